@@ -1,0 +1,242 @@
+"""The words both planes speak: frozen values and typed identifiers, without IO and without protobuf.
+
+Times are seconds (float) and probabilities are in [0, 1] unless a name says otherwise.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NewType
+
+if TYPE_CHECKING:
+    from protos.histogram import Histogram
+
+PROTOCOL_VERSION = 1
+"""Version of the control stream and of the datagram layout; peers of another version are refused."""
+
+NodeName = NewType("NodeName", str)
+"""Name of a sidecar, unique in the mesh."""
+
+InterfaceName = NewType("InterfaceName", str)
+"""Name of a network interface of one sidecar, such as wlan0."""
+
+InterfaceId = NewType("InterfaceId", int)
+"""Number of an interface, 0 to 255, stable within one session."""
+
+ServiceName = NewType("ServiceName", str)
+"""Fully qualified ROS service name, such as /plan_path."""
+
+SessionId = NewType("SessionId", int)
+"""64-bit number of one run of a sidecar; stands in the header of every datagram it sends."""
+
+Version = NewType("Version", int)
+"""Version of a pushed resource; only grows. 0 means none."""
+
+Address = tuple[str, int]
+"""IP address in its canonical text form and UDP port; IPv4-mapped IPv6 addresses are written as IPv4."""
+
+TOKEN_BYTES = 16
+"""Size of the stable secret of a sidecar."""
+
+
+class Role(enum.Enum):
+    """What a sidecar is for."""
+
+    ROBOT = "robot"
+    CLOUD = "cloud"
+
+
+class CandidateKind(enum.Enum):
+    """How an address was learnt."""
+
+    HOST = "host"
+    SERVER_REFLEXIVE = "srflx"
+
+
+class ResourceKind(enum.Enum):
+    """What the control plane pushes."""
+
+    PEERS = "peers"
+    MAPPING = "mapping"
+
+
+class RemovalReason(enum.Enum):
+    """Why a peer left the view."""
+
+    LEASE_EXPIRED = "lease_expired"
+    LEFT = "left"
+    REVOKED = "revoked"
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One address under which one interface of a sidecar may be reached."""
+
+    interface_id: InterfaceId
+    interface: InterfaceName
+    kind: CandidateKind
+    address: Address
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceOffer:
+    """A service that a cloud sidecar can run; `capacity` 0 means no limit."""
+
+    name: ServiceName
+    type: str
+    capacity: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceUse:
+    """A service that a robot sidecar carries right now."""
+
+    name: ServiceName
+    type: str
+    deadline_s: float
+    idempotent: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A sidecar as its peers see it."""
+
+    name: NodeName
+    role: Role
+    session: SessionId
+    token: bytes = field(repr=False)
+    incarnation: int
+    candidates: tuple[Candidate, ...] = ()
+    offers: tuple[ServiceOffer, ...] = ()
+    draining: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RemovedPeer:
+    """A peer that left since the version the sidecar held."""
+
+    name: NodeName
+    reason: RemovalReason
+
+
+@dataclass(frozen=True, slots=True)
+class PeerSet:
+    """All peers of one sidecar at one version."""
+
+    version: Version
+    nonce: int
+    peers: tuple[Peer, ...] = ()
+    removed: tuple[RemovedPeer, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """Requests go over `interface` to `server`."""
+
+    interface: InterfaceName
+    server: NodeName
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceMapping:
+    """Where one service's requests go, and why."""
+
+    service: ServiceName
+    assignments: tuple[Assignment, ...]
+    predicted_miss: float = 1.0
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MappingSet:
+    """The mapping of all services of one robot at one version."""
+
+    version: Version
+    nonce: int
+    services: tuple[ServiceMapping, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """What a sidecar says of itself first on its stream."""
+
+    protocol_version: int
+    name: NodeName
+    role: Role
+    session: SessionId
+    token: bytes = field(repr=False)
+    incarnation: int
+    software_version: str
+    peers_version: Version = Version(0)
+    mapping_version: Version = Version(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Welcome:
+    """The control plane's answer to a registration; `stun_servers` are host:port strings."""
+
+    lease_s: float
+    report_interval_s: float
+    stun_servers: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """`version` was applied."""
+
+    resource: ResourceKind
+    version: Version
+    nonce: int
+
+
+@dataclass(frozen=True, slots=True)
+class Nack:
+    """What was sent with `nonce` is refused; `version` is still in force."""
+
+    resource: ResourceKind
+    version: Version
+    nonce: int
+    error: str
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyReport:
+    """Latency of one interface to one server for one service since the last report."""
+
+    interface: InterfaceName
+    server: NodeName
+    service: ServiceName
+    latency: Histogram
+    processing: Histogram
+
+
+@dataclass(frozen=True, slots=True)
+class PathReport:
+    """State of one path, and its round-trip times since the last report."""
+
+    interface: InterfaceName
+    server: NodeName
+    up: bool
+    rtt: Histogram
+    datagrams_sent: int = 0
+    datagrams_lost: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class OutcomeReport:
+    """What became of the requests for one service since the last report."""
+
+    service: ServiceName
+    ok: int = 0
+    deadline_missed: int = 0
+    failed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Everything a robot sidecar measured since its last report."""
+
+    latencies: tuple[LatencyReport, ...] = ()
+    paths: tuple[PathReport, ...] = ()
+    outcomes: tuple[OutcomeReport, ...] = ()
