@@ -1,0 +1,121 @@
+"""What the data plane tells the application side (the ROS bridge), and what it is told, as values."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NewType
+
+if TYPE_CHECKING:
+    from protos.model import Assignment, InterfaceName, NodeName, ServiceName
+
+RequestId = NewType("RequestId", bytes)
+"""16 bytes that name one request for ever; see `request_id.py`."""
+
+ExecutionId = NewType("ExecutionId", int)
+"""Number of one execution on a cloud sidecar, unique within its session."""
+
+
+class RejectReason(enum.IntEnum):
+    """Why a cloud sidecar did not run a request; the numbers stand on the wire."""
+
+    NOT_OFFERED = 1
+    """No local server for this service."""
+    WRONG_TYPE = 2
+    """The service exists with another type."""
+    BAD_PAYLOAD = 3
+    """The bytes are not a request of this type."""
+    OVERLOADED = 4
+    """A table is full."""
+    DRAINING = 5
+    """The sidecar is going away."""
+    SERVER_LOST = 6
+    """The local server went away or gave no answer in time: the request may have run."""
+    FORGOTTEN = 7
+    """It ran, but the cached answer has been dropped."""
+
+    @property
+    def certainly_not_run(self) -> bool:
+        """True when another server may run the request without breaking at-most-once for it."""
+        return self not in (RejectReason.SERVER_LOST, RejectReason.FORGOTTEN)
+
+
+@dataclass(frozen=True, slots=True)
+class OfferService:
+    """A live server offers this service and the configuration allows it: offer it on the robot."""
+
+    name: ServiceName
+    type: str
+
+
+@dataclass(frozen=True, slots=True)
+class WithdrawService:
+    """The last live server of this service is gone."""
+
+    name: ServiceName
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseArrived:
+    """The first valid response to a request; there is never a second one."""
+
+    request_id: RequestId
+    service: ServiceName
+    payload: bytes = field(repr=False)
+    server: NodeName
+    interface: InterfaceName
+    elapsed_s: float
+    late: bool
+
+
+@dataclass(frozen=True, slots=True)
+class DeadlineMissed:
+    """A request's deadline passed without a response; the request goes on until its lifetime ends."""
+
+    request_id: RequestId
+    service: ServiceName
+    deadline_s: float
+    copies: tuple[Assignment, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RequestFailed:
+    """No response will come. `outcome` is a label of plr_requests_total: failed, rejected or late_dropped."""
+
+    request_id: RequestId
+    service: ServiceName
+    outcome: str
+    reason: str
+    elapsed_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ExecuteRequest:
+    """Run this request on the local server, once; answer with `complete` or `refuse`."""
+
+    execution: ExecutionId
+    service: ServiceName
+    type: str
+    payload: bytes = field(repr=False)
+    robot: NodeName
+    expires_s: float
+    """Seconds from now after which nobody waits for the answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class AbandonExecution:
+    """Nobody waits for this execution any more: forget it."""
+
+    execution: ExecutionId
+
+
+ApplicationEvent = (
+    OfferService
+    | WithdrawService
+    | ResponseArrived
+    | DeadlineMissed
+    | RequestFailed
+    | ExecuteRequest
+    | AbandonExecution
+)

@@ -1,0 +1,60 @@
+"""Which services are carried, and how: the configuration's rules, matched by name.
+
+The first rule that matches wins. Parameter and lifecycle services of nodes are carried only when a rule names them
+exactly: a glob such as /* must not open every node's parameters to other machines.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from protos.model import ServiceName
+
+_NODE_INTERNAL_SUFFIXES = frozenset(
+    {
+        # rclcpp and rclpy parameter services
+        "describe_parameters",
+        "get_parameter_types",
+        "get_parameters",
+        "list_parameters",
+        "set_parameters",
+        "set_parameters_atomically",
+        "get_type_description",
+        # managed nodes
+        "change_state",
+        "get_state",
+        "get_available_states",
+        "get_available_transitions",
+        "get_transition_graph",
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceRule:
+    """How the services whose name matches `pattern` (exact or glob) are carried."""
+
+    pattern: str
+    deadline_s: float
+    lifetime_s: float
+    """A request without a response is given up after this long."""
+    idempotent: bool = False
+    """Copies of one request may run on several servers."""
+    drop_late: bool = False
+    """A response after the deadline is not delivered."""
+    capacity: int = 0
+    """Cloud: how many robot interfaces may be mapped here; 0 means no limit."""
+
+
+def find_rule(rules: Iterable[ServiceRule], name: ServiceName) -> ServiceRule | None:
+    """Return the rule under which the service is carried, or None when it is not."""
+    internal = name.rsplit("/", 1)[-1] in _NODE_INTERNAL_SUFFIXES or "/_action/" in name
+    for rule in rules:
+        if rule.pattern == name or (not internal and fnmatch.fnmatchcase(name, rule.pattern)):
+            return rule
+    return None

@@ -1,0 +1,39 @@
+"""The seams between the sidecar's parts: what the ROS bridge asks of the data plane, and the other way round."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from protos.model import ServiceName, ServiceOffer, SessionId
+    from sidecar.core.events import ApplicationEvent, ExecutionId, RejectReason, RequestId
+
+
+class DataPlane(Protocol):
+    """What the application side may call, from any thread; nothing here blocks."""
+
+    @property
+    def session(self) -> SessionId:
+        """This run's session."""
+
+    def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
+        """Robot: send a serialised request; ends in exactly one ResponseArrived or RequestFailed."""
+
+    def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
+        """Cloud: the local server answered after `processing_s` seconds."""
+
+    def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str) -> None:
+        """Cloud: the request was not or will not be answered."""
+
+    def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
+        """Cloud: the services that local servers offer right now, a whole new set."""
+
+    def set_carried(self, services: frozenset[ServiceName]) -> None:
+        """Robot: the proxied services that exist in the local ROS graph right now, a whole new set."""
+
+
+class Application(Protocol):
+    """What the data plane calls."""
+
+    def handle(self, event: ApplicationEvent) -> None:
+        """Take an event. Called from data-plane threads: must return at once (queue it)."""
