@@ -1,0 +1,62 @@
+"""Plain counters that the cores keep and `sidecar/metrics.py` reads at scrape time.
+
+Each object has one writer (a link's thread, or whoever holds the engine); a scrape reads it without a lock, which in
+CPython is safe for ints and dicts as long as the reader copies (`dict(...)`) before it iterates.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protos.histogram import Histogram
+    from protos.model import InterfaceName, NodeName, ServiceName
+
+
+@dataclass(slots=True)
+class PathStats:
+    """One path, as measured by its own probes and acknowledgements."""
+
+    up: bool = False
+    srtt_s: float = 0.0
+    datagrams_sent: int = 0
+    datagrams_lost: int = 0
+    bytes_sent: int = 0
+
+
+@dataclass(slots=True)
+class LinkStats:
+    """One interface. Written by its thread only."""
+
+    interface: InterfaceName
+    datagrams: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """(direction: sent | received, kind: data | control | stun)."""
+    dropped: Counter[str] = field(default_factory=Counter)
+    """Datagrams by the reason they were dropped for, received and unsendable ones alike."""
+    bytes: Counter[str] = field(default_factory=Counter)
+    """Direction: sent | received; UDP payload bytes."""
+    paths: dict[NodeName, PathStats] = field(default_factory=dict)
+    """The best path to each peer."""
+
+
+@dataclass(slots=True)
+class EngineStats:
+    """The requests. Written by whoever holds the engine."""
+
+    requests: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
+    """(service, outcome: ok | deadline_missed | failed | rejected)."""
+    durations: dict[ServiceName, Histogram] = field(default_factory=dict)
+    """Seconds from submit to the first response, since start."""
+    wins: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
+    duplicate_responses: int = 0
+    late_dropped: Counter[ServiceName] = field(default_factory=Counter)
+    executions: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
+    """Cloud: (service, result: run | coalesced | cached | refused | abandoned)."""
+    dropped: Counter[str] = field(default_factory=Counter)
+    """Messages and table entries by the reason they were dropped for."""
+    mapping_version: int = 0
+    peers_version: int = 0
+    nacks: int = 0
+    in_flight: int = 0
