@@ -1,0 +1,17 @@
+"""Errors that both planes raise."""
+
+from __future__ import annotations
+
+
+class DecodeError(ValueError):
+    """Bytes or messages from the network break their format; the text tells which rule of it."""
+
+
+class ConfigError(ValueError):
+    """A configuration is refused; the text is one line that names the file, the key and what was expected."""
+
+    def __init__(self, source: str, key: str, problem: str) -> None:
+        super().__init__(": ".join(part for part in (source, key, problem) if part))
+        self.source = source
+        self.key = key
+        self.problem = problem
