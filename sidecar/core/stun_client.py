@@ -1,0 +1,144 @@
+"""STUN client (RFC 8489 Binding): learns how the world sees one local UDP socket. Sans-IO.
+
+IPv4 and IPv6 are learnt independently. Within a family one server is asked; when it is slow the next one is
+asked as well, and the first answer wins. The server that answered stays the preferred one, so that a NAT
+which maps each destination differently does not look like one that changes its mind. A learnt mapping is
+refreshed for ever, a failed round is repeated for ever with backoff.
+"""
+
+from __future__ import annotations
+
+from ipaddress import ip_address
+from typing import TYPE_CHECKING
+
+from protos.errors import DecodeError
+from protos.stun import MessageClass, decode, is_stun
+from sidecar.core.stun_events import StunDrop
+from sidecar.core.stun_family import StunClientConfig, StunFamilyClient, StunOutbox
+
+if TYPE_CHECKING:
+    import random
+    from collections import Counter
+    from collections.abc import Iterable
+
+    from protos.model import Address
+    from sidecar.core.stun_events import StunEvent
+
+MAX_SERVERS_PER_FAMILY = 4
+"""Servers used of those a control plane names; the others are ignored and counted."""
+
+
+class StunClient:
+    """Learns the server-reflexive address of one socket, per family.
+
+    `servers` are numeric addresses in canonical form, asked in order; raises ValueError for a host name.
+    `rng` draws transaction ids: pass random.SystemRandom outside tests, since an id is what keeps strangers
+    from forging answers.
+    """
+
+    def __init__(
+        self,
+        servers: Iterable[Address],
+        rng: random.Random,
+        config: StunClientConfig | None = None,
+        *,
+        software: str | None = None,
+    ) -> None:
+        self._rng = rng
+        self._config = config or StunClientConfig()
+        self._software = software
+        self._families: dict[int, StunFamilyClient] = {}
+        self._outbox = StunOutbox()
+        self.servers_ignored = 0
+        self._set_servers(servers)
+
+    @property
+    def drops(self) -> Counter[StunDrop]:
+        """STUN datagrams not believed, by reason."""
+        return self._outbox.drops
+
+    @property
+    def requests_sent(self) -> int:
+        """Requests handed out for sending, repetitions included."""
+        return self._outbox.requests_sent
+
+    @property
+    def events_lost(self) -> int:
+        """Events dropped because the driver did not fetch them."""
+        return self._outbox.events_lost
+
+    def set_servers(self, servers: Iterable[Address], now: float) -> None:
+        """Ask these from now on; families whose servers stay the same are left undisturbed."""
+        before = {family: client.servers for family, client in self._families.items()}
+        self._set_servers(servers)
+        for family, client in self._families.items():
+            if before.get(family) != client.servers:
+                client.start(now)
+
+    def start(self, now: float) -> None:
+        """Ask at once; also to be called when the interface's address or link changed."""
+        for client in self._families.values():
+            client.start(now)
+
+    def mapping(self, family: int) -> Address | None:
+        """The mapping last learnt for family 4 or 6."""
+        client = self._families.get(family)
+        return client.mapping if client else None
+
+    def receive_datagram(self, data: bytes | memoryview, addr: Address, now: float) -> bool:
+        """Take a datagram of the socket; True if it was STUN, believed or counted."""
+        if not is_stun(data):
+            return False
+        try:
+            message = decode(data)
+        except DecodeError:
+            self._outbox.drops[StunDrop.MALFORMED] += 1
+            return True
+        if message.message_class not in (MessageClass.SUCCESS, MessageClass.ERROR):
+            self._outbox.drops[StunDrop.NOT_A_RESPONSE] += 1
+            return True
+        for client in self._families.values():
+            transaction = client.find(message.transaction_id)
+            if transaction is not None:
+                client.handle_response(transaction, message, addr, now)
+                return True
+        self._outbox.drops[StunDrop.UNKNOWN_TRANSACTION] += 1
+        return True
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due; to be called at next_timer()."""
+        for client in self._families.values():
+            client.handle_timer(now)
+
+    def next_timer(self) -> float | None:
+        """When handle_timer wants to be called; None before start or without servers."""
+        return min((t for c in self._families.values() if (t := c.next_timer()) is not None), default=None)
+
+    def datagrams_to_send(self) -> list[tuple[bytes, Address]]:
+        """Take what is to be sent over the socket now."""
+        sending, self._outbox.sending = self._outbox.sending, []
+        return sending
+
+    def next_event(self) -> StunEvent | None:
+        """Take the oldest event."""
+        events = self._outbox.events
+        return events.popleft() if events else None
+
+    def _set_servers(self, servers: Iterable[Address]) -> None:
+        by_family: dict[int, list[Address]] = {}
+        for server in dict.fromkeys(servers):
+            listed = by_family.setdefault(ip_address(server[0]).version, [])
+            if len(listed) < MAX_SERVERS_PER_FAMILY:
+                listed.append(server)
+            else:
+                self.servers_ignored += 1
+        for family in self._families.keys() - by_family.keys():
+            del self._families[family]
+        for family, listed in by_family.items():
+            client = self._families.get(family)
+            if client is None:
+                self._families[family] = StunFamilyClient(
+                    family, tuple(listed), self._outbox, self._rng, self._config, self._software
+                )
+            elif set(client.servers) != set(listed):
+                client.servers = tuple(listed)

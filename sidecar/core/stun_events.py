@@ -1,0 +1,60 @@
+"""What the STUN client tells its driver, and what it counts."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protos.model import Address
+
+
+@dataclass(frozen=True, slots=True)
+class Mapped:
+    """The socket is seen as `address`: for the first time, or again after a failure.
+
+    `family` (4 or 6) is that of the server asked; `address` may be of the other one behind a NAT64.
+    """
+
+    family: int
+    address: Address
+    server: Address
+
+
+@dataclass(frozen=True, slots=True)
+class MappingChanged:
+    """The NAT gave the socket another address: `previous` is no longer of use to peers."""
+
+    family: int
+    address: Address
+    previous: Address
+    server: Address
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """No server of this family answered; asking goes on in the background.
+
+    `last_known` is the mapping until now. A refresh also fails when only the servers are gone, so it may
+    well still hold: whether to use it is for the driver to say.
+    """
+
+    family: int
+    reason: str
+    last_known: Address | None
+
+
+StunEvent = Mapped | MappingChanged | Failed
+
+
+class StunDrop(enum.StrEnum):
+    """Why a STUN datagram was not believed; labels of plr_datagrams_dropped_total."""
+
+    MALFORMED = "stun_malformed"
+    NOT_A_RESPONSE = "stun_not_a_response"
+    UNKNOWN_TRANSACTION = "stun_unknown_transaction"
+    WRONG_SOURCE = "stun_wrong_source"
+    UNKNOWN_ATTRIBUTE = "stun_unknown_attribute"
+    NO_ADDRESS = "stun_no_address"
+    BAD_ADDRESS = "stun_bad_address"
