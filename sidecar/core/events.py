@@ -33,11 +33,13 @@ class RejectReason(enum.IntEnum):
     """The local server went away or gave no answer in time: the request may have run."""
     FORGOTTEN = 7
     """It ran, but the cached answer has been dropped."""
+    TOO_LARGE = 8
+    """It ran, but its answer is larger than a message may be."""
 
     @property
     def certainly_not_run(self) -> bool:
         """True when another server may run the request without breaking at-most-once for it."""
-        return self not in (RejectReason.SERVER_LOST, RejectReason.FORGOTTEN)
+        return self not in (RejectReason.SERVER_LOST, RejectReason.FORGOTTEN, RejectReason.TOO_LARGE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,308 @@
+"""Layout and codec of our datagrams. Integers are big-endian.
+
+Datagram::
+
+     0                   1                   2                   3
+     0 1 2 3 4 5 6 7 8 9 0 1 2 3 4 5 6 7 8 9 0 1 2 3 4 5 6 7 8 9 0 1
+    +-------+-------+---------------+---------------+---------------+
+    | 1101  |version| flags         | sender's if   | receiver's if |
+    +-------+-------+---------------+---------------+---------------+
+    | session of the sender (64)                                    |
+    +---------------------------------------------------------------+
+    | packet number on this path and direction (64)                 |
+    +---------------------------------------------------------------+
+    | frames ...                                                    |
+    +---------------------------------------------------------------+
+    | authentication tag (0 now; 16 when sealed)                    |
+    +---------------------------------------------------------------+
+
+The first 20 bytes stay in clear and are the associated data once datagrams are sealed (flags bit 0 says sealed, bit 1
+is the key phase; both must be 0 in this version, and the size budget already leaves 16 bytes for the tag). The first
+byte tells our datagrams (0xD1) from STUN's (0x00 to 0x3F, RFC 8489 section 5) on the same socket.
+
+Frames, each a type byte and then::
+
+    PROBE        1  id (32)                                  is answered at once
+    PROBE_REPLY  2  id (32)
+    ACK          3  largest (64) delay in us (32) n (8), n times: length - 1 of a range (16), gap - 1 below it (16)
+    FRAGMENT     4  message (64) total size (32) symbol size (16) index (16), then the symbol: its length follows
+                    from the other fields
+    REPAIR       5  reserved for FEC: as FRAGMENT, with block (16) and repair index (8) for the index
+    FINISHED     6  message (64)                             the receiver has all of it
+    ABANDON      7  message (64)                             reserved: the sender will not send the rest
+    CLOSE        8  the sidecar goes away
+    HELLO        9  token (16 bytes) incarnation (64)        who sends under this session; place of the key agreement
+
+A message of `total size` bytes is cut into symbols of `symbol size` bytes, the last one shorter; `index` counts them.
+Only FRAGMENT and FINISHED are ack-eliciting (RFC 9002 section 2): a PROBE is answered by its reply, the rest is not
+waited for.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+from protos.errors import DecodeError
+from protos.model import PROTOCOL_VERSION, TOKEN_BYTES, InterfaceId, SessionId
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+FIRST_BYTE = 0xD0 | PROTOCOL_VERSION
+HEADER = struct.Struct(">BBBBQQ")
+HEADER_BYTES = HEADER.size
+
+MAX_DATAGRAM_BYTES = 1200
+"""UDP payload that every path of the Internet carries unfragmented (RFC 9000 section 14); per-path discovery later."""
+TAG_BYTES = 16
+"""Room left for the tag of the AEAD."""
+MAX_FRAMES_BYTES = MAX_DATAGRAM_BYTES - HEADER_BYTES - TAG_BYTES
+
+MAX_MESSAGE_BYTES = 16 * 1024 * 1024 + 1024
+"""Largest payload the product promises (16 MiB) and the head of a message."""
+MAX_ACK_RANGES = 32
+"""More ranges than this are news of losses that the sender has long declared."""
+MAX_FRAMES = 64
+"""Frames in one datagram; an honest one holds a handful."""
+
+_PROBE, _PROBE_REPLY, _ACK, _FRAGMENT, FINISHED_TYPE, _CLOSE, _HELLO = 1, 2, 3, 4, 6, 8, 9
+
+_U32 = struct.Struct(">I")
+_U64 = struct.Struct(">Q")
+_ACK_HEAD = struct.Struct(">QIB")
+_ACK_RANGE = struct.Struct(">HH")
+_FRAGMENT_HEAD = struct.Struct(">QIHH")
+_TYPED_FRAGMENT_HEAD = struct.Struct(">BQIHH")
+_HELLO_BODY = struct.Struct(f">{TOKEN_BYTES}sQ")
+
+MAX_SYMBOL_BYTES = MAX_FRAMES_BYTES - _TYPED_FRAGMENT_HEAD.size
+"""Payload of one datagram that holds nothing but a fragment."""
+MIN_SYMBOL_BYTES = 256
+"""Smaller symbols would let a peer make us count millions of fragments for one message."""
+
+
+class Header(NamedTuple):
+    """The clear head of a datagram."""
+
+    sender_interface: InterfaceId
+    receiver_interface: InterfaceId
+    session: SessionId
+    packet_number: int
+
+
+class Probe(NamedTuple):
+    """Asks for a PROBE_REPLY with the same id at once."""
+
+    id: int
+
+
+class ProbeReply(NamedTuple):
+    """Answers a PROBE."""
+
+    id: int
+
+
+class AckFrame(NamedTuple):
+    """Packet numbers received on this path: inclusive ranges, highest first; `delay_s` since the largest came."""
+
+    ranges: tuple[tuple[int, int], ...]
+    delay_s: float
+
+
+class Fragment(NamedTuple):
+    """One symbol of a message; `data` views the datagram it came in."""
+
+    message: int
+    total: int
+    symbol: int
+    index: int
+    data: memoryview
+
+
+class Finished(NamedTuple):
+    """The receiver holds the whole message."""
+
+    message: int
+
+
+class Close(NamedTuple):
+    """The sender goes away."""
+
+
+class Hello(NamedTuple):
+    """Who sends under the header's session."""
+
+    token: bytes
+    incarnation: int
+
+
+Frame = Probe | ProbeReply | AckFrame | Fragment | Finished | Close | Hello
+
+
+class VersionError(DecodeError):
+    """Ours, but of another protocol version."""
+
+
+def symbol_count(total: int, symbol: int) -> int:
+    """Number of symbols of a message of `total` bytes; an empty message has one, empty, symbol."""
+    return max(1, -(-total // symbol))
+
+
+def encode_header(header: Header) -> bytes:
+    """Return the 20 clear bytes."""
+    return HEADER.pack(FIRST_BYTE, 0, *header)
+
+
+def decode_header(data: bytes | memoryview) -> Header:
+    """Parse the clear head.
+
+    Raises:
+        VersionError: ours, of another version.
+        DecodeError: anything else that is not a datagram of ours.
+    """
+    if len(data) < HEADER_BYTES:
+        raise DecodeError("short datagram")
+    first, flags, sender, receiver, session, packet_number = HEADER.unpack_from(data)
+    if first != FIRST_BYTE:
+        if first & 0xF0 == FIRST_BYTE & 0xF0:
+            raise VersionError(f"protocol version {first & 0x0F}, ours is {PROTOCOL_VERSION}")
+        raise DecodeError("not one of our datagrams")
+    if flags:
+        raise DecodeError("sealed or unknown flags")
+    return Header(InterfaceId(sender), InterfaceId(receiver), SessionId(session), packet_number)
+
+
+def encode_probe(frame: Probe) -> bytes:
+    """Return the frame's bytes."""
+    return b"\x01" + _U32.pack(frame.id)
+
+
+def encode_probe_reply(frame: ProbeReply) -> bytes:
+    """Return the frame's bytes."""
+    return b"\x02" + _U32.pack(frame.id)
+
+
+def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
+    """Encode inclusive `ranges`, highest first; those past MAX_ACK_RANGES or too wide to tell are left out."""
+    largest = ranges[0][1]
+    body = bytearray()
+    count = 0
+    above: int | None = None
+    for low, high in ranges[:MAX_ACK_RANGES]:
+        gap = 0 if above is None else above - high - 2
+        if gap > 0xFFFF:
+            break
+        length = min(high - low, 0xFFFF)
+        body += _ACK_RANGE.pack(length, gap)
+        count += 1
+        if length < high - low:
+            break
+        above = low
+    delay_us = min(int(delay_s * 1e6), 0xFFFFFFFF)
+    return b"\x03" + _ACK_HEAD.pack(largest, delay_us, count) + bytes(body)
+
+
+def encode_fragment_head(message: int, total: int, symbol: int, index: int) -> bytes:
+    """Return the bytes that go before the symbol itself."""
+    return _TYPED_FRAGMENT_HEAD.pack(_FRAGMENT, message, total, symbol, index)
+
+
+def encode_finished(frame: Finished) -> bytes:
+    """Return the frame's bytes."""
+    return b"\x06" + _U64.pack(frame.message)
+
+
+def finished_number(encoded: bytes) -> int:
+    """Return the message number of an encoded FINISHED frame."""
+    (number,) = _U64.unpack_from(encoded, 1)
+    return int(number)
+
+
+def encode_close() -> bytes:
+    """Return the frame's byte."""
+    return b"\x08"
+
+
+def encode_hello(frame: Hello) -> bytes:
+    """Return the frame's bytes."""
+    return b"\x09" + _HELLO_BODY.pack(frame.token, frame.incarnation)
+
+
+def decode_frames(view: memoryview) -> list[Frame]:
+    """Parse what follows the header.
+
+    Raises:
+        DecodeError: the bytes are not whole frames that we know; nothing of them is to be believed.
+    """
+    frames: list[Frame] = []
+    position = 0
+    end = len(view)
+    if not end:
+        raise DecodeError("no frames")
+    try:
+        while position < end:
+            kind = view[position]
+            position += 1
+            if kind == _FRAGMENT:
+                fragment, position = _decode_fragment(view, position)
+                frames.append(fragment)
+            elif kind == _ACK:
+                ack, position = _decode_ack(view, position)
+                frames.append(ack)
+            elif kind == FINISHED_TYPE:
+                frames.append(Finished(_U64.unpack_from(view, position)[0]))
+                position += 8
+            elif kind in (_PROBE, _PROBE_REPLY):
+                (probe_id,) = _U32.unpack_from(view, position)
+                frames.append(Probe(probe_id) if kind == _PROBE else ProbeReply(probe_id))
+                position += 4
+            elif kind == _HELLO:
+                frames.append(Hello(*_HELLO_BODY.unpack_from(view, position)))
+                position += _HELLO_BODY.size
+            elif kind == _CLOSE:
+                frames.append(Close())
+            else:
+                raise DecodeError(f"unknown frame type {kind}")
+            if len(frames) > MAX_FRAMES:
+                raise DecodeError("too many frames")
+    except struct.error:
+        raise DecodeError("truncated frame") from None
+    return frames
+
+
+def _decode_fragment(view: memoryview, position: int) -> tuple[Fragment, int]:
+    message, total, symbol, index = _FRAGMENT_HEAD.unpack_from(view, position)
+    position += _FRAGMENT_HEAD.size
+    if total > MAX_MESSAGE_BYTES:
+        raise DecodeError("message over the limit")
+    if symbol < MIN_SYMBOL_BYTES:
+        raise DecodeError("symbol too small")
+    start = index * symbol
+    if start >= total and (index or total):
+        raise DecodeError("fragment beyond the end of its message")
+    length = min(symbol, total - start)
+    data = view[position : position + length]
+    if len(data) != length:
+        raise DecodeError("truncated fragment")
+    return Fragment(message, total, symbol, index, data), position + length
+
+
+def _decode_ack(view: memoryview, position: int) -> tuple[AckFrame, int]:
+    largest, delay_us, count = _ACK_HEAD.unpack_from(view, position)
+    position += _ACK_HEAD.size
+    if not 1 <= count <= MAX_ACK_RANGES:
+        raise DecodeError("bad number of ack ranges")
+    ranges = []
+    high = largest
+    for number in range(count):
+        length, gap = _ACK_RANGE.unpack_from(view, position)
+        position += _ACK_RANGE.size
+        if number:
+            high -= gap + 2
+        low = high - length
+        if low < 0:
+            raise DecodeError("ack range below zero")
+        ranges.append((low, high))
+        high = low
+    return AckFrame(tuple(ranges), delay_us / 1e6), position

@@ -1,0 +1,478 @@
+"""One interface's share of the data plane: datagrams in and out, all its paths. Owned by one thread; sans-IO.
+
+The driver feeds `receive_datagram`, `execute` and `handle_timer`, then drains `next_event` and `datagrams_to_send`.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from dataclasses import dataclass
+from itertools import count
+from typing import TYPE_CHECKING
+
+from protos.errors import DecodeError
+from sidecar.core import frame
+from sidecar.core.frame import HEADER_BYTES, MAX_FRAMES_BYTES, Header
+from sidecar.core.link_events import (
+    FragmentReceived,
+    FragmentsLost,
+    LinkCommand,
+    LinkEvent,
+    MessageFinished,
+    PathChanged,
+    PathId,
+    PathMeasured,
+    PathState,
+    PeerClosed,
+    PeerRestarted,
+    Resend,
+    Send,
+    SendClose,
+    SendFinished,
+    SetPeers,
+    SetReady,
+)
+from sidecar.core.paths import Path
+from sidecar.core.stats import LinkStats, PathStats
+
+if TYPE_CHECKING:
+    import random
+    from collections.abc import Iterable
+
+    from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
+    from sidecar.core.link_events import LinkPeer
+    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.recovery import Sent
+
+BURST_DATAGRAMS = 64
+"""Datagrams built in one go before the driver looks at the socket again (about 70 kB, under a millisecond)."""
+MEASURE_EVERY_S = 0.25
+"""How often a path's round-trip times go to the engine."""
+MAX_PENDING_FRAMES = 256
+"""Control frames waiting on one path; a peer that makes us owe more is not honest."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkIdentity:
+    """Who we are on this interface."""
+
+    interface: InterfaceName
+    interface_id: InterfaceId
+    session: SessionId
+    token: bytes
+    incarnation: int
+
+
+class Link:
+    """All paths over one interface."""
+
+    def __init__(self, identity: LinkIdentity, rng: random.Random, now: float) -> None:
+        self.identity = identity
+        self.stats = LinkStats(identity.interface)
+        self._rng = rng
+        self._peers: dict[NodeName, LinkPeer] = {}
+        self._by_session: dict[SessionId, LinkPeer] = {}
+        self._by_token: dict[bytes, LinkPeer] = {}
+        self._paths: dict[tuple[NodeName, InterfaceId], Path] = {}
+        self._ready = False
+        self._closing = False
+        self._events: deque[LinkEvent] = deque()
+        self._dirty: dict[PathId, Path] = {}
+        self._timers: list[tuple[float, int, Path]] = []
+        self._timer_of: dict[PathId, float] = {}
+        self._order = count()
+        self._measure_at = now + MEASURE_EVERY_S
+
+    # -- what the driver calls ------------------------------------------------------------------------------------
+
+    def receive_datagram(self, data: bytes | memoryview, source: Address, now: float) -> None:
+        """Take one datagram from the socket. Fragments in the events view `data`."""
+        stats = self.stats
+        stats.bytes["received"] += len(data)
+        try:
+            header = frame.decode_header(data)
+            peer = self._by_session.get(header.session)
+            if peer is None:
+                self._receive_from_stranger(header, memoryview(data)[HEADER_BYTES:])
+                return
+            if header.receiver_interface != self.identity.interface_id:
+                stats.dropped["wrong_interface"] += 1
+                return
+            path = self._paths.get((peer.name, header.sender_interface))
+            if path is None:
+                stats.dropped["unknown_path"] += 1
+                return
+            frames = frame.decode_frames(memoryview(data)[HEADER_BYTES:])
+        except frame.VersionError:
+            stats.dropped["version"] += 1
+            return
+        except DecodeError:
+            stats.dropped["malformed"] += 1
+            return
+        if not path.received.add(header.packet_number, now):
+            stats.dropped["duplicate"] += 1
+            return
+        if header.packet_number > path.largest_received:
+            path.largest_received = header.packet_number
+            path.remote = source
+        if path.state is PathState.DOWN and path.probe_at is not None:
+            path.probe_at = min(path.probe_at, now)
+        self._dirty[path.id] = path
+        self._receive_frames(path, frames, now)
+
+    def execute(self, command: LinkCommand, now: float) -> None:
+        """Carry out what the engine asks."""
+        match command:
+            case Send(path_id, message):
+                path = self._live_path(path_id, message, range(message.count))
+                if path is not None:
+                    path.queue.add(message)
+            case Resend(path_id, message, indices):
+                path = self._live_path(path_id, message, indices)
+                if path is not None:
+                    path.queue.resend(message, indices)
+            case SendFinished(path_id, number):
+                path = self._paths.get((path_id.peer, path_id.remote))
+                if path is not None:
+                    self._owe(path, frame.encode_finished(frame.Finished(number)))
+            case SetPeers(peers):
+                self._set_peers(peers, now)
+            case SetReady(ready):
+                self._ready = ready
+                for path in self._paths.values():
+                    if ready and path.state is PathState.DOWN:
+                        path.probe_at = now
+                    self._dirty[path.id] = path
+            case SendClose():
+                self._closing = True
+                for path in self._paths.values():
+                    if path.state is not PathState.DOWN:
+                        self._owe(path, frame.encode_close())
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due by now."""
+        self._rearm()
+        while self._timers and self._timers[0][0] <= now:
+            due, _, path = heapq.heappop(self._timers)
+            if self._timer_of.get(path.id) != due or self._paths.get((path.peer, path.remote_id)) is not path:
+                continue
+            del self._timer_of[path.id]
+            self._dirty[path.id] = path
+            self._path_timer(path, now)
+        if now >= self._measure_at:
+            self._measure_at = now + MEASURE_EVERY_S
+            self._measure()
+
+    def next_timer(self) -> float:
+        """When `handle_timer` is wanted next."""
+        self._rearm()
+        while self._timers and self._timer_of.get(self._timers[0][2].id) != self._timers[0][0]:
+            heapq.heappop(self._timers)
+        if self._timers:
+            return min(self._timers[0][0], self._measure_at)
+        return self._measure_at
+
+    def next_event(self) -> LinkEvent | None:
+        """Return the oldest event not taken yet."""
+        return self._events.popleft() if self._events else None
+
+    def datagrams_to_send(self, now: float) -> list[tuple[Address, bytes]]:
+        """Build what may leave now, at most about BURST_DATAGRAMS; call again until nothing comes."""
+        out: list[tuple[Address, bytes]] = []
+        for path in list(self._dirty.values()):
+            self._build(path, out, now)
+            if len(out) >= BURST_DATAGRAMS:
+                break
+        stats = self.stats
+        for _, datagram in out:
+            stats.bytes["sent"] += len(datagram)
+        return out
+
+    # -- receiving ------------------------------------------------------------------------------------------------
+
+    def _receive_from_stranger(self, header: Header, body: memoryview) -> None:
+        """An unknown session: only a HELLO of a known peer's newer start is listened to."""
+        frames = frame.decode_frames(body)
+        hello = frames[0]
+        if isinstance(hello, frame.Hello):
+            peer = self._by_token.get(hello.token)
+            if peer is not None and hello.incarnation > peer.incarnation:
+                self._events.append(PeerRestarted(peer.name, header.session, hello.incarnation))
+                return
+        self.stats.dropped["unknown_session"] += 1
+
+    def _receive_frames(self, path: Path, frames: list[frame.Frame], now: float) -> None:
+        eliciting = False
+        events = self._events
+        kind = "control"
+        for item in frames:
+            match item:
+                case frame.Fragment():
+                    eliciting = True
+                    kind = "data"
+                    events.append(FragmentReceived(path.id, item))
+                case frame.AckFrame():
+                    self._receive_ack(path, item, now)
+                case frame.Probe(probe_id):
+                    self._owe(path, frame.encode_probe_reply(frame.ProbeReply(probe_id)))
+                case frame.ProbeReply(probe_id):
+                    if not path.answered_probe(probe_id, now):
+                        self.stats.dropped["unasked_probe_reply"] += 1
+                    elif path.made_progress(now):
+                        self._path_up(path)
+                case frame.Finished(number):
+                    eliciting = True
+                    events.append(MessageFinished(path.peer, number))
+                case frame.Close():
+                    events.append(PeerClosed(path.peer))
+                case frame.Hello():
+                    pass
+        self.stats.datagrams["received", kind] += 1
+        if eliciting:
+            path.received.owe_ack(now, at_once=False)
+
+    def _receive_ack(self, path: Path, ack: frame.AckFrame, now: float) -> None:
+        recovery = path.recovery
+        newly = recovery.on_ack(ack, now)
+        if newly is None:
+            self.stats.dropped["acks_the_unsent"] += 1
+            return
+        if not newly:
+            return
+        for datagram in newly:
+            if datagram.fragment is not None:
+                message, index = datagram.fragment
+                message.acked[index] = 1
+        path.window.on_acked(newly, recovery.acked_bytes, recovery.rtt, now)
+        path.note_rtt()
+        if path.made_progress(now):
+            self._path_up(path)
+        self._report_lost(path, recovery.detect_lost(now))
+
+    def _path_up(self, path: Path) -> None:
+        self._events.append(PathChanged(path.id, PathState.UP, "answers"))
+
+    # -- sending --------------------------------------------------------------------------------------------------
+
+    def _live_path(self, path_id: PathId, message: OutboundMessage, indices: Iterable[int]) -> Path | None:
+        """Return the path if it can carry the message; otherwise hand the symbols back as lost."""
+        path = self._paths.get((path_id.peer, path_id.remote))
+        if path is None or path.state is PathState.DOWN:
+            self._events.append(FragmentsLost(path_id, message, tuple(indices)))
+            return None
+        self._dirty[path.id] = path
+        return path
+
+    def _owe(self, path: Path, encoded: bytes) -> None:
+        if len(path.pending) >= MAX_PENDING_FRAMES:
+            self.stats.dropped["pending_frames_full"] += 1
+            return
+        path.pending.append(encoded)
+        self._dirty[path.id] = path
+
+    def _build(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+        """Build the path's datagrams; leaves it dirty only when the burst limit cut it short."""
+        self._flush_control(path, out, now)
+        if path.state is PathState.DOWN or path.remote is None:
+            self._rearm_one(path)
+            return
+        recovery = path.recovery
+        stats = self.stats
+        expired_before = path.queue.expired
+        while recovery.in_flight < path.window.bytes:
+            if len(out) >= BURST_DATAGRAMS:
+                return
+            item = path.queue.pop(now)
+            if item is None:
+                break
+            message, index = item
+            number = recovery.take_number()
+            datagram = b"".join(
+                (
+                    self._header(path, number),
+                    frame.encode_fragment_head(message.number, len(message.data), message.symbol, index),
+                    message.symbol_data(index),
+                )
+            )
+            recovery.on_sent(number, now, len(datagram), fragment=item)
+            path.waits_for_answer(now)
+            out.append((path.remote, datagram))
+            stats.datagrams["sent", "data"] += 1
+        if path.queue.expired != expired_before:
+            stats.dropped["expired"] += path.queue.expired - expired_before
+        self._rearm_one(path)
+
+    def _flush_control(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+        pending = path.pending
+        if path.received.ack_at is not None and (pending or path.received.ack_at <= now or len(path.queue)):
+            ranges, delay = path.received.take_ack(now)
+            pending.append(frame.encode_ack(ranges, delay))
+        if path.probe_at is not None and path.probe_at <= now and self._ready and not self._closing:
+            self._send_probe(path, out, now)
+        if not pending:
+            return
+        if path.remote is None:
+            pending.clear()
+            return
+        path.pending = []
+        while pending:
+            size = 0
+            finished: int | None = None
+            taken: list[bytes] = []
+            while pending and size + len(pending[0]) <= MAX_FRAMES_BYTES and len(taken) < frame.MAX_FRAMES:
+                is_finished = pending[0][0] == frame.FINISHED_TYPE
+                if is_finished and finished is not None:
+                    break
+                encoded = pending.pop(0)
+                if is_finished:
+                    finished = frame.finished_number(encoded)
+                size += len(encoded)
+                taken.append(encoded)
+            number = path.recovery.take_number()
+            datagram = b"".join((self._header(path, number), *taken))
+            if finished is not None:
+                path.recovery.on_sent(number, now, len(datagram), finished=finished)
+                path.waits_for_answer(now)
+            out.append((path.remote, datagram))
+            self.stats.datagrams["sent", "control"] += 1
+
+    def _send_probe(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+        probe = frame.encode_probe(frame.Probe(path.next_probe(now, self._rng)))
+        if path.state is PathState.DOWN:
+            me = self.identity
+            probe = frame.encode_hello(frame.Hello(me.token, me.incarnation)) + probe
+        for address in path.destinations():
+            out.append((address, self._header(path, path.recovery.take_number()) + probe))
+            self.stats.datagrams["sent", "control"] += 1
+
+    def _header(self, path: Path, number: int) -> bytes:
+        me = self.identity
+        return frame.encode_header(Header(me.interface_id, path.remote_id, me.session, number))
+
+    # -- loss and liveness ----------------------------------------------------------------------------------------
+
+    def _path_timer(self, path: Path, now: float) -> None:
+        recovery = path.recovery
+        if recovery.loss_timer is not None and recovery.loss_timer <= now:
+            self._report_lost(path, recovery.detect_lost(now))
+        elif recovery.pto_timer is not None and recovery.pto_timer <= now:
+            self._report_lost(path, recovery.on_probe_timeout(now), timed_out=True)
+        state = path.check_silence(now)
+        if state is not None:
+            if state is PathState.DOWN:
+                self._take_down(path, "silent")
+            else:
+                self._events.append(PathChanged(path.id, state, "silent"))
+
+    def _take_down(self, path: Path, reason: str) -> None:
+        """Hand back what the path still carried, then say that it is down."""
+        path.state = PathState.DOWN
+        self._events.append(PathChanged(path.id, PathState.DOWN, reason))
+        self._report_lost(path, path.recovery.give_up_all())
+        for message in path.queue.clear():
+            missing = tuple(index for index in range(message.count) if message.needs(index))
+            self._events.append(FragmentsLost(path.id, message, missing))
+
+    def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
+        by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}
+        for datagram in lost:
+            if datagram.fragment is not None:
+                message, index = datagram.fragment
+                if message.needs(index):
+                    by_message.setdefault(message.number, (message, []))[1].append(index)
+            elif datagram.finished is not None and path.state is not PathState.DOWN:
+                self._owe(path, frame.encode_finished(frame.Finished(datagram.finished)))
+        for message, indices in by_message.values():
+            self._events.append(FragmentsLost(path.id, message, tuple(indices), timed_out))
+
+    def _measure(self) -> None:
+        for path in self._paths.values():
+            recovery = path.recovery
+            sent, lost = recovery.total_sent, recovery.total_lost
+            if path.rtts or sent != path.reported_sent:
+                self._events.append(
+                    PathMeasured(
+                        path.id,
+                        recovery.rtt.smoothed,
+                        tuple(path.rtts),
+                        sent - path.reported_sent,
+                        lost - path.reported_lost,
+                    )
+                )
+                path.rtts.clear()
+                path.reported_sent, path.reported_lost = sent, lost
+        self._publish_path_stats()
+
+    def _publish_path_stats(self) -> None:
+        best: dict[NodeName, Path] = {}
+        for path in self._paths.values():
+            other = best.get(path.peer)
+            if other is None or (path.state is PathState.UP and other.state is not PathState.UP):
+                best[path.peer] = path
+        self.stats.paths = {
+            name: PathStats(
+                up=path.state is PathState.UP,
+                srtt_s=path.recovery.rtt.smoothed,
+                datagrams_sent=path.recovery.total_sent,
+                datagrams_lost=path.recovery.total_lost,
+            )
+            for name, path in best.items()
+        }
+
+    # -- peers ----------------------------------------------------------------------------------------------------
+
+    def _set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> None:
+        before = self._paths
+        self._peers = {peer.name: peer for peer in peers}
+        self._by_session = {peer.session: peer for peer in peers}
+        self._by_token = {peer.token: peer for peer in peers}
+        self._paths = {}
+        for peer in peers:
+            for remote, addresses in peer.addresses:
+                path = before.pop((peer.name, remote), None)
+                if path is not None and path.session == peer.session:
+                    path.candidates = addresses
+                else:
+                    if path is not None:
+                        before[peer.name, remote] = path
+                    path = Path(PathId(self.identity.interface, peer.name, remote), peer.session, addresses, now)
+                self._paths[peer.name, remote] = path
+                self._dirty[path.id] = path
+        for path in before.values():
+            if path.state is not PathState.DOWN:
+                self._take_down(path, "peer left or restarted")
+            if (path.peer, path.remote_id) not in self._paths:
+                self._dirty.pop(path.id, None)
+                self._timer_of.pop(path.id, None)
+
+    # -- timers ---------------------------------------------------------------------------------------------------
+
+    def _rearm(self) -> None:
+        for path in self._dirty.values():
+            self._arm(path)
+
+    def _rearm_one(self, path: Path) -> None:
+        self._dirty.pop(path.id, None)
+        self._arm(path)
+
+    def _arm(self, path: Path) -> None:
+        recovery = path.recovery
+        timer = min(
+            (
+                time
+                for time in (
+                    path.probe_at if self._ready and not self._closing else None,
+                    path.received.ack_at,
+                    recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
+                    path.silence_timer,
+                )
+                if time is not None
+            ),
+            default=None,
+        )
+        if timer is None:
+            self._timer_of.pop(path.id, None)
+        elif self._timer_of.get(path.id) != timer:
+            self._timer_of[path.id] = timer
+            heapq.heappush(self._timers, (timer, next(self._order), path))

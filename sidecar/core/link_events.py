@@ -1,0 +1,162 @@
+"""What passes between a link (one interface, its own thread) and the engine (the requests): values only."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
+    from sidecar.core.frame import Fragment
+    from sidecar.core.outbound import OutboundMessage
+
+
+class PathId(NamedTuple):
+    """A path: our interface, the peer, and the peer's interface."""
+
+    interface: InterfaceName
+    peer: NodeName
+    remote: InterfaceId
+
+
+class PathState(enum.Enum):
+    """Liveness of a path."""
+
+    DOWN = "down"
+    """Not validated, or silent for long: only probes travel."""
+    UP = "up"
+    UNSTABLE = "unstable"
+    """Silent longer than its round-trip time explains: still used, but not relied on."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkPeer:
+    """A peer as a link needs to know it."""
+
+    name: NodeName
+    session: SessionId
+    token: bytes
+    incarnation: int
+    addresses: tuple[tuple[InterfaceId, tuple[Address, ...]], ...]
+    """For each of the peer's interfaces, where it may be reached."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetPeers:
+    """All peers that may be talked to; a peer with a new session starts afresh."""
+
+    peers: tuple[LinkPeer, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SetReady:
+    """Whether the interface may be used yet (its STUN succeeded, or no STUN server answers anybody)."""
+
+    ready: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Send a whole message over this path."""
+
+    path: PathId
+    message: OutboundMessage
+
+
+@dataclass(frozen=True, slots=True)
+class Resend:
+    """Send these symbols of a message over this path, which need not be the one that lost them."""
+
+    path: PathId
+    message: OutboundMessage
+    indices: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SendFinished:
+    """Tell the peer that its message is complete."""
+
+    path: PathId
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class SendClose:
+    """Tell all peers that we go away."""
+
+
+LinkCommand = SetPeers | SetReady | Send | Resend | SendFinished | SendClose
+
+
+class FragmentReceived(NamedTuple):
+    """A symbol came; its data views the received datagram."""
+
+    path: PathId
+    fragment: Fragment
+
+
+@dataclass(frozen=True, slots=True)
+class FragmentsLost:
+    """These symbols of a message did not arrive over this path."""
+
+    path: PathId
+    message: OutboundMessage
+    indices: tuple[int, ...]
+    timed_out: bool = False
+    """Nothing at all was heard in time: the path itself is suspect, not one datagram."""
+
+
+@dataclass(frozen=True, slots=True)
+class MessageFinished:
+    """The peer holds the whole message."""
+
+    peer: NodeName
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class PathChanged:
+    """A path's liveness changed."""
+
+    path: PathId
+    state: PathState
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class PathMeasured:
+    """Round-trip times (s) and datagram counts of one path since the last such event."""
+
+    path: PathId
+    smoothed_rtt_s: float
+    rtts_s: tuple[float, ...]
+    sent: int
+    lost: int
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRestarted:
+    """A known peer proved a newer session."""
+
+    peer: NodeName
+    session: SessionId
+    incarnation: int
+
+
+@dataclass(frozen=True, slots=True)
+class PeerClosed:
+    """The peer said goodbye."""
+
+    peer: NodeName
+
+
+LinkEvent = (
+    FragmentReceived
+    | FragmentsLost
+    | MessageFinished
+    | PathChanged
+    | PathMeasured
+    | PeerRestarted
+    | PeerClosed
+)

@@ -1,0 +1,169 @@
+"""What a reassembled message holds. Integers are big-endian.
+
+    request    1  request id (16 bytes) copy (8) lifetime left in ms (32) n (16) service name m (16) type name, payload
+    response   2  request id (16 bytes) copy (8) processing time in us (32), payload
+    rejection  3  request id (16 bytes) copy (8) reason (8) n (16) text
+
+`copy` numbers the copies of one request; the answer repeats it, so that each copy's latency is known whichever path
+the answer takes.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from protos.errors import DecodeError
+from protos.model import ServiceName
+from sidecar.core.events import RejectReason, RequestId
+from sidecar.core.request_id import REQUEST_ID_BYTES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
+MAX_NAME_BYTES = 255
+MAX_TEXT_BYTES = 500
+
+_HEAD = struct.Struct(f">B{REQUEST_ID_BYTES}sB")
+_U32 = struct.Struct(">I")
+_U16 = struct.Struct(">H")
+_REQUEST, _RESPONSE, _REJECTION = 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True)
+class RequestMessage:
+    """A copy of a request on its way to a server."""
+
+    request_id: RequestId
+    copy: int
+    lifetime_left_s: float
+    service: ServiceName
+    type: str
+    payload: bytes | memoryview = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseMessage:
+    """The answer to one copy; `processing_s` is the server's own share of the time."""
+
+    request_id: RequestId
+    copy: int
+    processing_s: float
+    payload: bytes | memoryview = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class RejectionMessage:
+    """The server did not answer one copy, and why."""
+
+    request_id: RequestId
+    copy: int
+    reason: RejectReason
+    text: str
+
+
+Message = RequestMessage | ResponseMessage | RejectionMessage
+
+
+def encode_message(message: Message) -> bytes:
+    """Return the message's bytes (one copy of the payload, into the buffer the fragments are cut from)."""
+    if isinstance(message, RequestMessage):
+        service, kind = message.service.encode(), message.type.encode()
+        lifetime_ms = max(0, min(int(message.lifetime_left_s * 1e3), 0xFFFFFFFF))
+        return b"".join(
+            (
+                _HEAD.pack(_REQUEST, message.request_id, message.copy),
+                _U32.pack(lifetime_ms),
+                _U16.pack(len(service)),
+                service,
+                _U16.pack(len(kind)),
+                kind,
+                message.payload,
+            )
+        )
+    if isinstance(message, ResponseMessage):
+        processing_us = max(0, min(int(message.processing_s * 1e6), 0xFFFFFFFF))
+        return b"".join(
+            (
+                _HEAD.pack(_RESPONSE, message.request_id, message.copy),
+                _U32.pack(processing_us),
+                message.payload,
+            )
+        )
+    text = message.text.encode()[:MAX_TEXT_BYTES]
+    return b"".join(
+        (
+            _HEAD.pack(_REJECTION, message.request_id, message.copy),
+            bytes((message.reason,)),
+            _U16.pack(len(text)),
+            text,
+        )
+    )
+
+
+def decode_message(view: memoryview) -> Message:
+    """Parse a reassembled message; payloads view the buffer.
+
+    Raises:
+        DecodeError: the bytes are not a message that we know.
+    """
+    try:
+        kind, request_id, copy = _HEAD.unpack_from(view)
+        decode = _DECODERS.get(kind)
+        if decode is None:
+            raise DecodeError(f"unknown message kind {kind}")
+        return decode(RequestId(request_id), copy, view, _HEAD.size)
+    except struct.error:
+        raise DecodeError("truncated message") from None
+
+
+def _decode_request(request_id: RequestId, copy: int, view: memoryview, position: int) -> Message:
+    (lifetime_ms,) = _U32.unpack_from(view, position)
+    service, position = _decode_text(view, position + 4, MAX_NAME_BYTES)
+    kind, position = _decode_text(view, position, MAX_NAME_BYTES)
+    payload = _payload(view, position)
+    return RequestMessage(request_id, copy, lifetime_ms / 1e3, ServiceName(service), kind, payload)
+
+
+def _decode_response(request_id: RequestId, copy: int, view: memoryview, position: int) -> Message:
+    (processing_us,) = _U32.unpack_from(view, position)
+    return ResponseMessage(request_id, copy, processing_us / 1e6, _payload(view, position + 4))
+
+
+def _decode_rejection(request_id: RequestId, copy: int, view: memoryview, position: int) -> Message:
+    if position >= len(view):
+        raise DecodeError("truncated message")
+    try:
+        reason = RejectReason(view[position])
+    except ValueError:
+        raise DecodeError("unknown reason of a rejection") from None
+    text, position = _decode_text(view, position + 1, MAX_TEXT_BYTES, errors="replace")
+    return RejectionMessage(request_id, copy, reason, text)
+
+
+_DECODERS: dict[int, Callable[[RequestId, int, memoryview, int], Message]] = {
+    _REQUEST: _decode_request,
+    _RESPONSE: _decode_response,
+    _REJECTION: _decode_rejection,
+}
+
+
+def _payload(view: memoryview, position: int) -> memoryview:
+    payload = view[position:]
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise DecodeError("payload over the limit")
+    return payload
+
+
+def _decode_text(view: memoryview, position: int, limit: int, errors: str = "strict") -> tuple[str, int]:
+    (length,) = _U16.unpack_from(view, position)
+    position += 2
+    raw = bytes(view[position : position + length])
+    if len(raw) != length or length > limit:
+        raise DecodeError("truncated or overlong text")
+    try:
+        return raw.decode(errors=errors), position + length
+    except UnicodeDecodeError:
+        raise DecodeError("text is not UTF-8") from None

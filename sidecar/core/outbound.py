@@ -1,0 +1,50 @@
+"""A message on its way out, shared by the links that carry its fragments."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.frame import MAX_SYMBOL_BYTES, symbol_count
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+
+
+class OutboundMessage:
+    """The bytes of one message and which symbols have arrived.
+
+    Links on several threads share it without a lock: `acked` bytes and `over` only ever go from 0 to 1, and a link
+    that reads an old value merely sends a symbol that is no longer needed.
+    """
+
+    __slots__ = ("acked", "count", "data", "deadline", "expires", "number", "over", "peer", "symbol")
+
+    def __init__(
+        self,
+        number: int,
+        peer: NodeName,
+        data: bytes,
+        *,
+        deadline: float,
+        expires: float,
+        symbol: int = MAX_SYMBOL_BYTES,
+    ) -> None:
+        self.number = number
+        self.peer = peer
+        self.data = memoryview(data)
+        self.deadline = deadline
+        self.expires = expires
+        self.symbol = symbol
+        self.count = symbol_count(len(data), symbol)
+        self.acked = bytearray(self.count)
+        self.over = False
+        """Delivered, cancelled or expired: nothing of it needs to travel any more."""
+
+    def needs(self, index: int) -> bool:
+        """Whether this symbol still has to travel."""
+        return not self.over and not self.acked[index]
+
+    def symbol_data(self, index: int) -> memoryview:
+        """Return one symbol, as a view."""
+        start = index * self.symbol
+        return self.data[start : start + self.symbol]

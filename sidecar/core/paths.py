@@ -1,0 +1,171 @@
+"""One path: where it leads, whether it lives, when to probe it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.link_events import PathId, PathState
+from sidecar.core.pacing import SendQueue, Window
+from sidecar.core.received import ReceivedPackets
+from sidecar.core.recovery import Recovery
+
+if TYPE_CHECKING:
+    import random
+
+    from protos.model import Address, InterfaceId, NodeName, SessionId
+
+IDLE_PROBE_S = 0.5
+"""A quiet path is probed this often: keeps NAT bindings open (RFC 4787 asks for 2 minutes, real ones forget after
+seconds) and finds a dead path within a second."""
+FIRST_PROBE_S = 0.05
+"""Probes to a path that is not up start this close together ..."""
+MAX_PROBE_S = 1.0
+"""... and back off to this, so that a path that comes back is seen within a second."""
+PROBE_BACKOFF = 1.5
+DOWN_FACTOR = 4.0
+"""An unstable path is down after this many times the silence that made it unstable ..."""
+DOWN_FLOOR_S = 0.5
+"""... but not before this."""
+MAX_PROBES_OUT = 32
+"""Unanswered probes that are remembered; older ones could only give stale round-trip times."""
+MAX_RTT_SAMPLES = 512
+"""Round-trip times kept between two reports."""
+
+
+class Path:
+    """Sender's and receiver's state of one path. Owned by its link."""
+
+    __slots__ = (
+        "_next_probe_id",
+        "_probe_gap",
+        "_probes_out",
+        "_waiting_since",
+        "candidates",
+        "id",
+        "is_validated",
+        "largest_received",
+        "pending",
+        "probe_at",
+        "queue",
+        "received",
+        "recovery",
+        "remote",
+        "remote_id",
+        "reported_lost",
+        "reported_sent",
+        "rtts",
+        "session",
+        "state",
+        "window",
+    )
+
+    def __init__(self, path_id: PathId, session: SessionId, candidates: tuple[Address, ...], now: float) -> None:
+        self.id = path_id
+        self.remote_id: InterfaceId = path_id.remote
+        self.session = session
+        self.candidates = candidates
+        self.remote: Address | None = None
+        """Where the newest authentic datagram came from."""
+        self.state = PathState.DOWN
+        self.recovery = Recovery()
+        self.received = ReceivedPackets()
+        self.window = Window()
+        self.queue = SendQueue()
+        self.pending: list[bytes] = []
+        """Encoded control frames that wait for the next datagram."""
+        self.largest_received = -1
+        self.probe_at: float | None = now
+        self.rtts: list[float] = []
+        self.reported_sent = 0
+        self.reported_lost = 0
+        self._probe_gap = FIRST_PROBE_S
+        self._next_probe_id = 0
+        self._probes_out: dict[int, float] = {}
+        self._waiting_since: float | None = None
+
+    @property
+    def peer(self) -> NodeName:
+        """The node at the other end."""
+        return self.id.peer
+
+    def destinations(self) -> tuple[Address, ...]:
+        """Where a probe goes now: the known address, or every candidate while the path is not up."""
+        if self.remote is not None and self.state is not PathState.DOWN:
+            return (self.remote,)
+        if self.remote is not None and self.remote not in self.candidates:
+            return (self.remote, *self.candidates)
+        return self.candidates
+
+    def next_probe(self, now: float, rng: random.Random) -> int:
+        """Return the id of a probe that leaves now, and plan the next one."""
+        probe_id = self._next_probe_id
+        self._next_probe_id = (probe_id + 1) & 0xFFFFFFFF
+        self._probes_out[probe_id] = now
+        if len(self._probes_out) > MAX_PROBES_OUT:
+            del self._probes_out[next(iter(self._probes_out))]
+        self.waits_for_answer(now)
+        if self.state is PathState.UP:
+            gap = IDLE_PROBE_S
+        elif self.state is PathState.UNSTABLE:
+            gap = max(FIRST_PROBE_S, self.recovery.rtt.smoothed)
+        else:
+            gap = self._probe_gap
+            self._probe_gap = min(gap * PROBE_BACKOFF, MAX_PROBE_S)
+        self.probe_at = now + gap * rng.uniform(0.9, 1.1)
+        return probe_id
+
+    def answered_probe(self, probe_id: int, now: float) -> bool:
+        """A PROBE_REPLY came; False when it answers nothing we asked."""
+        sent_at = self._probes_out.pop(probe_id, None)
+        if sent_at is None:
+            return False
+        self.recovery.rtt.sample(now - sent_at)
+        self.note_rtt()
+        return True
+
+    def note_rtt(self) -> None:
+        """Keep the latest round-trip time for the next report."""
+        if len(self.rtts) < MAX_RTT_SAMPLES:
+            self.rtts.append(self.recovery.rtt.latest)
+
+    def waits_for_answer(self, now: float) -> None:
+        """Something that wants an answer left."""
+        if self._waiting_since is None:
+            self._waiting_since = now
+
+    def made_progress(self, now: float) -> bool:
+        """The peer proved that our datagrams arrive; True when that brings the path up."""
+        self._waiting_since = now if self.recovery.sent else None
+        if self.state is PathState.UP:
+            if self.probe_at is None or self.probe_at < now + IDLE_PROBE_S / 2:
+                self.probe_at = now + IDLE_PROBE_S
+            return False
+        self.state = PathState.UP
+        self._probe_gap = FIRST_PROBE_S
+        self.probe_at = now + IDLE_PROBE_S
+        return True
+
+    @property
+    def silence_timer(self) -> float | None:
+        """When the present silence makes the path unstable or down."""
+        if self._waiting_since is None or self.state is PathState.DOWN:
+            return None
+        return self._waiting_since + self._limit()
+
+    def _limit(self) -> float:
+        limit = self.recovery.rtt.silence_limit()
+        return limit if self.state is PathState.UP else max(DOWN_FACTOR * limit, DOWN_FLOOR_S)
+
+    def check_silence(self, now: float) -> PathState | None:
+        """Return the new state when the silence changed it."""
+        timer = self.silence_timer
+        if timer is None or timer > now:
+            return None
+        if self.state is PathState.UP:
+            self.state = PathState.UNSTABLE
+        else:
+            self.state = PathState.DOWN
+            self._waiting_since = None
+            self._probes_out.clear()
+        self.probe_at = now
+        return self.state

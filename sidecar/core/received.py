@@ -1,0 +1,94 @@
+"""Packet numbers received on one path, and the acknowledgement owed for them."""
+
+from __future__ import annotations
+
+from sidecar.core.frame import MAX_ACK_RANGES
+
+MAX_ACK_DELAY_S = 0.005
+"""A lone datagram's acknowledgement may wait this long for something to travel with."""
+ACK_EVERY = 2
+"""Acknowledge at once after this many ack-eliciting datagrams (RFC 9000 section 13.2.2)."""
+STALE_PACKETS = 1024
+"""Ranges this far below the largest are no longer told: the sender has long declared their gaps lost."""
+
+
+class ReceivedPackets:
+    """Which packet numbers came, as at most MAX_ACK_RANGES inclusive ranges, highest first."""
+
+    __slots__ = ("_ack_at", "_gap", "_largest_at", "_ranges", "_unacked")
+
+    def __init__(self) -> None:
+        self._ranges: list[list[int]] = []
+        self._largest_at = 0.0
+        self._ack_at: float | None = None
+        self._unacked = 0
+        self._gap = False
+
+    def add(self, number: int, now: float) -> bool:
+        """Note a packet number; False when it came before or is older than what is remembered."""
+        ranges = self._ranges
+        if not ranges or number > ranges[0][1]:
+            if ranges and number == ranges[0][1] + 1:
+                ranges[0][1] = number
+            else:
+                self._gap = bool(ranges)
+                ranges.insert(0, [number, number])
+                del ranges[MAX_ACK_RANGES:]
+                while ranges[-1][1] < number - STALE_PACKETS:
+                    ranges.pop()
+            self._largest_at = now
+            return True
+        self._gap = True
+        return self._fill(number)
+
+    def _fill(self, number: int) -> bool:
+        ranges = self._ranges
+        for position, (low, high) in enumerate(ranges):
+            if low <= number <= high:
+                return False
+            if number > high:
+                joins_upper = position > 0 and ranges[position - 1][0] == number + 1
+                joins_lower = high + 1 == number
+                if joins_upper and joins_lower:
+                    ranges[position - 1][0] = low
+                    del ranges[position]
+                elif joins_upper:
+                    ranges[position - 1][0] = number
+                elif joins_lower:
+                    ranges[position][1] = number
+                else:
+                    ranges.insert(position, [number, number])
+                    del ranges[MAX_ACK_RANGES:]
+                return True
+        if ranges[-1][0] == number + 1:
+            ranges[-1][0] = number
+            return True
+        if len(ranges) < MAX_ACK_RANGES:
+            ranges.append([number, number])
+            return True
+        return False
+
+    def owe_ack(self, now: float, *, at_once: bool) -> None:
+        """An ack-eliciting datagram came: acknowledge it now or soon."""
+        self._unacked += 1
+        if at_once or self._unacked >= ACK_EVERY or self._gap:
+            self._ack_at = now
+        elif self._ack_at is None:
+            self._ack_at = now + MAX_ACK_DELAY_S
+
+    @property
+    def ack_at(self) -> float | None:
+        """When the acknowledgement is due; None when nothing is owed."""
+        return self._ack_at
+
+    @property
+    def ack_owed(self) -> bool:
+        """Whether a datagram that leaves now should carry an acknowledgement."""
+        return self._ack_at is not None
+
+    def take_ack(self, now: float) -> tuple[list[tuple[int, int]], float]:
+        """Return the ranges and the delay since the largest came, and owe nothing any more."""
+        self._ack_at = None
+        self._unacked = 0
+        self._gap = False
+        return [(low, high) for low, high in self._ranges], max(0.0, now - self._largest_at)

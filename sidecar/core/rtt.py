@@ -1,0 +1,56 @@
+"""Round-trip time of one path (RFC 9002 section 5; RFC 6298)."""
+
+from __future__ import annotations
+
+INITIAL_RTT_S = 0.2
+"""Assumed before the first sample: a cellular path at rest."""
+GRANULARITY_S = 0.001
+"""Finest timer that is worth arming."""
+UNSTABLE_FLOOR_S = 0.060
+"""A path silent for less than this is never called unstable (SRT's floor)."""
+
+
+class RttEstimator:
+    """Smoothed round-trip time, its variation and its minimum, in seconds."""
+
+    __slots__ = ("latest", "minimum", "smoothed", "variation")
+
+    def __init__(self) -> None:
+        self.smoothed = 0.0
+        self.variation = 0.0
+        self.minimum = 0.0
+        self.latest = 0.0
+
+    @property
+    def has_sample(self) -> bool:
+        """Whether anything was measured."""
+        return self.latest > 0
+
+    def sample(self, rtt_s: float) -> None:
+        """Take one measured round trip, the peer's own delay already subtracted."""
+        rtt_s = max(rtt_s, 1e-6)
+        if not self.has_sample:
+            self.smoothed = self.minimum = rtt_s
+            self.variation = rtt_s / 2
+        else:
+            self.variation += (abs(self.smoothed - rtt_s) - self.variation) / 4
+            self.smoothed += (rtt_s - self.smoothed) / 8
+            self.minimum = min(self.minimum, rtt_s)
+        self.latest = rtt_s
+
+    def probe_timeout(self, peer_delay_s: float) -> float:
+        """Seconds after which an acknowledgement is overdue (RFC 9002 section 6.2.1)."""
+        if not self.has_sample:
+            return 2 * INITIAL_RTT_S
+        return self.smoothed + max(4 * self.variation, GRANULARITY_S) + peer_delay_s
+
+    def loss_delay(self) -> float:
+        """Seconds after which a datagram older than an acknowledged one is lost (RFC 9002 section 6.1.2)."""
+        reference = max(self.smoothed, self.latest) if self.has_sample else INITIAL_RTT_S
+        return max(9 / 8 * reference, GRANULARITY_S)
+
+    def silence_limit(self) -> float:
+        """Seconds of unanswered silence after which the path is unstable."""
+        if not self.has_sample:
+            return 2 * INITIAL_RTT_S
+        return max(2 * self.smoothed + 4 * self.variation, UNSTABLE_FLOOR_S)
