@@ -1,0 +1,217 @@
+"""Mergeable latency histogram with logarithmic buckets: the unit of every report.
+
+Layout 1::
+
+    index        0        |   1  ..  340                        |     341
+    covers   [0, 0.1 ms)  |   [EDGES[i-1], EDGES[i])            |  [60 s, inf)
+                          |   each 3.991 % wider than the last  |
+
+    beside the buckets: `lost`, requests that were never answered
+
+A value reported at the geometric middle of its bucket is off by less than 2 %. Histograms of the same layout
+merge by adding counts, which is exact and independent of the order.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from bisect import bisect_right
+from typing import TYPE_CHECKING
+
+from protos.errors import DecodeError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+LAYOUT = 1
+"""Number of the bucket layout above; another layout gets another number, never this one changed."""
+
+MIN_S = 1e-4
+"""Lower edge of the first regular bucket, seconds: below what a request over any network takes."""
+
+MAX_S = 60.0
+"""Upper edge of the last regular bucket, seconds: beyond every deadline that makes sense for a robot."""
+
+REGULAR_BUCKETS = 340
+"""The fewest that keep the error below 2 % between MIN_S and MAX_S."""
+
+GROWTH = (MAX_S / MIN_S) ** (1.0 / REGULAR_BUCKETS)
+"""Ratio of a regular bucket's upper edge to its lower one."""
+
+EDGES: tuple[float, ...] = (
+    *(MIN_S * GROWTH**i for i in range(REGULAR_BUCKETS)),
+    MAX_S,
+)
+"""The edges between buckets, seconds: bucket i ends at EDGES[i], and the last has no end."""
+
+BUCKETS = REGULAR_BUCKETS + 2
+"""Regular buckets, underflow and overflow."""
+
+MIDS: tuple[float, ...] = (
+    MIN_S / 2,
+    *(math.sqrt(low * high) for low, high in itertools.pairwise(EDGES)),
+    MAX_S,
+)
+"""The value that stands for a bucket, seconds: its geometric middle; for overflow its lower edge."""
+
+MAX_COUNT = 1 << 40
+"""Largest count accepted from the network: more than any sidecar sends in a lifetime, and far from
+where a 64-bit sum or a float would lose it."""
+
+
+class Histogram:
+    """Counts of latencies by bucket; mutable, and for one thread at a time. Times are seconds."""
+
+    __slots__ = ("_counts", "_lost")
+
+    # Mutable: equal by content, hence not hashable.
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self) -> None:
+        self._counts = [0] * BUCKETS
+        self._lost = 0
+
+    def record(self, seconds: float) -> None:
+        """Count one answered request; negative times (clock noise) count as zero. NaN raises ValueError."""
+        # Bisection over the edges runs in C, and is exact at the edges where a logarithm is not.
+        if seconds != seconds:
+            raise ValueError("a latency is not NaN")
+        self._counts[bisect_right(EDGES, seconds)] += 1
+
+    def record_lost(self, n: int = 1) -> None:
+        """Count `n` requests that were never answered."""
+        if n < 0:
+            raise ValueError("a count is not negative")
+        self._lost += n
+
+    def merge(self, other: Histogram) -> None:
+        """Add the counts of `other` to this one."""
+        self._counts = [a + b for a, b in zip(self._counts, other._counts, strict=True)]
+        self._lost += other._lost
+
+    def copy(self) -> Histogram:
+        """A histogram of its own with the same counts."""
+        twin = Histogram()
+        twin._counts = self._counts.copy()
+        twin._lost = self._lost
+        return twin
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._counts = [0] * BUCKETS
+        self._lost = 0
+
+    def take(self) -> Histogram:
+        """What was recorded so far, and start anew."""
+        taken = Histogram()
+        taken._counts, taken._lost = self._counts, self._lost
+        self.clear()
+        return taken
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Count of each bucket, `BUCKETS` of them."""
+        return tuple(self._counts)
+
+    @property
+    def lost(self) -> int:
+        """Requests that were never answered."""
+        return self._lost
+
+    @property
+    def answered(self) -> int:
+        """Requests that were answered, however late."""
+        return sum(self._counts)
+
+    @property
+    def total(self) -> int:
+        """All requests, answered or lost."""
+        return sum(self._counts) + self._lost
+
+    def count_over(self, seconds: float) -> float:
+        """How many took longer than `seconds`, linear inside a bucket; the lost took longer than anything.
+
+        All of the overflow bucket counts as over: how far over it goes, it does not know.
+        """
+        index = bisect_right(EDGES, seconds)
+        over = float(sum(self._counts[index + 1 :]) + self._lost)
+        if index == BUCKETS - 1:
+            return over + self._counts[index]
+        low = EDGES[index - 1] if index else 0.0
+        high = EDGES[index]
+        return over + self._counts[index] * min(1.0, (high - seconds) / (high - low))
+
+    def fraction_over(self, seconds: float) -> float:
+        """Share of all requests that took longer than `seconds`; NaN of an empty histogram."""
+        total = self.total
+        return self.count_over(seconds) / total if total else math.nan
+
+    def quantile(self, q: float) -> float:
+        """Latency that a share `q` of all requests does not exceed, within 2 %.
+
+        inf where that many were not answered, `MAX_S` in the overflow bucket, NaN of an empty histogram.
+        Raises ValueError unless 0 <= q <= 1.
+        """
+        if not 0.0 <= q <= 1.0:
+            raise ValueError(f"a quantile lies in [0, 1], not {q}")
+        total = self.total
+        if not total:
+            return math.nan
+        rank = max(1, math.ceil(q * total))
+        seen = 0
+        for count, mid in zip(self._counts, MIDS, strict=True):
+            seen += count
+            if seen >= rank:
+                return mid
+        return math.inf
+
+    def mean(self) -> float:
+        """Mean latency of the answered requests, within 2 %; NaN if there are none."""
+        answered = self.answered
+        if not answered:
+            return math.nan
+        return sum(count * mid for count, mid in zip(self._counts, MIDS, strict=True)) / answered
+
+    def to_sparse(self) -> tuple[list[int], list[int], int]:
+        """Indices of the buckets in use, ascending, their counts, and the lost."""
+        indices = [index for index, count in enumerate(self._counts) if count]
+        return indices, [self._counts[index] for index in indices], self._lost
+
+    @classmethod
+    def from_sparse(
+        cls, indices: Sequence[int], counts: Sequence[int], lost: int, *, layout: int = LAYOUT
+    ) -> Histogram:
+        """The inverse of `to_sparse`; raises DecodeError on anything that `to_sparse` cannot have made."""
+        if layout != LAYOUT:
+            raise DecodeError(f"histogram layout {layout} is not {LAYOUT}")
+        if len(indices) != len(counts):
+            raise DecodeError(f"histogram has {len(indices)} indices but {len(counts)} counts")
+        if not 0 <= lost <= MAX_COUNT:
+            raise DecodeError(f"histogram counts {lost} lost, which is not within 0..{MAX_COUNT}")
+        histogram = cls()
+        previous = -1
+        for index, count in zip(indices, counts, strict=True):
+            if not previous < index < BUCKETS:
+                raise DecodeError(
+                    f"histogram index {index} does not follow {previous} within 0..{BUCKETS - 1}"
+                )
+            if not 1 <= count <= MAX_COUNT:
+                raise DecodeError(f"histogram count {count} is not within 1..{MAX_COUNT}")
+            histogram._counts[index] = count
+            previous = index
+        histogram._lost = lost
+        return histogram
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Histogram):
+            return NotImplemented
+        return self._lost == other._lost and self._counts == other._counts
+
+    def __repr__(self) -> str:
+        if not self.total:
+            return "Histogram(empty)"
+        return (
+            f"Histogram(total={self.total}, lost={self._lost}, "
+            f"p50={self.quantile(0.5):.4g} s, p99={self.quantile(0.99):.4g} s)"
+        )
