@@ -1,0 +1,245 @@
+"""The sidecar's configuration: one YAML file, validated once, frozen, passed in."""
+
+from __future__ import annotations
+
+import enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from protos.errors import ConfigError
+from protos.model import NodeName, Role, ServiceName
+from sidecar.config_fields import (
+    InterfacePattern,
+    IpAddress,
+    ListenAddress,
+    RemoteAddress,
+    ServicePattern,
+    SidecarName,
+    is_glob,
+    refuse_duplicates,
+)
+from sidecar.config_file import key_path, parse_yaml, read_text, validate
+from sidecar.core.rules import ServiceRule, find_rule
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+DEFAULT_CLOUD_UDP_PORT = 24700
+"""Fixed, since a firewall rule has to name it; below Linux' ephemeral ports (32768 and up)."""
+
+MAX_DEADLINE_MS = 60_000
+"""Where the latency histogram ends: a miss of a longer deadline could not be predicted."""
+
+MAX_LIFETIME_MS = 3_600_000
+"""An hour: a request that waits longer is a job, not a call."""
+
+MIN_DEFAULT_LIFETIME_MS = 10_000.0
+"""A request outlives its deadline at least until a dead path is noticed and another one has tried."""
+
+LIFETIME_PER_DEADLINE = 10.0
+"""Default lifetime, in deadlines."""
+
+CLOUD_LIFETIME_MS = 60_000.0
+"""How long a cloud sidecar waits for a local server by default."""
+
+_UNLIMITED = 0
+_MS_PER_S = 1000.0
+
+# A YAML list becomes a tuple, a word an enum: strictness would refuse both. What the list holds stays strict.
+_converted = Field(strict=False)
+
+
+class LogLevel(enum.Enum):
+    """How much is logged."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+class StunConfig(_Section):
+    """How the sidecar learns its addresses as seen from outside."""
+
+    enabled: bool = True
+    """Off only where no NAT lies between the sidecars, such as clouds with public addresses."""
+    servers: Annotated[tuple[RemoteAddress, ...], AfterValidator(refuse_duplicates), _converted] = ()
+    """host:port of each server; none: those that the control plane names."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.servers and not self.enabled:
+            raise ValueError("expected no servers while enabled is false")
+        return self
+
+
+class AdvertisedAddress(_Section):
+    """A public address that a 1:1 NAT translates to one interface of a cloud."""
+
+    address: IpAddress
+    """IPv4 or IPv6, without port: the NAT keeps udp_port."""
+    interface: InterfacePattern | None = None
+    """The interface behind it; none: the first usable one."""
+
+
+class ServiceConfig(_Section):
+    """One service, or all whose name matches a glob; the first entry that matches a name decides."""
+
+    name: ServicePattern
+    """Full name such as /plan_path, or a glob such as /arm/*."""
+    deadline_ms: Annotated[float, Field(gt=0, le=MAX_DEADLINE_MS)] | None = None
+    """Robot, required: an answer is in time within this many milliseconds."""
+    lifetime_ms: Annotated[float, Field(gt=0, le=MAX_LIFETIME_MS)] | None = None
+    """Milliseconds after which an unanswered request is given up; more than deadline_ms.
+
+    Robot: by default 10 deadlines, at least 10000. Cloud: how long a local server is waited for, by default
+    60000."""
+    idempotent: bool | None = None
+    """Robot: copies of one request may run on several servers. Default false."""
+    drop_late: bool | None = None
+    """Robot: an answer after the deadline is not delivered. Default false."""
+    capacity_interfaces: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    """Cloud: how many robot interfaces may be mapped to this server for the service; none: no limit."""
+
+
+class SidecarConfig(_Section):
+    """Configuration of plr-sidecar."""
+
+    name: SidecarName
+    """Name of this sidecar, unique in the mesh."""
+    role: Annotated[Role, _converted]
+    """robot: its applications call services; cloud: its servers answer them."""
+    control_plane: RemoteAddress
+    """host:port of the control plane."""
+    services: Annotated[tuple[ServiceConfig, ...], Field(min_length=1), _converted]
+    """What is carried; nothing else is."""
+    interfaces: (
+        Annotated[
+            tuple[InterfacePattern, ...], Field(min_length=1), AfterValidator(refuse_duplicates), _converted
+        ]
+        | None
+    ) = None
+    """Names or globs; none: all usable ones, which leaves out loopback, containers, bridges and tunnels."""
+    udp_port: Annotated[int, Field(ge=0, le=65535)] = Field(
+        default_factory=lambda fields: DEFAULT_CLOUD_UDP_PORT if fields.get("role") is Role.CLOUD else 0
+    )
+    """Port of the data sockets, 0 for any free one. Default: 0 on a robot, 24700 on a cloud."""
+    advertise: Annotated[tuple[AdvertisedAddress, ...], _converted] = ()
+    """Cloud behind a 1:1 NAT: its public addresses."""
+    stun: StunConfig = StunConfig()
+    """How the sidecar learns its addresses as seen from outside."""
+    state_dir: Annotated[Path, _converted] = Path("/var/lib/plr")
+    """Absolute path of the folder for the identity and the last good mapping."""
+    metrics_listen: ListenAddress | None = "127.0.0.1:9464"
+    """address:port of the Prometheus metrics; null for none."""
+    log_level: Annotated[LogLevel, _converted] = LogLevel.INFO
+    """debug, info, warning or error."""
+
+    @property
+    def node_name(self) -> NodeName:
+        """`name`, typed."""
+        return NodeName(self.name)
+
+    def service_rules(self) -> tuple[ServiceRule, ...]:
+        """The services as the cores want them, in order."""
+        return tuple(_rule(self.role, service) for service in self.services)
+
+
+def load_config(path: Path) -> SidecarConfig:
+    """Read and check the file; raises ConfigError."""
+    return parse_config(read_text(path), str(path))
+
+
+def parse_config(text: str, source: str) -> SidecarConfig:
+    """Check YAML text; `source` names it in the error. Raises ConfigError."""
+    config = validate(SidecarConfig, parse_yaml(text, source), source)
+    for location, problem in _cross_checks(config):
+        raise ConfigError(source, key_path(location), problem)
+    return config
+
+
+def config_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the configuration file."""
+    schema = SidecarConfig.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def _rule(role: Role, service: ServiceConfig) -> ServiceRule:
+    if role is Role.CLOUD:
+        lifetime_ms = service.lifetime_ms or CLOUD_LIFETIME_MS
+        deadline_ms = lifetime_ms
+    else:
+        deadline_ms = service.deadline_ms or MAX_DEADLINE_MS
+        lifetime_ms = service.lifetime_ms or max(LIFETIME_PER_DEADLINE * deadline_ms, MIN_DEFAULT_LIFETIME_MS)
+    return ServiceRule(
+        pattern=service.name,
+        deadline_s=deadline_ms / _MS_PER_S,
+        lifetime_s=lifetime_ms / _MS_PER_S,
+        idempotent=bool(service.idempotent),
+        drop_late=bool(service.drop_late),
+        capacity=service.capacity_interfaces or _UNLIMITED,
+    )
+
+
+_Problem = tuple[tuple[str | int, ...], str]
+
+
+def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
+    """Yield what single fields cannot know; a key that would have no effect is refused, not ignored."""
+    if not config.state_dir.is_absolute():
+        yield ("state_dir",), f"expected an absolute path, got '{config.state_dir}'"
+    for index, service in enumerate(config.services):
+        for key, problem in _check_service(config.role, service):
+            yield ("services", index, key), problem
+        yield from _check_order(config, index)
+    if config.advertise and config.role is Role.ROBOT:
+        yield ("advertise",), "expected on a cloud only: a robot's addresses come from STUN"
+    if config.advertise and config.udp_port == 0:
+        yield ("udp_port",), "expected a fixed port beside advertise, got 0"
+    for index, advertised in enumerate(config.advertise):
+        if advertised.interface is not None and is_glob(advertised.interface):
+            yield ("advertise", index, "interface"), f"expected a name, got the glob '{advertised.interface}'"
+        if advertised in config.advertise[:index]:
+            yield ("advertise", index), "expected each entry once"
+
+
+def _check_service(role: Role, service: ServiceConfig) -> Iterator[tuple[str, str]]:
+    if role is Role.CLOUD:
+        for key in ("deadline_ms", "idempotent", "drop_late"):
+            if getattr(service, key) is not None:
+                yield key, "expected on a robot only: it is the robot's sidecar that decides this"
+        return
+    if service.capacity_interfaces is not None:
+        yield "capacity_interfaces", "expected on a cloud only: it limits what that server takes"
+    if service.deadline_ms is None:
+        yield "deadline_ms", "expected milliseconds, but missing"
+    elif service.lifetime_ms is not None and service.lifetime_ms <= service.deadline_ms:
+        yield (
+            "lifetime_ms",
+            f"expected more than deadline_ms ({service.deadline_ms:g}), got {service.lifetime_ms:g}",
+        )
+
+
+def _check_order(config: SidecarConfig, index: int) -> Iterator[_Problem]:
+    name = config.services[index].name
+    for before, service in enumerate(config.services[:index]):
+        if service.name == name:
+            yield (
+                ("services", index, "name"),
+                f"expected each name once, got '{name}' in services[{before}] too",
+            )
+    if not is_glob(name):
+        winner = find_rule(config.service_rules()[:index], ServiceName(name))
+        if winner is not None and winner.pattern != name:
+            yield (
+                ("services", index, "name"),
+                f"expected before the glob '{winner.pattern}', which matches '{name}' first",
+            )

@@ -1,0 +1,169 @@
+"""Strict YAML: no key written twice, and every problem as one line that names file, key and expectation."""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from protos.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from pydantic_core import ErrorDetails
+
+Model = TypeVar("Model", bound=BaseModel)
+
+MAX_CONFIG_BYTES = 1 << 20
+"""A configuration is written by hand; a larger file is some other file."""
+
+_SHOWN_INPUT_CHARACTERS = 60
+
+_EXPECTED = {
+    "tuple_type": "a list",
+    "model_type": "keys and values",
+    "string_type": "text",
+    "int_type": "a whole number",
+    "float_type": "a number",
+    "bool_type": "true or false",
+    "path_type": "a path",
+}
+"""What the reader of a YAML file calls the kinds of values."""
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """SafeLoader that refuses a key written twice, where YAML would silently keep the last one."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            key = self.construct_object(key_node, deep=True)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key!r} is written twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def read_text(path: Path) -> str:
+    """Return the file's text; raises ConfigError."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_CONFIG_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(str(path), "", f"cannot be read: {error.strerror or error}") from error
+    if len(data) > MAX_CONFIG_BYTES:
+        raise ConfigError(str(path), "", f"expected at most {MAX_CONFIG_BYTES} bytes of YAML")
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise ConfigError(str(path), "", f"expected UTF-8: {error.reason} at byte {error.start}") from error
+
+
+def parse_yaml(text: str, source: str) -> dict[str, Any]:
+    """Return the one mapping that the text holds; raises ConfigError."""
+    try:
+        # The loader derives from SafeLoader: only plain values come out.
+        data = yaml.load(text, Loader=_StrictLoader)  # noqa: S506
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        where = f"line {mark.line + 1}" if mark else ""
+        raise ConfigError(source, where, f"expected YAML: {error.problem or error.context}") from error
+    except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        # The constructors of the YAML package leak these for malformed scalars (!!int x, 2026-02-31).
+        raise ConfigError(source, "", f"expected YAML: {_one_line(str(error))}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(source, "", f"expected keys and values, got {_shown(data)}")
+    for key in data:
+        if not isinstance(key, str):
+            raise ConfigError(source, _shown(key), "expected a key that is text; quote it")
+    return data
+
+
+def validate(model: type[Model], data: Mapping[str, Any], source: str) -> Model:
+    """Return the validated model; raises ConfigError with the first problem and how many follow."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        problems = _root_problems(error.errors(include_url=False))
+        first = problems[0]
+        text = _describe(model, first)
+        if len(problems) > 1:
+            text += f" (and {len(problems) - 1} more)"
+        raise ConfigError(source, key_path(first["loc"]), text) from error
+
+
+def key_path(location: Iterable[str | int]) -> str:
+    """Write a location the way a reader finds it: services[0].deadline_ms."""
+    path = ""
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        else:
+            path += f".{part}" if path else part
+    return path
+
+
+def _root_problems(problems: list[ErrorDetails]) -> list[ErrorDetails]:
+    """Leave out what is only there because another field or a list's entry has a problem."""
+    parents = {problem["loc"][:length] for problem in problems for length in range(len(problem["loc"]))}
+    return [
+        problem
+        for problem in problems
+        if problem["type"] != "default_factory_not_called"
+        and not (problem["type"] == "too_short" and problem["loc"] in parents)
+    ]
+
+
+def _describe(model: type[BaseModel], problem: ErrorDetails) -> str:
+    kind = problem["type"]
+    if kind == "missing":
+        return "expected, but missing"
+    if kind == "extra_forbidden":
+        known = _keys_at(model, problem["loc"][:-1])
+        close = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
+        return f"unknown key; {hint}"
+    if kind == "too_short":
+        return f"expected at least {problem['ctx']['min_length']} entry"
+    if kind in _EXPECTED:
+        return f"expected {_EXPECTED[kind]}, got {_shown(problem['input'])}"
+    message = problem["msg"].removeprefix("Value error, ")
+    if message.startswith("Input should be "):
+        message = f"expected {message.removeprefix('Input should be ')}, got {_shown(problem['input'])}"
+    return _one_line(message)
+
+
+def _keys_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[str]:
+    """Return the keys that the model, or the model nested in it at `location`, knows."""
+    schema = model.model_json_schema()
+    definitions = schema.get("$defs", {})
+    here: dict[str, Any] = schema
+    for part in location:
+        here = here.get("items", {}) if isinstance(part, int) else here.get("properties", {}).get(part, {})
+        for option in (here, *here.get("anyOf", ()), *here.get("allOf", ())):
+            if "$ref" in option:
+                here = definitions[option["$ref"].rsplit("/", 1)[-1]]
+                break
+            if "items" in option:
+                here = option
+                break
+        if "$ref" in here:
+            here = definitions[here["$ref"].rsplit("/", 1)[-1]]
+    return sorted(here.get("properties", ()))
+
+
+def _shown(value: object) -> str:
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) <= _SHOWN_INPUT_CHARACTERS else text[:_SHOWN_INPUT_CHARACTERS] + "…"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,296 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from protos.errors import ConfigError
+from protos.model import Role
+from sidecar.config import (
+    DEFAULT_CLOUD_UDP_PORT,
+    LogLevel,
+    SidecarConfig,
+    config_schema,
+    load_config,
+    parse_config,
+)
+
+SOURCE = "sidecar.yaml"
+ROBOT: dict[str, Any] = {
+    "name": "robot-1",
+    "role": "robot",
+    "control_plane": "plr.example.org:50051",
+    "services": [{"name": "/plan_path", "deadline_ms": 100}],
+}
+CLOUD: dict[str, Any] = {
+    "name": "cloud-a",
+    "role": "cloud",
+    "control_plane": "[2001:db8::1]:50051",
+    "services": [{"name": "/*"}],
+}
+
+
+def parse(base: dict[str, Any], **changes: Any) -> SidecarConfig:
+    return parse_config(yaml.safe_dump({**base, **changes}), SOURCE)
+
+
+def with_service(base: dict[str, Any], **keys: Any) -> dict[str, Any]:
+    return {**base, "services": [{**base["services"][0], **keys}]}
+
+
+def test_smallest_robot_gets_the_defaults() -> None:
+    config = parse(ROBOT)
+    assert config.role is Role.ROBOT
+    assert config.interfaces is None
+    assert config.udp_port == 0
+    assert config.stun.enabled
+    assert config.stun.servers == ()
+    assert config.state_dir == Path("/var/lib/plr")
+    assert config.metrics_listen == "127.0.0.1:9464"
+    assert config.log_level is LogLevel.INFO
+
+
+def test_cloud_has_a_fixed_port_by_default_and_may_choose_another() -> None:
+    assert parse(CLOUD).udp_port == DEFAULT_CLOUD_UDP_PORT
+    assert parse(CLOUD, udp_port=0).udp_port == 0
+
+
+def test_every_key_of_a_robot() -> None:
+    config = parse(
+        ROBOT,
+        interfaces=["wlan0", "wwan*"],
+        udp_port=40000,
+        stun={"servers": ["stun.example.org:3478"]},
+        state_dir="/tmp/plr",
+        metrics_listen=None,
+        log_level="debug",
+    )
+    assert config.interfaces == ("wlan0", "wwan*")
+    assert config.stun.servers == ("stun.example.org:3478",)
+    assert config.metrics_listen is None
+
+
+def test_every_key_of_a_cloud() -> None:
+    config = parse(
+        CLOUD,
+        advertise=[{"address": "203.0.113.7", "interface": "eth0"}, {"address": "2001:DB8::0:7"}],
+        stun={"enabled": False},
+        services=[{"name": "/plan_path", "capacity_interfaces": 4, "lifetime_ms": 1500}],
+    )
+    assert [entry.address for entry in config.advertise] == ["203.0.113.7", "2001:db8::7"]
+    assert config.service_rules()[0].capacity == 4
+    assert config.service_rules()[0].lifetime_s == 1.5
+
+
+def test_config_is_frozen() -> None:
+    config = parse(ROBOT)
+    with pytest.raises(ValidationError):
+        config.name = "other"
+
+
+@pytest.mark.parametrize(
+    ("keys", "deadline_s", "lifetime_s"),
+    [
+        ({"deadline_ms": 100}, 0.1, 10.0),
+        ({"deadline_ms": 5000}, 5.0, 50.0),
+        ({"deadline_ms": 0.5, "lifetime_ms": 1}, 0.0005, 0.001),
+    ],
+)
+def test_rules_of_a_robot(keys: dict[str, float], deadline_s: float, lifetime_s: float) -> None:
+    (rule,) = parse(with_service(ROBOT, **keys, idempotent=True, drop_late=True)).service_rules()
+    assert rule.pattern == "/plan_path"
+    assert rule.deadline_s == pytest.approx(deadline_s)
+    assert rule.lifetime_s == pytest.approx(lifetime_s)
+    assert rule.idempotent
+    assert rule.drop_late
+
+
+def test_copies_to_several_servers_only_when_asked_for() -> None:
+    (rule,) = parse(ROBOT).service_rules()
+    assert not rule.idempotent
+    assert not rule.drop_late
+
+
+BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
+    (ROBOT | {"interface": ["wlan0"]}, "interface", "unknown key; did you mean interfaces?"),
+    (ROBOT | {"zzz": 1}, "zzz", "unknown key; expected one of advertise, control_plane"),
+    (with_service(ROBOT, deadline_s=0.1), "services[0].deadline_s", "did you mean deadline_ms?"),
+    (ROBOT | {"stun": {"enable": True}}, "stun.enable", "did you mean enabled?"),
+    (with_service(ROBOT, deadline_ms="100ms"), "services[0].deadline_ms", "expected a number, got '100ms'"),
+    (with_service(ROBOT, deadline_ms="100"), "services[0].deadline_ms", "expected a number, got '100'"),
+    (with_service(ROBOT, deadline_ms=True), "services[0].deadline_ms", "expected a number"),
+    (with_service(ROBOT, deadline_ms=0), "services[0].deadline_ms", "greater than 0"),
+    (with_service(ROBOT, deadline_ms=float("nan")), "services[0].deadline_ms", "finite"),
+    (with_service(ROBOT, deadline_ms=60_001), "services[0].deadline_ms", "60000"),
+    (with_service(ROBOT, lifetime_ms=100), "services[0].lifetime_ms", "more than deadline_ms (100), got 100"),
+    (with_service(ROBOT, capacity_interfaces=1), "services[0].capacity_interfaces", "on a cloud only"),
+    (ROBOT | {"services": [{"name": "/a"}]}, "services[0].deadline_ms", "expected milliseconds"),
+    (with_service(CLOUD, deadline_ms=100), "services[0].deadline_ms", "on a robot only"),
+    (with_service(CLOUD, idempotent=False), "services[0].idempotent", "on a robot only"),
+    (with_service(CLOUD, drop_late=True), "services[0].drop_late", "on a robot only"),
+    (
+        with_service(CLOUD, capacity_interfaces=0),
+        "services[0].capacity_interfaces",
+        "greater than or equal to 1",
+    ),
+    (ROBOT | {"services": []}, "services", "at least 1 entry"),
+    (ROBOT | {"services": {"/a": 1}}, "services", "expected a list"),
+    (with_service(ROBOT, name="plan_path"), "services[0].name", "expected a service name such as /plan_path"),
+    (with_service(ROBOT, name="/plan path"), "services[0].name", "expected a service name"),
+    (with_service(ROBOT, name="/a/"), "services[0].name", "expected a service name"),
+    (with_service(ROBOT, name="/" + "a" * 255), "services[0].name", "expected a service name"),
+    (ROBOT | {"role": "server"}, "role", "expected 'robot' or 'cloud', got 'server'"),
+    (ROBOT | {"name": 1.10}, "name", "expected text, got 1.1"),
+    (ROBOT | {"name": ""}, "name", "expected 1 to 63 letters"),
+    (ROBOT | {"name": "robot\n1"}, "name", "expected 1 to 63 letters"),
+    (ROBOT | {"control_plane": "plr.example.org"}, "control_plane", "expected host:port"),
+    (ROBOT | {"control_plane": "plr.example.org:0"}, "control_plane", "a port from 1 to 65535"),
+    (ROBOT | {"control_plane": "plr.example.org:65536"}, "control_plane", "up to 65535"),
+    (ROBOT | {"control_plane": "::1:50051"}, "control_plane", "in brackets"),
+    (ROBOT | {"control_plane": "http://plr:50051"}, "control_plane", "in brackets"),
+    (ROBOT | {"control_plane": "-plr:50051"}, "control_plane", "host name"),
+    (ROBOT | {"interfaces": []}, "interfaces", "at least 1 entry"),
+    (ROBOT | {"interfaces": "wlan0"}, "interfaces", "expected a list, got 'wlan0'"),
+    (ROBOT | {"interfaces": ["wlan0", "wlan0"]}, "interfaces", "'wlan0' twice"),
+    (ROBOT | {"interfaces": ["sixteencharacter"]}, "interfaces[0]", "at most 15 characters"),
+    (ROBOT | {"udp_port": 65536}, "udp_port", "65535"),
+    (ROBOT | {"udp_port": 1.0}, "udp_port", "a whole number"),
+    (ROBOT | {"advertise": [{"address": "203.0.113.7"}]}, "advertise", "on a cloud only"),
+    (CLOUD | {"advertise": [{"address": "203.0.113.7:1"}]}, "advertise[0].address", "expected an IP address"),
+    (CLOUD | {"advertise": [{"address": "fe80::1%eth0"}]}, "advertise[0].address", "without a zone"),
+    (CLOUD | {"advertise": [{"address": "203.0.113.7"}] * 2}, "advertise[1]", "once"),
+    (CLOUD | {"advertise": [{"address": "203.0.113.7"}], "udp_port": 0}, "udp_port", "expected a fixed port"),
+    (
+        CLOUD | {"advertise": [{"address": "203.0.113.7", "interface": "eth*"}]},
+        "advertise[0].interface",
+        "expected a name",
+    ),
+    (ROBOT | {"stun": {"enabled": False, "servers": ["s:1"]}}, "stun", "no servers while enabled is false"),
+    (ROBOT | {"stun": {"servers": ["s"]}}, "stun.servers[0]", "expected host:port"),
+    (ROBOT | {"stun": None}, "stun", "expected keys and values, got nothing"),
+    (ROBOT | {"state_dir": "plr"}, "state_dir", "absolute path, got 'plr'"),
+    (ROBOT | {"metrics_listen": "localhost:9464"}, "metrics_listen", "expected an IP address"),
+    (ROBOT | {"log_level": "loud"}, "log_level", "expected 'debug', 'info'"),
+]
+
+
+@pytest.mark.parametrize(("data", "key", "expected"), BAD_VALUES)
+def test_a_bad_value_is_refused_in_one_line(data: dict[str, Any], key: str, expected: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_config(yaml.safe_dump(data), SOURCE)
+    text = str(caught.value)
+    assert caught.value.key == key
+    assert text.startswith(f"{SOURCE}: {key}: ")
+    assert expected in text
+    assert "\n" not in text
+    assert "more)" not in text
+
+
+@pytest.mark.parametrize("key", ["name", "role", "control_plane", "services"])
+def test_a_missing_key_is_named(key: str) -> None:
+    data = {name: value for name, value in ROBOT.items() if name != key}
+    with pytest.raises(ConfigError, match=rf"^{SOURCE}: {key}: expected, but missing$"):
+        parse_config(yaml.safe_dump(data), SOURCE)
+
+
+def test_further_problems_are_counted() -> None:
+    with pytest.raises(ConfigError, match=r"\(and 2 more\)$"):
+        parse(ROBOT, name="", udp_port=-1, log_level="loud")
+
+
+def services(*names: str) -> list[dict[str, Any]]:
+    return [{"name": name, "deadline_ms": 100} for name in names]
+
+
+def test_a_pattern_written_twice_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"services\[2\]\.name: .*'/arm/\*' in services\[0\] too"):
+        parse(ROBOT, services=services("/arm/*", "/b", "/arm/*"))
+
+
+def test_a_name_behind_a_glob_that_matches_it_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"services\[1\]\.name: expected before the glob '/a\*'"):
+        parse(ROBOT, services=services("/a*", "/ab"))
+    parse(ROBOT, services=services("/ab", "/a*"))
+
+
+def test_a_parameter_service_may_stand_behind_a_glob_which_does_not_open_it() -> None:
+    parse(ROBOT, services=services("/a/*", "/a/get_parameters"))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "expected keys and values, got nothing"),
+        ("- name", "expected keys and values"),
+        ("name: [", "line 1: expected YAML"),
+        ("name: a\nrole: robot\nname: b\n", "line 3: expected YAML: key 'name' is written twice"),
+        ("services:\n- {name: /a, name: /b}\n", "key 'name' is written twice"),
+        ("1: a", "expected a key that is text"),
+        ("name: !!python/object/apply:os.system [true]", "line 1: expected YAML"),
+        ("name: !!int x", "expected YAML"),
+        ("name: !!bool x", "expected YAML"),
+        ("name: !!timestamp x", "expected YAML"),
+        ("name: 2026-02-31", "expected YAML"),
+        ("{[a]: b}", "expected YAML"),
+        ("a: *b", "expected YAML"),
+        ("[" * 5000, "expected YAML"),
+        ("name: \x00", "expected YAML"),
+    ],
+)
+def test_text_that_is_not_our_yaml_is_refused(text: str, expected: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text, SOURCE)
+    assert expected in str(caught.value)
+    assert str(caught.value).startswith(f"{SOURCE}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_merge_keys_of_yaml_work() -> None:
+    text = """
+name: robot-1
+role: robot
+control_plane: c:1
+services:
+- &first {name: /a, deadline_ms: 100}
+- {<<: *first, name: /b}
+"""
+    assert [rule.deadline_s for rule in parse_config(text, SOURCE).service_rules()] == [0.1, 0.1]
+
+
+def test_a_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "sidecar.yaml"
+    path.write_text(yaml.safe_dump(ROBOT))
+    assert load_config(path).name == "robot-1"
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "absent.yaml", tmp_path):
+        with pytest.raises(ConfigError, match=rf"^{path}: cannot be read: "):
+            load_config(path)
+
+
+def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "sidecar.yaml"
+    path.write_bytes(b"name: \xff\n")
+    with pytest.raises(ConfigError, match="expected UTF-8"):
+        load_config(path)
+
+
+def test_an_oversized_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "sidecar.yaml"
+    path.write_bytes(b"#" * ((1 << 20) + 1))
+    with pytest.raises(ConfigError, match="at most 1048576 bytes"):
+        load_config(path)
+
+
+def test_schema_describes_every_key_and_is_json() -> None:
+    schema = json.loads(json.dumps(config_schema()))
+    assert schema["additionalProperties"] is False
+    assert set(schema["properties"]) == set(SidecarConfig.model_fields)
+    assert all("description" in entry or "$ref" in entry for entry in schema["properties"].values())
+    service = schema["$defs"]["ServiceConfig"]
+    assert all("description" in entry for entry in service["properties"].values())
