@@ -1,0 +1,59 @@
+# FogROS2-PLR. Every target sets up what it needs, from a bare checkout on; `make` lists them.
+
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+PY := .venv/bin/python
+
+# The ROS of the virtual environment must not mix with one that this shell has sourced, nor with the libraries of a
+# Python process of another environment that runs us.
+unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH RMW_IMPLEMENTATION
+unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# Nothing that we start announces itself to the network.
+export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
+
+.PHONY: help setup demo test lint format protos interfaces lock bench clean distclean
+
+help: ## this list
+	@echo 'usage: make TARGET'
+	@echo
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):[^#]*## (.*)/\1\t\2/' | while IFS=$$'\t' read -r target what; do printf '  %-11s %s\n' "$$target" "$$what"; done
+	@echo
+	@echo 'options:'
+	@echo "  make test PYTEST_ARGS='tests/unit -k histogram'"
+	@echo "  make demo DEMO_ARGS='--help'"
+	@echo "  make bench BENCH_ARGS='--help'"
+
+setup: ## Debian packages, .venv, locked dependencies, example interfaces (the other targets run it)
+	@deploy/dev/setup.sh
+
+demo: setup ## a robot keeps its deadline while a link, a server and the control plane die (about two minutes)
+	@$(PY) -m bench.demo $(DEMO_ARGS)
+
+test: setup ## all tests
+	@$(PY) -m pytest $(PYTEST_ARGS)
+
+lint: setup ## ruff, mypy, import rules, stub drift
+	@deploy/dev/lint.sh
+
+format: setup ## rewrite the sources the way lint wants them
+	@$(PY) -m ruff check --fix --exit-zero --quiet .
+	@$(PY) -m ruff format --quiet .
+
+protos: setup ## generate the gRPC stubs from protos/plr/v1/*.proto
+	@deploy/dev/protos.sh
+
+interfaces: setup ## build examples/plr_demo_interfaces into .venv
+
+lock: setup ## lock dependencies anew from pyproject.toml (LOCK_ARGS=--upgrade for newer versions)
+	@deploy/dev/lock.sh $(LOCK_ARGS)
+
+bench: setup ## measure: scenarios over the network lab, reports into bench/results
+	@$(PY) -m bench $(BENCH_ARGS)
+
+clean: ## remove caches and build output
+	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis *.egg-info
+	@find . -name __pycache__ -type d -not -path './.venv/*' -prune -exec rm -rf {} +
+
+distclean: clean ## clean, and remove .venv
+	@rm -rf .venv
