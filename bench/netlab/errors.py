@@ -1,0 +1,11 @@
+"""The lab's errors: two, so that callers can tell their own mistake from the machine's."""
+
+from __future__ import annotations
+
+
+class LabError(RuntimeError):
+    """The lab could not be built, or a part of it died; the text says which part and why."""
+
+
+class LabConfigError(ValueError):
+    """A topology, link profile or trace that makes no sense; the text names the field."""

@@ -1,0 +1,70 @@
+"""How the lab's processes talk: one JSON object a line over a stream socket they inherit."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from bench.netlab.errors import LabError
+
+if TYPE_CHECKING:
+    import socket
+
+
+class LineSocket:
+    """JSON lines over a connected stream socket, blocking or polled."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._socket = connection
+        self._received = bytearray()
+
+    def fileno(self) -> int:
+        """Readable when more may be received."""
+        return self._socket.fileno()
+
+    def settimeout(self, seconds: float | None) -> None:
+        """How long `send` and `receive` wait before they raise TimeoutError."""
+        self._socket.settimeout(seconds)
+
+    def send(self, message: dict[str, Any]) -> None:
+        """Send one message. Raises OSError."""
+        self._socket.sendall(json.dumps(message).encode() + b"\n")
+
+    def receive(self) -> dict[str, Any] | None:
+        """The next message, waiting for it; None: the other side is gone. Raises LabError on garbage."""
+        while b"\n" not in self._received:
+            if not self._fill():
+                return None
+        return self._pop()
+
+    def receive_ready(self) -> list[dict[str, Any]] | None:
+        """After the socket turned readable: the messages that are complete; None: the other side is gone."""
+        if not self._fill():
+            return None
+        messages = []
+        while b"\n" in self._received:
+            messages.append(self._pop())
+        return messages
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def _fill(self) -> bool:
+        try:
+            data = self._socket.recv(1 << 16)
+        except ConnectionError:
+            return False
+        self._received += data
+        return bool(data)
+
+    def _pop(self) -> dict[str, Any]:
+        line, _, rest = self._received.partition(b"\n")
+        self._received = bytearray(rest)
+        try:
+            message = json.loads(line)
+        except ValueError as error:
+            raise LabError(f"garbage on the lab's control socket: {error}") from None
+        if not isinstance(message, dict):
+            raise LabError("garbage on the lab's control socket: not an object")
+        return message
