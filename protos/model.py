@@ -173,6 +173,31 @@ class Registration:
 
 
 @dataclass(frozen=True, slots=True)
+class CandidateSet:
+    """All candidates of a sidecar, replacing those it sent before."""
+
+    candidates: tuple[Candidate, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceSet:
+    """All services a sidecar offers and carries, replacing those it sent before."""
+
+    offers: tuple[ServiceOffer, ...] = ()
+    uses: tuple[ServiceUse, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """Renews the lease, as every other message does."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drain:
+    """The sidecar finishes what is in flight and goes."""
+
+
+@dataclass(frozen=True, slots=True)
 class Welcome:
     """The control plane's answer to a registration; `stun_servers` are host:port strings."""
 
@@ -240,3 +265,44 @@ class Report:
     latencies: tuple[LatencyReport, ...] = ()
     paths: tuple[PathReport, ...] = ()
     outcomes: tuple[OutcomeReport, ...] = ()
+
+
+SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain
+"""What a sidecar says on its stream; a Registration first, once."""
+
+ControlMessage = Welcome | PeerSet | MappingSet
+"""What the control plane says on a sidecar's stream."""
+
+
+class SyncState(enum.Enum):
+    """Whether a sidecar applied what it was sent last; a nack is never shown as synced."""
+
+    NOT_SENT = "not sent"
+    STALE = "stale"
+    SYNCED = "synced"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceStatus:
+    """How far one resource of one sidecar got; `error` is the detail of the last nack."""
+
+    version_sent: Version = Version(0)
+    version_acked: Version = Version(0)
+    state: SyncState = SyncState.NOT_SENT
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SidecarStatus:
+    """What the control plane knows of one sidecar, for the operator; its secret token is left out."""
+
+    peer: Peer
+    connected: bool
+    lease_left_s: float
+    software_version: str
+    uses: tuple[ServiceUse, ...] = ()
+    peers: ResourceStatus = ResourceStatus()
+    mapping: ResourceStatus = ResourceStatus()
+    services: tuple[ServiceMapping, ...] = ()
+    paths: tuple[PathReport, ...] = ()

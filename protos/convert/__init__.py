@@ -1,0 +1,62 @@
+"""Protobuf <-> model, both ways, validating.
+
+`*_to_proto` encodes a model value. `*_from_proto` checks every field of a message of the network and returns
+a model value, or raises `DecodeError` and nothing else; `parse_*` does the same from bytes. A value comes
+back from its own encoding unchanged, but for what the format rounds: times to microseconds, texts for people
+to `MAX_STRING_BYTES` printable bytes.
+"""
+
+from __future__ import annotations
+
+from protos.convert.admin import status_from_proto, status_to_proto
+from protos.convert.control import (
+    control_message_from_proto,
+    control_message_to_proto,
+    parse_control_message,
+    parse_sidecar_message,
+    sidecar_message_from_proto,
+    sidecar_message_to_proto,
+)
+from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
+from protos.convert.reports import report_from_proto, report_to_proto
+from protos.convert.types import (
+    address_from_proto,
+    address_to_proto,
+    candidate_from_proto,
+    candidate_to_proto,
+    histogram_from_proto,
+    histogram_to_proto,
+    offer_from_proto,
+    offer_to_proto,
+    peer_from_proto,
+    peer_to_proto,
+    use_from_proto,
+    use_to_proto,
+)
+
+__all__ = [
+    "address_from_proto",
+    "address_to_proto",
+    "candidate_from_proto",
+    "candidate_to_proto",
+    "control_message_from_proto",
+    "control_message_to_proto",
+    "histogram_from_proto",
+    "histogram_to_proto",
+    "mapping_set_from_proto",
+    "mapping_set_to_proto",
+    "offer_from_proto",
+    "offer_to_proto",
+    "parse_control_message",
+    "parse_sidecar_message",
+    "peer_from_proto",
+    "peer_to_proto",
+    "report_from_proto",
+    "report_to_proto",
+    "sidecar_message_from_proto",
+    "sidecar_message_to_proto",
+    "status_from_proto",
+    "status_to_proto",
+    "use_from_proto",
+    "use_to_proto",
+]

@@ -1,0 +1,92 @@
+"""Conversion of what the operator sees (admin.proto)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from protos.convert.fields import (
+    MAX_MAPPED_SERVICES,
+    MAX_PATHS,
+    MAX_SIDECARS,
+    MAX_USES,
+    clean_text,
+    duration,
+    each,
+    known,
+    microseconds,
+    text,
+    version,
+)
+from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
+from protos.convert.reports import path_from_proto, path_to_proto
+from protos.convert.types import peer_from_proto, peer_to_proto, use_from_proto, use_to_proto
+from protos.model import ResourceStatus, SidecarStatus, SyncState
+from protos.plr.v1 import admin_pb2
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+_SYNC_STATES = {
+    admin_pb2.SYNC_STATE_NOT_SENT: SyncState.NOT_SENT,
+    admin_pb2.SYNC_STATE_STALE: SyncState.STALE,
+    admin_pb2.SYNC_STATE_SYNCED: SyncState.SYNCED,
+    admin_pb2.SYNC_STATE_REJECTED: SyncState.REJECTED,
+}
+_SYNC_STATE_NUMBERS = {state: number for number, state in _SYNC_STATES.items()}
+
+
+def status_from_proto(message: admin_pb2.GetStatusResponse) -> tuple[SidecarStatus, ...]:
+    """Check the status of all sidecars."""
+    return each(message.sidecars, MAX_SIDECARS, "sidecars", _sidecar_from_proto)
+
+
+def status_to_proto(sidecars: Iterable[SidecarStatus]) -> admin_pb2.GetStatusResponse:
+    """Encode the status of all sidecars, without their tokens."""
+    return admin_pb2.GetStatusResponse(sidecars=map(_sidecar_to_proto, sidecars))
+
+
+def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
+    return SidecarStatus(
+        peer=peer_from_proto(message.peer, with_token=False),
+        connected=message.connected,
+        lease_left_s=duration(message.lease_left_us, "lease_left_us", zero=True),
+        software_version=text(message.software_version, "software_version"),
+        uses=each(message.uses, MAX_USES, "uses", use_from_proto),
+        peers=_resource_from_proto(message.peers),
+        mapping=_resource_from_proto(message.mapping),
+        services=each(message.services, MAX_MAPPED_SERVICES, "services", service_mapping_from_proto),
+        paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
+    )
+
+
+def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
+    return admin_pb2.SidecarStatus(
+        peer=peer_to_proto(dataclasses.replace(status.peer, token=b"")),
+        connected=status.connected,
+        lease_left_us=microseconds(status.lease_left_s),
+        software_version=clean_text(status.software_version),
+        uses=map(use_to_proto, status.uses),
+        peers=_resource_to_proto(status.peers),
+        mapping=_resource_to_proto(status.mapping),
+        services=map(service_mapping_to_proto, status.services),
+        paths=map(path_to_proto, status.paths),
+    )
+
+
+def _resource_from_proto(message: admin_pb2.ResourceStatus) -> ResourceStatus:
+    return ResourceStatus(
+        version_sent=version(message.version_sent, "version_sent"),
+        version_acked=version(message.version_acked, "version_acked"),
+        state=known(message.state, _SYNC_STATES, "sync state"),
+        error=text(message.error, "error"),
+    )
+
+
+def _resource_to_proto(status: ResourceStatus) -> admin_pb2.ResourceStatus:
+    return admin_pb2.ResourceStatus(
+        version_sent=status.version_sent,
+        version_acked=status.version_acked,
+        state=_SYNC_STATE_NUMBERS[status.state],
+        error=clean_text(status.error),
+    )

@@ -1,0 +1,256 @@
+"""Conversion of the two directions of the control stream (control.proto)."""
+
+from __future__ import annotations
+
+from typing import assert_never
+
+from google.protobuf.message import DecodeError as ProtobufDecodeError
+
+from protos.convert.fields import (
+    MAX_PEERS,
+    MAX_REMOVED,
+    MAX_STUN_SERVERS,
+    MAX_USES,
+    clean_text,
+    duration,
+    each,
+    known,
+    microseconds,
+    node_name,
+    text,
+    unique,
+    version,
+)
+from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
+from protos.convert.reports import report_from_proto, report_to_proto
+from protos.convert.types import (
+    candidate_to_proto,
+    candidates_from_proto,
+    offer_to_proto,
+    offers_from_proto,
+    peer_from_proto,
+    peer_to_proto,
+    role_from_proto,
+    role_to_proto,
+    session_from_proto,
+    use_from_proto,
+    use_to_proto,
+)
+from protos.errors import DecodeError
+from protos.model import (
+    TOKEN_BYTES,
+    Ack,
+    CandidateSet,
+    ControlMessage,
+    Drain,
+    Heartbeat,
+    MappingSet,
+    Nack,
+    PeerSet,
+    Registration,
+    RemovalReason,
+    RemovedPeer,
+    Report,
+    ResourceKind,
+    ServiceSet,
+    SidecarMessage,
+    Welcome,
+)
+from protos.plr.v1 import control_pb2
+
+_RESOURCES = {
+    control_pb2.RESOURCE_KIND_PEERS: ResourceKind.PEERS,
+    control_pb2.RESOURCE_KIND_MAPPING: ResourceKind.MAPPING,
+}
+_RESOURCE_NUMBERS = {kind: number for number, kind in _RESOURCES.items()}
+_REASONS = {
+    control_pb2.REMOVAL_REASON_LEASE_EXPIRED: RemovalReason.LEASE_EXPIRED,
+    control_pb2.REMOVAL_REASON_LEFT: RemovalReason.LEFT,
+    control_pb2.REMOVAL_REASON_REVOKED: RemovalReason.REVOKED,
+}
+_REASON_NUMBERS = {reason: number for number, reason in _REASONS.items()}
+
+
+def parse_sidecar_message(data: bytes) -> SidecarMessage:
+    """Parse and check the bytes of one message of a sidecar."""
+    try:
+        message = control_pb2.SidecarMessage.FromString(data)
+    except ProtobufDecodeError as error:
+        raise DecodeError(f"not a SidecarMessage: {error}") from error
+    return sidecar_message_from_proto(message)
+
+
+def parse_control_message(data: bytes) -> ControlMessage:
+    """Parse and check the bytes of one message of the control plane."""
+    try:
+        message = control_pb2.ControlMessage.FromString(data)
+    except ProtobufDecodeError as error:
+        raise DecodeError(f"not a ControlMessage: {error}") from error
+    return control_message_from_proto(message)
+
+
+def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMessage:
+    """Check one message of a sidecar."""
+    match message.WhichOneof("kind"):
+        case "register":
+            return _registration_from_proto(message.register)
+        case "candidates":
+            return CandidateSet(candidates_from_proto(message.candidates.candidates))
+        case "services":
+            uses = each(message.services.uses, MAX_USES, "uses", use_from_proto)
+            unique((use.name for use in uses), "uses")
+            return ServiceSet(offers_from_proto(message.services.offers), uses)
+        case "report":
+            return report_from_proto(message.report)
+        case "ack":
+            return Ack(
+                resource=known(message.ack.resource, _RESOURCES, "resource"),
+                version=version(message.ack.version, "acknowledged version"),
+                nonce=message.ack.nonce,
+            )
+        case "nack":
+            return Nack(
+                resource=known(message.nack.resource, _RESOURCES, "resource"),
+                version=version(message.nack.version, "version in force"),
+                nonce=message.nack.nonce,
+                error=text(message.nack.error, "error"),
+            )
+        case "heartbeat":
+            return Heartbeat()
+        case "drain":
+            return Drain()
+        case _:
+            raise DecodeError("sidecar message of no known kind")
+
+
+def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessage:
+    """Encode one message of a sidecar."""
+    match value:
+        case Registration():
+            return control_pb2.SidecarMessage(register=_registration_to_proto(value))
+        case CandidateSet(candidates=candidates):
+            message = control_pb2.Candidates(candidates=map(candidate_to_proto, candidates))
+            return control_pb2.SidecarMessage(candidates=message)
+        case ServiceSet(offers=offers, uses=uses):
+            services = control_pb2.Services(offers=map(offer_to_proto, offers), uses=map(use_to_proto, uses))
+            return control_pb2.SidecarMessage(services=services)
+        case Report():
+            return control_pb2.SidecarMessage(report=report_to_proto(value))
+        case Ack():
+            ack = control_pb2.Ack(
+                resource=_RESOURCE_NUMBERS[value.resource], version=value.version, nonce=value.nonce
+            )
+            return control_pb2.SidecarMessage(ack=ack)
+        case Nack():
+            nack = control_pb2.Nack(
+                resource=_RESOURCE_NUMBERS[value.resource],
+                version=value.version,
+                nonce=value.nonce,
+                error=clean_text(value.error),
+            )
+            return control_pb2.SidecarMessage(nack=nack)
+        case Heartbeat():
+            return control_pb2.SidecarMessage(heartbeat=control_pb2.Heartbeat())
+        case Drain():
+            return control_pb2.SidecarMessage(drain=control_pb2.Drain())
+        case _:
+            assert_never(value)
+
+
+def control_message_from_proto(message: control_pb2.ControlMessage) -> ControlMessage:
+    """Check one message of the control plane."""
+    match message.WhichOneof("kind"):
+        case "welcome":
+            return _welcome_from_proto(message.welcome)
+        case "peers":
+            return _peer_set_from_proto(message.peers)
+        case "mapping":
+            return mapping_set_from_proto(message.mapping)
+        case _:
+            raise DecodeError("control message of no known kind")
+
+
+def control_message_to_proto(value: ControlMessage) -> control_pb2.ControlMessage:
+    """Encode one message of the control plane."""
+    match value:
+        case Welcome():
+            welcome = control_pb2.Welcome(
+                lease_us=microseconds(value.lease_s),
+                report_interval_us=microseconds(value.report_interval_s),
+                stun_servers=value.stun_servers,
+            )
+            return control_pb2.ControlMessage(welcome=welcome)
+        case PeerSet():
+            return control_pb2.ControlMessage(peers=_peer_set_to_proto(value))
+        case MappingSet():
+            return control_pb2.ControlMessage(mapping=mapping_set_to_proto(value))
+        case _:
+            assert_never(value)
+
+
+def _registration_from_proto(message: control_pb2.Register) -> Registration:
+    if len(message.token) != TOKEN_BYTES:
+        raise DecodeError(f"token has {len(message.token)} bytes, not {TOKEN_BYTES}")
+    return Registration(
+        protocol_version=message.protocol_version,
+        name=node_name(message.name, "name"),
+        role=role_from_proto(message.role),
+        session=session_from_proto(message.session),
+        token=message.token,
+        incarnation=message.incarnation,
+        software_version=text(message.software_version, "software_version"),
+        peers_version=version(message.peers_version, "peers_version"),
+        mapping_version=version(message.mapping_version, "mapping_version"),
+    )
+
+
+def _registration_to_proto(value: Registration) -> control_pb2.Register:
+    return control_pb2.Register(
+        protocol_version=value.protocol_version,
+        name=value.name,
+        role=role_to_proto(value.role),
+        session=value.session,
+        token=value.token,
+        incarnation=value.incarnation,
+        software_version=clean_text(value.software_version),
+        peers_version=value.peers_version,
+        mapping_version=value.mapping_version,
+    )
+
+
+def _welcome_from_proto(message: control_pb2.Welcome) -> Welcome:
+    if len(message.stun_servers) > MAX_STUN_SERVERS:
+        raise DecodeError(f"stun_servers has more than {MAX_STUN_SERVERS} elements")
+    return Welcome(
+        lease_s=duration(message.lease_us, "lease_us"),
+        report_interval_s=duration(message.report_interval_us, "report_interval_us"),
+        stun_servers=tuple(text(server, "stun_servers") for server in message.stun_servers),
+    )
+
+
+def _peer_set_from_proto(message: control_pb2.PeerSet) -> PeerSet:
+    peers = each(message.peers, MAX_PEERS, "peers", peer_from_proto)
+    removed = each(message.removed, MAX_REMOVED, "removed", _removed_from_proto)
+    unique([*(peer.name for peer in peers), *(gone.name for gone in removed)], "peers")
+    return PeerSet(
+        version=version(message.version, "peers version"), nonce=message.nonce, peers=peers, removed=removed
+    )
+
+
+def _peer_set_to_proto(value: PeerSet) -> control_pb2.PeerSet:
+    return control_pb2.PeerSet(
+        version=value.version,
+        nonce=value.nonce,
+        peers=map(peer_to_proto, value.peers),
+        removed=(
+            control_pb2.RemovedPeer(name=removed.name, reason=_REASON_NUMBERS[removed.reason])
+            for removed in value.removed
+        ),
+    )
+
+
+def _removed_from_proto(message: control_pb2.RemovedPeer) -> RemovedPeer:
+    return RemovedPeer(
+        name=node_name(message.name, "removed peer"),
+        reason=known(message.reason, _REASONS, "removal reason"),
+    )

@@ -1,0 +1,177 @@
+"""Limits and checks of single fields; a check returns the value or raises DecodeError naming the field."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TYPE_CHECKING, TypeVar
+
+from protos.errors import DecodeError
+from protos.model import InterfaceName, NodeName, ServiceName, Version
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+
+    from google.protobuf.message import Message
+
+MAX_STRING_BYTES = 255
+"""Longest string, UTF-8: ROS names its limit for topic and service names 255 too."""
+
+MAX_CANDIDATES = 256
+"""Addresses of one sidecar: a dozen interfaces with a handful of IPv6 addresses each stay well below."""
+
+MAX_OFFERS = 1024
+"""Services one cloud sidecar offers."""
+
+MAX_USES = 1024
+"""Services one robot sidecar carries."""
+
+MAX_PEERS = 4096
+"""Peers in one set: with 300 bytes each it still fits gRPC's default message of 4 MiB."""
+
+MAX_REMOVED = 4096
+"""Removal notices in one set."""
+
+MAX_ASSIGNMENTS = 256
+"""Assignments of one service: as many as a robot can have interfaces."""
+
+MAX_MAPPED_SERVICES = 1024
+"""Services in one mapping: as many as a robot can carry."""
+
+MAX_LATENCIES = 4096
+"""Latency histograms in one report."""
+
+MAX_PATHS = 4096
+"""Path reports in one report."""
+
+MAX_OUTCOMES = 1024
+"""Outcome reports in one report: as many as a robot can carry services."""
+
+MAX_STUN_SERVERS = 16
+"""STUN servers in one welcome."""
+
+MAX_SIDECARS = 8192
+"""Sidecars in one status."""
+
+MAX_DURATION_S = 86_400.0
+"""Longest deadline, lease or interval: one day. What is longer is a mistake of units."""
+
+MAX_VERSION = (1 << 63) - 1
+"""Largest version of a resource: half of the field, so that a larger one can always be given out."""
+
+MAX_EVENTS = 1 << 53
+"""Largest count of datagrams or requests in one report: what a float still holds exactly."""
+
+MAX_CAPACITY = 1_000_000
+"""Largest capacity of a server; more is written 0, no limit."""
+
+US_PER_S = 1_000_000
+
+T = TypeVar("T")
+K = TypeVar("K", bound=int)
+P = TypeVar("P", bound="Message")
+
+_NODE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+# What Linux allows in an interface's name, less what is not printable ASCII.
+_INTERFACE_NAME = re.compile(r"[!-.0-~]+")
+# ROS 2: tokens of letters, digits and underscores that do not start with a digit.
+_SERVICE_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(srv|action|msg)/[A-Za-z][A-Za-z0-9_]*")
+
+
+def clean_text(text: str) -> str:
+    """`text` on one line, printable and no longer than `MAX_STRING_BYTES`: fit for an error or a reason."""
+    printable = "".join(char if char.isprintable() else " " for char in text)
+    return printable.encode("utf-8", "replace")[:MAX_STRING_BYTES].decode("utf-8", "ignore")
+
+
+def text(value: str, field: str) -> str:
+    """Check a text for people: short and printable, so that it breaks neither a log line nor a terminal."""
+    if len(value.encode("utf-8", "replace")) > MAX_STRING_BYTES:
+        raise DecodeError(f"{field} is longer than {MAX_STRING_BYTES} bytes")
+    if not value.isprintable():
+        raise DecodeError(f"{field} has a character that is not printable: {value!a}")
+    return value
+
+
+def _name(value: str, field: str, pattern: re.Pattern[str], expected: str) -> str:
+    text(value, field)
+    if not pattern.fullmatch(value):
+        raise DecodeError(f"{field} {value!a} is not {expected}")
+    return value
+
+
+def node_name(value: str, field: str) -> NodeName:
+    """Check the name of a sidecar."""
+    return NodeName(_name(value, field, _NODE_NAME, "a name of letters, digits, '_', '.' and '-'"))
+
+
+def interface_name(value: str, field: str) -> InterfaceName:
+    """Check the name of a network interface."""
+    return InterfaceName(_name(value, field, _INTERFACE_NAME, "the name of an interface"))
+
+
+def service_name(value: str, field: str) -> ServiceName:
+    """Check a fully qualified ROS name."""
+    return ServiceName(_name(value, field, _SERVICE_NAME, "a fully qualified ROS name such as /plan_path"))
+
+
+def type_name(value: str, field: str) -> str:
+    """Check the name of a ROS type."""
+    return _name(value, field, _TYPE_NAME, "a ROS type such as nav_msgs/srv/GetPlan")
+
+
+def duration(microseconds: int, field: str, *, zero: bool = False) -> float:
+    """Check a span of time and turn it into seconds; 0 only where `zero` allows it."""
+    if microseconds == 0 and not zero:
+        raise DecodeError(f"{field} is 0")
+    if microseconds > MAX_DURATION_S * US_PER_S:
+        raise DecodeError(f"{field} of {microseconds} us is longer than {MAX_DURATION_S:.0f} s")
+    return microseconds / US_PER_S
+
+
+def microseconds(seconds: float) -> int:
+    """Round seconds for the network."""
+    return round(seconds * US_PER_S)
+
+
+def probability(value: float, field: str) -> float:
+    """Check a probability."""
+    if not (math.isfinite(value) and 0.0 <= value <= 1.0):
+        raise DecodeError(f"{field} {value} is not a probability")
+    return value
+
+
+def at_most(value: int, limit: int, field: str) -> int:
+    """Check an unsigned number."""
+    if not 0 <= value <= limit:
+        raise DecodeError(f"{field} {value} is not within 0..{limit}")
+    return value
+
+
+def version(value: int, field: str) -> Version:
+    """Check a version."""
+    return Version(at_most(value, MAX_VERSION, field))
+
+
+def known(value: K, names: Mapping[K, T], field: str) -> T:
+    """Check an enum and turn it into the model's."""
+    if value not in names:
+        raise DecodeError(f"{field} has no meaning for the value {value}")
+    return names[value]
+
+
+def each(messages: Sequence[P], limit: int, field: str, convert: Callable[[P], T]) -> tuple[T, ...]:
+    """Convert a repeated field of at most `limit` elements."""
+    if len(messages) > limit:
+        raise DecodeError(f"{field} has {len(messages)} elements, more than {limit}")
+    return tuple(convert(message) for message in messages)
+
+
+def unique(keys: Iterable[Hashable], field: str) -> None:
+    """Check that nothing is named twice."""
+    seen: set[Hashable] = set()
+    for key in keys:
+        if key in seen:
+            raise DecodeError(f"{field} names {key!a} twice")
+        seen.add(key)

@@ -1,0 +1,67 @@
+"""Conversion of mappings."""
+
+from __future__ import annotations
+
+from protos.convert.fields import (
+    MAX_ASSIGNMENTS,
+    MAX_MAPPED_SERVICES,
+    clean_text,
+    each,
+    interface_name,
+    node_name,
+    probability,
+    service_name,
+    text,
+    unique,
+    version,
+)
+from protos.model import Assignment, MappingSet, ServiceMapping
+from protos.plr.v1 import control_pb2
+
+
+def mapping_set_from_proto(message: control_pb2.MappingSet) -> MappingSet:
+    """Check a mapping set."""
+    services = each(message.services, MAX_MAPPED_SERVICES, "services", service_mapping_from_proto)
+    unique((mapping.service for mapping in services), "services")
+    return MappingSet(
+        version=version(message.version, "mapping version"), nonce=message.nonce, services=services
+    )
+
+
+def mapping_set_to_proto(mapping: MappingSet) -> control_pb2.MappingSet:
+    """Encode a mapping set."""
+    return control_pb2.MappingSet(
+        version=mapping.version,
+        nonce=mapping.nonce,
+        services=map(service_mapping_to_proto, mapping.services),
+    )
+
+
+def service_mapping_from_proto(message: control_pb2.ServiceMapping) -> ServiceMapping:
+    """Check the mapping of one service."""
+    assignments = each(message.assignments, MAX_ASSIGNMENTS, "assignments", _assignment_from_proto)
+    unique(((a.interface, a.server) for a in assignments), "assignments")
+    return ServiceMapping(
+        service=service_name(message.service, "service"),
+        assignments=assignments,
+        predicted_miss=probability(message.predicted_miss, "predicted_miss"),
+        reason=text(message.reason, "reason"),
+    )
+
+
+def service_mapping_to_proto(mapping: ServiceMapping) -> control_pb2.ServiceMapping:
+    """Encode the mapping of one service."""
+    return control_pb2.ServiceMapping(
+        service=mapping.service,
+        assignments=(
+            control_pb2.Assignment(interface=a.interface, server=a.server) for a in mapping.assignments
+        ),
+        predicted_miss=mapping.predicted_miss,
+        reason=clean_text(mapping.reason),
+    )
+
+
+def _assignment_from_proto(message: control_pb2.Assignment) -> Assignment:
+    return Assignment(
+        interface=interface_name(message.interface, "interface"), server=node_name(message.server, "server")
+    )

@@ -1,0 +1,95 @@
+"""Conversion of what sidecars measured."""
+
+from __future__ import annotations
+
+from protos.convert.fields import (
+    MAX_EVENTS,
+    MAX_LATENCIES,
+    MAX_OUTCOMES,
+    MAX_PATHS,
+    at_most,
+    each,
+    interface_name,
+    node_name,
+    service_name,
+)
+from protos.convert.types import histogram_from_proto, histogram_to_proto
+from protos.model import LatencyReport, OutcomeReport, PathReport, Report
+from protos.plr.v1 import control_pb2
+
+
+def report_from_proto(message: control_pb2.Report) -> Report:
+    """Check a report."""
+    return Report(
+        latencies=each(message.latencies, MAX_LATENCIES, "latencies", _latency_from_proto),
+        paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
+        outcomes=each(message.outcomes, MAX_OUTCOMES, "outcomes", _outcome_from_proto),
+    )
+
+
+def report_to_proto(report: Report) -> control_pb2.Report:
+    """Encode a report."""
+    return control_pb2.Report(
+        latencies=map(_latency_to_proto, report.latencies),
+        paths=map(path_to_proto, report.paths),
+        outcomes=map(_outcome_to_proto, report.outcomes),
+    )
+
+
+def _latency_from_proto(message: control_pb2.LatencyReport) -> LatencyReport:
+    return LatencyReport(
+        interface=interface_name(message.interface, "interface"),
+        server=node_name(message.server, "server"),
+        service=service_name(message.service, "service"),
+        latency=histogram_from_proto(message.latency),
+        processing=histogram_from_proto(message.processing),
+    )
+
+
+def _latency_to_proto(latency: LatencyReport) -> control_pb2.LatencyReport:
+    return control_pb2.LatencyReport(
+        interface=latency.interface,
+        server=latency.server,
+        service=latency.service,
+        latency=histogram_to_proto(latency.latency),
+        processing=histogram_to_proto(latency.processing),
+    )
+
+
+def path_from_proto(message: control_pb2.PathReport) -> PathReport:
+    """Check a path report."""
+    return PathReport(
+        interface=interface_name(message.interface, "interface"),
+        server=node_name(message.server, "server"),
+        up=message.up,
+        rtt=histogram_from_proto(message.rtt),
+        datagrams_sent=at_most(message.datagrams_sent, MAX_EVENTS, "datagrams_sent"),
+        datagrams_lost=at_most(message.datagrams_lost, MAX_EVENTS, "datagrams_lost"),
+    )
+
+
+def path_to_proto(path: PathReport) -> control_pb2.PathReport:
+    """Encode a path report."""
+    return control_pb2.PathReport(
+        interface=path.interface,
+        server=path.server,
+        up=path.up,
+        rtt=histogram_to_proto(path.rtt),
+        datagrams_sent=path.datagrams_sent,
+        datagrams_lost=path.datagrams_lost,
+    )
+
+
+def _outcome_from_proto(message: control_pb2.OutcomeReport) -> OutcomeReport:
+    return OutcomeReport(
+        service=service_name(message.service, "service"),
+        ok=at_most(message.ok, MAX_EVENTS, "ok"),
+        deadline_missed=at_most(message.deadline_missed, MAX_EVENTS, "deadline_missed"),
+        failed=at_most(message.failed, MAX_EVENTS, "failed"),
+    )
+
+
+def _outcome_to_proto(outcome: OutcomeReport) -> control_pb2.OutcomeReport:
+    return control_pb2.OutcomeReport(
+        service=outcome.service, ok=outcome.ok, deadline_missed=outcome.deadline_missed, failed=outcome.failed
+    )

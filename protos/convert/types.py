@@ -1,0 +1,198 @@
+"""Conversion of the nouns both planes share (types.proto)."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Address, IPv6Address, ip_address
+from typing import TYPE_CHECKING
+
+from protos.convert.fields import (
+    MAX_CANDIDATES,
+    MAX_CAPACITY,
+    MAX_OFFERS,
+    at_most,
+    duration,
+    each,
+    interface_name,
+    known,
+    microseconds,
+    node_name,
+    service_name,
+    type_name,
+    unique,
+)
+from protos.errors import DecodeError
+from protos.histogram import LAYOUT, Histogram
+from protos.model import (
+    TOKEN_BYTES,
+    Address,
+    Candidate,
+    CandidateKind,
+    InterfaceId,
+    Peer,
+    Role,
+    ServiceOffer,
+    ServiceUse,
+    SessionId,
+)
+from protos.plr.v1 import types_pb2
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+MAX_INTERFACE_ID = 255
+"""The data plane's frames give an interface one byte."""
+
+_ROLES = {types_pb2.ROLE_ROBOT: Role.ROBOT, types_pb2.ROLE_CLOUD: Role.CLOUD}
+_ROLE_NUMBERS = {role: number for number, role in _ROLES.items()}
+_CANDIDATE_KINDS = {
+    types_pb2.CANDIDATE_KIND_HOST: CandidateKind.HOST,
+    types_pb2.CANDIDATE_KIND_SERVER_REFLEXIVE: CandidateKind.SERVER_REFLEXIVE,
+}
+_CANDIDATE_KIND_NUMBERS = {kind: number for number, kind in _CANDIDATE_KINDS.items()}
+
+
+def role_from_proto(value: types_pb2.Role.ValueType) -> Role:
+    """Check a role."""
+    return known(value, _ROLES, "role")
+
+
+def role_to_proto(role: Role) -> types_pb2.Role.ValueType:
+    """Encode a role."""
+    return _ROLE_NUMBERS[role]
+
+
+def address_from_proto(message: types_pb2.Address) -> Address:
+    """Check the address of one host: not unspecified, nor multicast or broadcast, which reach many."""
+    if len(message.ip) not in (4, 16):
+        raise DecodeError(f"address has {len(message.ip)} bytes, not 4 or 16")
+    if not 1 <= message.port <= 65535:
+        raise DecodeError(f"port {message.port} is not within 1..65535")
+    ip: IPv4Address | IPv6Address = ip_address(message.ip)
+    if isinstance(ip, IPv6Address) and ip.ipv4_mapped is not None:
+        ip = ip.ipv4_mapped
+    if ip.is_unspecified or ip.is_multicast or ip == IPv4Address("255.255.255.255"):
+        raise DecodeError(f"address {ip} is not one of a host")
+    return str(ip), message.port
+
+
+def address_to_proto(address: Address) -> types_pb2.Address:
+    """Encode an address; a zone (fe80::1%eth0) means nothing elsewhere and is left out."""
+    return types_pb2.Address(ip=ip_address(address[0]).packed, port=address[1])
+
+
+def candidate_from_proto(message: types_pb2.Candidate) -> Candidate:
+    """Check a candidate."""
+    return Candidate(
+        interface_id=InterfaceId(at_most(message.interface_id, MAX_INTERFACE_ID, "interface_id")),
+        interface=interface_name(message.interface, "interface"),
+        kind=known(message.kind, _CANDIDATE_KINDS, "candidate kind"),
+        address=address_from_proto(message.address),
+    )
+
+
+def candidate_to_proto(candidate: Candidate) -> types_pb2.Candidate:
+    """Encode a candidate."""
+    return types_pb2.Candidate(
+        interface_id=candidate.interface_id,
+        interface=candidate.interface,
+        kind=_CANDIDATE_KIND_NUMBERS[candidate.kind],
+        address=address_to_proto(candidate.address),
+    )
+
+
+def candidates_from_proto(messages: Sequence[types_pb2.Candidate]) -> tuple[Candidate, ...]:
+    """Check all candidates of a sidecar: numbers and names of interfaces belong together one to one."""
+    candidates = each(messages, MAX_CANDIDATES, "candidates", candidate_from_proto)
+    unique(candidates, "candidates")
+    interfaces = {(candidate.interface_id, candidate.interface) for candidate in candidates}
+    unique((number for number, _ in interfaces), "interface_id")
+    unique((name for _, name in interfaces), "interface")
+    return candidates
+
+
+def offer_from_proto(message: types_pb2.ServiceOffer) -> ServiceOffer:
+    """Check an offer."""
+    return ServiceOffer(
+        name=service_name(message.name, "service"),
+        type=type_name(message.type, "type"),
+        capacity=at_most(message.capacity, MAX_CAPACITY, "capacity"),
+    )
+
+
+def offer_to_proto(offer: ServiceOffer) -> types_pb2.ServiceOffer:
+    """Encode an offer."""
+    return types_pb2.ServiceOffer(name=offer.name, type=offer.type, capacity=offer.capacity)
+
+
+def offers_from_proto(messages: Sequence[types_pb2.ServiceOffer]) -> tuple[ServiceOffer, ...]:
+    """Check all offers of a sidecar."""
+    offers = each(messages, MAX_OFFERS, "offers", offer_from_proto)
+    unique((offer.name for offer in offers), "offers")
+    return offers
+
+
+def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
+    """Check a use."""
+    return ServiceUse(
+        name=service_name(message.name, "service"),
+        type=type_name(message.type, "type"),
+        deadline_s=duration(message.deadline_us, "deadline_us"),
+        idempotent=message.idempotent,
+    )
+
+
+def use_to_proto(use: ServiceUse) -> types_pb2.ServiceUse:
+    """Encode a use."""
+    return types_pb2.ServiceUse(
+        name=use.name, type=use.type, deadline_us=microseconds(use.deadline_s), idempotent=use.idempotent
+    )
+
+
+def peer_from_proto(message: types_pb2.Peer, *, with_token: bool = True) -> Peer:
+    """Check a peer; what is shown to the operator comes without its token."""
+    if len(message.token) != (TOKEN_BYTES if with_token else 0):
+        raise DecodeError(f"token has {len(message.token)} bytes, not {TOKEN_BYTES if with_token else 0}")
+    return Peer(
+        name=node_name(message.name, "peer"),
+        role=role_from_proto(message.role),
+        session=session_from_proto(message.session),
+        token=message.token,
+        incarnation=message.incarnation,
+        candidates=candidates_from_proto(message.candidates),
+        offers=offers_from_proto(message.offers),
+        draining=message.draining,
+    )
+
+
+def session_from_proto(value: int) -> SessionId:
+    """Check a session number; 0 is what a field never written holds."""
+    if value == 0:
+        raise DecodeError("session is 0")
+    return SessionId(value)
+
+
+def peer_to_proto(peer: Peer) -> types_pb2.Peer:
+    """Encode a peer."""
+    return types_pb2.Peer(
+        name=peer.name,
+        role=role_to_proto(peer.role),
+        session=peer.session,
+        token=peer.token,
+        incarnation=peer.incarnation,
+        candidates=map(candidate_to_proto, peer.candidates),
+        offers=map(offer_to_proto, peer.offers),
+        draining=peer.draining,
+    )
+
+
+def histogram_from_proto(message: types_pb2.Histogram) -> Histogram:
+    """Check a histogram; a message never filled in is an empty one."""
+    if message.layout == 0 and not message.index and not message.count and not message.lost:
+        return Histogram()
+    return Histogram.from_sparse(message.index, message.count, message.lost, layout=message.layout)
+
+
+def histogram_to_proto(histogram: Histogram) -> types_pb2.Histogram:
+    """Encode a histogram."""
+    indices, counts, lost = histogram.to_sparse()
+    return types_pb2.Histogram(layout=LAYOUT, index=indices, count=counts, lost=lost)

@@ -1,0 +1,184 @@
+"""Hypothesis strategies that draw every valid value of the control protocol."""
+
+from __future__ import annotations
+
+import dataclasses
+import operator
+from typing import TypeVar
+
+from hypothesis import strategies as st
+
+from protos.convert.fields import MAX_CAPACITY, MAX_DURATION_S, MAX_EVENTS, MAX_VERSION
+from protos.histogram import BUCKETS, MAX_COUNT, Histogram
+from protos.model import (
+    PROTOCOL_VERSION,
+    TOKEN_BYTES,
+    Ack,
+    Address,
+    Assignment,
+    Candidate,
+    CandidateKind,
+    CandidateSet,
+    ControlMessage,
+    Drain,
+    Heartbeat,
+    InterfaceId,
+    InterfaceName,
+    LatencyReport,
+    MappingSet,
+    Nack,
+    NodeName,
+    OutcomeReport,
+    PathReport,
+    Peer,
+    PeerSet,
+    Registration,
+    RemovalReason,
+    RemovedPeer,
+    Report,
+    ResourceKind,
+    ResourceStatus,
+    Role,
+    ServiceMapping,
+    ServiceName,
+    ServiceOffer,
+    ServiceSet,
+    ServiceUse,
+    SessionId,
+    SidecarMessage,
+    SidecarStatus,
+    SyncState,
+    Version,
+    Welcome,
+)
+
+T = TypeVar("T")
+
+node_names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,20}", fullmatch=True).map(NodeName)
+interface_names = st.from_regex(r"[a-z]{1,4}[0-9.:@_-]{0,8}", fullmatch=True).map(InterfaceName)
+service_names = st.from_regex(r"(/[A-Za-z_][A-Za-z0-9_]{0,6}){1,3}", fullmatch=True).map(ServiceName)
+type_names = st.from_regex(r"[a-z][a-z_]{0,5}/(srv|action|msg)/[A-Z][A-Za-z0-9_]{0,8}", fullmatch=True)
+texts = st.text(st.characters(categories=["L", "N", "P", "S"]), max_size=40)
+uint64 = st.integers(0, (1 << 64) - 1)
+versions = st.integers(0, MAX_VERSION).map(Version)
+sessions = st.integers(1, (1 << 64) - 1).map(SessionId)
+tokens = st.binary(min_size=TOKEN_BYTES, max_size=TOKEN_BYTES)
+durations = st.integers(1, round(MAX_DURATION_S * 1e6)).map(lambda us: us / 1_000_000)
+probabilities = st.floats(0.0, 1.0)
+events = st.integers(0, MAX_EVENTS)
+
+
+def _of_one_host(address: Address) -> bool:
+    first = address[0].split(".")[0]
+    return not (
+        (first.isdigit() and (int(first) >= 224 or address[0] == "0.0.0.0"))
+        or address[0] == "::"
+        or address[0].startswith(("ff", "::ffff:"))
+    )
+
+
+addresses = st.tuples(st.ip_addresses().map(str), st.integers(1, 65535)).filter(_of_one_host)
+
+
+@st.composite
+def histograms(draw: st.DrawFn) -> Histogram:
+    indices = sorted(draw(st.sets(st.integers(0, BUCKETS - 1), max_size=5)))
+    counts = [draw(st.integers(1, MAX_COUNT)) for _ in indices]
+    return Histogram.from_sparse(indices, counts, draw(st.integers(0, MAX_COUNT)))
+
+
+@st.composite
+def candidate_tuples(draw: st.DrawFn) -> tuple[Candidate, ...]:
+    interfaces = draw(st.dictionaries(st.integers(0, 255), interface_names, max_size=3))
+    found: list[Candidate] = []
+    for number, name in {name: (number, name) for number, name in interfaces.items()}.values():
+        for kind, address in draw(
+            st.sets(st.tuples(st.sampled_from(CandidateKind), addresses), min_size=1, max_size=3)
+        ):
+            found.append(Candidate(InterfaceId(number), name, kind, address))
+    return tuple(found)
+
+
+def _tuples(
+    elements: st.SearchStrategy[T], *, size: int = 3, by: str | None = None
+) -> st.SearchStrategy[tuple[T, ...]]:
+    if by is None:
+        return st.lists(elements, max_size=size).map(lambda found: tuple(found))
+    attribute = operator.attrgetter(by)
+    return st.lists(elements, max_size=size, unique_by=attribute).map(lambda found: tuple(found))
+
+
+offers = st.builds(ServiceOffer, service_names, type_names, st.integers(0, MAX_CAPACITY))
+uses = st.builds(ServiceUse, service_names, type_names, durations, st.booleans())
+peers = st.builds(
+    Peer,
+    node_names,
+    st.sampled_from(Role),
+    sessions,
+    tokens,
+    uint64,
+    candidate_tuples(),
+    _tuples(offers, by="name"),
+    st.booleans(),
+)
+registrations = st.builds(
+    Registration,
+    st.just(PROTOCOL_VERSION),
+    node_names,
+    st.sampled_from(Role),
+    sessions,
+    tokens,
+    uint64,
+    texts,
+    versions,
+    versions,
+)
+latencies = st.builds(LatencyReport, interface_names, node_names, service_names, histograms(), histograms())
+paths = st.builds(PathReport, interface_names, node_names, st.booleans(), histograms(), events, events)
+outcomes = st.builds(OutcomeReport, service_names, events, events, events)
+reports = st.builds(Report, _tuples(latencies), _tuples(paths), _tuples(outcomes))
+assignments = st.builds(Assignment, interface_names, node_names)
+service_mappings = st.builds(
+    ServiceMapping,
+    service_names,
+    st.lists(assignments, max_size=3, unique=True).map(lambda found: tuple(found)),
+    probabilities,
+    texts,
+)
+mapping_sets = st.builds(MappingSet, versions, uint64, _tuples(service_mappings, by="service"))
+welcomes = st.builds(Welcome, durations, durations, _tuples(texts))
+
+
+@st.composite
+def peer_sets(draw: st.DrawFn) -> PeerSet:
+    present = draw(_tuples(peers, by="name"))
+    gone = draw(_tuples(st.builds(RemovedPeer, node_names, st.sampled_from(RemovalReason)), by="name"))
+    names = {peer.name for peer in present}
+    removed = tuple(peer for peer in gone if peer.name not in names)
+    return PeerSet(draw(versions), draw(uint64), present, removed)
+
+
+sidecar_messages: st.SearchStrategy[SidecarMessage] = st.one_of(
+    registrations,
+    st.builds(CandidateSet, candidate_tuples()),
+    st.builds(ServiceSet, _tuples(offers, by="name"), _tuples(uses, by="name")),
+    reports,
+    st.builds(Ack, st.sampled_from(ResourceKind), versions, uint64),
+    st.builds(Nack, st.sampled_from(ResourceKind), versions, uint64, texts),
+    st.just(Heartbeat()),
+    st.just(Drain()),
+)
+control_messages: st.SearchStrategy[ControlMessage] = st.one_of(welcomes, peer_sets(), mapping_sets)
+resource_statuses = st.builds(ResourceStatus, versions, versions, st.sampled_from(SyncState), texts)
+statuses = st.builds(
+    SidecarStatus,
+    peers.map(lambda peer: dataclasses.replace(peer, token=b"")),
+    st.booleans(),
+    durations | st.just(0.0),
+    texts,
+    _tuples(uses),
+    resource_statuses,
+    resource_statuses,
+    _tuples(service_mappings),
+    _tuples(paths),
+)

@@ -1,0 +1,250 @@
+"""Every message round-trips, and what breaks a rule of the protocol is refused by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from protos.convert import (
+    control_message_from_proto,
+    control_message_to_proto,
+    parse_control_message,
+    parse_sidecar_message,
+    sidecar_message_from_proto,
+    sidecar_message_to_proto,
+    status_from_proto,
+    status_to_proto,
+)
+from protos.convert.fields import MAX_CANDIDATES, MAX_STRING_BYTES, MAX_VERSION, clean_text
+from protos.errors import DecodeError
+from protos.model import (
+    Ack,
+    Candidate,
+    CandidateKind,
+    CandidateSet,
+    ControlMessage,
+    InterfaceId,
+    InterfaceName,
+    Nack,
+    NodeName,
+    Peer,
+    ResourceKind,
+    Role,
+    SessionId,
+    SidecarMessage,
+    SidecarStatus,
+    Version,
+)
+from protos.plr.v1 import admin_pb2, control_pb2, types_pb2
+from tests.unit.protos import message_strategies as some
+
+PEERS = control_pb2.RESOURCE_KIND_PEERS
+LEFT = control_pb2.REMOVAL_REASON_LEFT
+
+
+@given(some.sidecar_messages)
+def test_sidecar_messages_round_trip(value: SidecarMessage) -> None:
+    assert sidecar_message_from_proto(sidecar_message_to_proto(value)) == value
+    assert parse_sidecar_message(sidecar_message_to_proto(value).SerializeToString()) == value
+
+
+@given(some.control_messages)
+@settings(deadline=None)
+def test_control_messages_round_trip(value: ControlMessage) -> None:
+    assert control_message_from_proto(control_message_to_proto(value)) == value
+    assert parse_control_message(control_message_to_proto(value).SerializeToString()) == value
+
+
+@given(st.lists(some.statuses, max_size=3))
+@settings(deadline=None, max_examples=30)
+def test_statuses_round_trip(statuses: list[SidecarStatus]) -> None:
+    assert status_from_proto(status_to_proto(statuses)) == tuple(statuses)
+
+
+def test_a_status_never_carries_a_token() -> None:
+    secret = bytes(range(16))
+    peer = Peer(NodeName("robot"), Role.ROBOT, SessionId(1), secret, incarnation=1)
+    message = status_to_proto([SidecarStatus(peer, connected=True, lease_left_s=1.0, software_version="1")])
+    assert secret not in message.SerializeToString()
+    assert status_from_proto(message)[0].peer.token == b""
+
+
+def register(**changes: Any) -> control_pb2.SidecarMessage:
+    fields: dict[str, Any] = {
+        "protocol_version": 1,
+        "name": "robot-1",
+        "role": types_pb2.ROLE_ROBOT,
+        "session": 7,
+        "token": bytes(16),
+        "incarnation": 1,
+        "software_version": "1.0",
+    }
+    return control_pb2.SidecarMessage(register=control_pb2.Register(**(fields | changes)))
+
+
+def candidates(*changes: dict[str, Any]) -> control_pb2.SidecarMessage:
+    fields: dict[str, Any] = {
+        "interface_id": 0,
+        "interface": "wlan0",
+        "kind": types_pb2.CANDIDATE_KIND_HOST,
+        "address": types_pb2.Address(ip=b"\x0a\x00\x00\x01", port=4000),
+    }
+    made = [types_pb2.Candidate(**(fields | change)) for change in changes]
+    return control_pb2.SidecarMessage(candidates=control_pb2.Candidates(candidates=made))
+
+
+def at(ip: bytes, port: int = 4000) -> dict[str, Any]:
+    return {"address": types_pb2.Address(ip=ip, port=port)}
+
+
+def services(offers: Any = (), uses: Any = ()) -> control_pb2.SidecarMessage:
+    return control_pb2.SidecarMessage(services=control_pb2.Services(offers=offers, uses=uses))
+
+
+def use(**changes: Any) -> types_pb2.ServiceUse:
+    fields: dict[str, Any] = {"name": "/plan", "type": "nav_msgs/srv/GetPlan", "deadline_us": 100_000}
+    return types_pb2.ServiceUse(**(fields | changes))
+
+
+def latency(**changes: Any) -> control_pb2.SidecarMessage:
+    fields: dict[str, Any] = {"interface": "wlan0", "server": "cloud-a", "service": "/plan"}
+    report = control_pb2.Report(latencies=[control_pb2.LatencyReport(**(fields | changes))])
+    return control_pb2.SidecarMessage(report=report)
+
+
+def test_the_samples_that_the_next_test_breaks_are_good() -> None:
+    for message in (register(), candidates({}), services(uses=[use()]), latency()):
+        sidecar_message_from_proto(message)
+
+
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [
+        (control_pb2.SidecarMessage(), "no known kind"),
+        (register(name=""), "name"),
+        (register(name="robot 1"), "name"),
+        (register(name="../robot"), "name"),
+        (register(name="-robot"), "name"),
+        (register(name="röbot"), "name"),
+        (register(name="robot\n"), "name"),
+        (register(name="r" * (MAX_STRING_BYTES + 1)), "name"),
+        (register(role=0), "role"),
+        (register(role=9), "role"),
+        (register(session=0), "session"),
+        (register(token=b""), "token"),
+        (register(token=bytes(17)), "token"),
+        (register(software_version="1\x1b[2J"), "software_version"),
+        (register(peers_version=MAX_VERSION + 1), "peers_version"),
+        (candidates({"interface_id": 256}), "interface_id"),
+        (candidates({"interface": ""}), "interface"),
+        (candidates({"interface": "a/b"}), "interface"),
+        (candidates({"kind": 0}), "candidate kind"),
+        (candidates({}, {}), "candidates"),
+        (candidates({}, {"interface_id": 1, **at(b"\x0a\x00\x00\x02")}), "interface"),
+        (candidates({}, {"interface": "wwan0", **at(b"\x0a\x00\x00\x02")}), "interface_id"),
+        (candidates(at(b"")), "address"),
+        (candidates(at(bytes(5))), "address"),
+        (candidates(at(bytes(4))), "address"),
+        (candidates(at(bytes(16))), "address"),
+        (candidates(at(b"\xe0\x00\x00\x01")), "address"),
+        (candidates(at(b"\xff\xff\xff\xff")), "address"),
+        (candidates(at(b"\x0a\x00\x00\x01", 0)), "port"),
+        (candidates(at(b"\x0a\x00\x00\x01", 65536)), "port"),
+        (candidates(*({**at(b"\x0a\x00\x00\x01", 1 + i)} for i in range(MAX_CANDIDATES + 1))), "candidates"),
+        (services(uses=[use(name="plan")]), "service"),
+        (services(uses=[use(name="/plan/")]), "service"),
+        (services(uses=[use(name="/1plan")]), "service"),
+        (services(uses=[use(type="GetPlan")]), "type"),
+        (services(uses=[use(deadline_us=0)]), "deadline_us"),
+        (services(uses=[use(deadline_us=1 << 60)]), "deadline_us"),
+        (services(uses=[use(), use()]), "uses"),
+        (services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A", capacity=1 << 31)]), "capacity"),
+        (services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A")] * 2), "offers"),
+        (latency(server=""), "server"),
+        (latency(latency=types_pb2.Histogram(layout=2, index=[1], count=[1])), "layout"),
+        (latency(latency=types_pb2.Histogram(layout=1, index=[1], count=[])), "histogram"),
+        (latency(processing=types_pb2.Histogram(lost=1)), "layout"),
+        (control_pb2.SidecarMessage(ack=control_pb2.Ack(version=1)), "resource"),
+        (control_pb2.SidecarMessage(nack=control_pb2.Nack(resource=PEERS, error="a\nb")), "error"),
+    ],
+)
+def test_a_broken_rule_is_named(message: control_pb2.SidecarMessage, field: str) -> None:
+    with pytest.raises(DecodeError, match=field):
+        sidecar_message_from_proto(message)
+
+
+def mapping(**changes: Any) -> control_pb2.ControlMessage:
+    made = control_pb2.ServiceMapping(**({"service": "/plan"} | changes))
+    return control_pb2.ControlMessage(mapping=control_pb2.MappingSet(version=1, services=[made]))
+
+
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [
+        (control_pb2.ControlMessage(), "no known kind"),
+        (control_pb2.ControlMessage(welcome=control_pb2.Welcome(report_interval_us=1)), "lease_us"),
+        (control_pb2.ControlMessage(welcome=control_pb2.Welcome(lease_us=1)), "report_interval_us"),
+        (mapping(predicted_miss=float("nan")), "predicted_miss"),
+        (mapping(predicted_miss=1.5), "predicted_miss"),
+        (mapping(predicted_miss=-0.1), "predicted_miss"),
+        (mapping(assignments=[control_pb2.Assignment(interface="w", server="a")] * 2), "assignments"),
+        (
+            control_pb2.ControlMessage(
+                peers=control_pb2.PeerSet(removed=[control_pb2.RemovedPeer(name="a")])
+            ),
+            "removal reason",
+        ),
+        (
+            control_pb2.ControlMessage(
+                peers=control_pb2.PeerSet(removed=[control_pb2.RemovedPeer(name="a", reason=LEFT)] * 2)
+            ),
+            "peers",
+        ),
+    ],
+)
+def test_a_broken_rule_of_the_control_plane_is_named(message: control_pb2.ControlMessage, field: str) -> None:
+    with pytest.raises(DecodeError, match=field):
+        control_message_from_proto(message)
+
+
+def test_a_sync_state_without_meaning_is_refused() -> None:
+    peer = types_pb2.Peer(name="a", role=types_pb2.ROLE_CLOUD, session=1)
+    status = admin_pb2.SidecarStatus(peer=peer)
+    with pytest.raises(DecodeError, match="sync state"):
+        status_from_proto(admin_pb2.GetStatusResponse(sidecars=[status]))
+
+
+def test_an_ipv4_address_inside_ipv6_is_written_as_ipv4() -> None:
+    message = candidates(at(bytes(10) + b"\xff\xff\x0a\x00\x00\x01"))
+    value = sidecar_message_from_proto(message)
+    assert isinstance(value, CandidateSet)
+    assert value.candidates[0].address == ("10.0.0.1", 4000)
+
+
+def test_a_zone_stays_at_home() -> None:
+    value = CandidateSet(
+        (Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, ("fe80::1%eth0", 4000)),)
+    )
+    back = sidecar_message_from_proto(sidecar_message_to_proto(value))
+    assert isinstance(back, CandidateSet)
+    assert back.candidates[0].address == ("fe80::1", 4000)
+
+
+@given(st.text())
+def test_any_error_text_can_be_sent(text: str) -> None:
+    nack = Nack(ResourceKind.PEERS, Version(3), 4, text)
+    back = sidecar_message_from_proto(sidecar_message_to_proto(nack))
+    assert back == Nack(ResourceKind.PEERS, Version(3), 4, clean_text(text))
+
+
+def test_a_long_text_is_cut_between_characters() -> None:
+    assert clean_text("x" + "é" * 200) == "x" + "é" * 127
+
+
+def test_a_message_of_the_wrong_type_is_refused() -> None:
+    ack = sidecar_message_to_proto(Ack(ResourceKind.PEERS, Version(1), 1))
+    with pytest.raises(DecodeError):
+        parse_control_message(ack.SerializeToString())
