@@ -69,13 +69,11 @@ class Reassembler:
                 self._remember(number)
                 return fragment.data
             partial = self._open(fragment, now)
-            if partial is None:
-                return Progress.DROPPED
         elif len(partial.buffer) != fragment.total or partial.symbol != fragment.symbol:
             self._dropped["fragment_mismatch"] += 1
             return Progress.DROPPED
         partial.touched_at = now
-        index = fragment.index
+        index = fragment.symbol_index
         if not partial.have[index]:
             partial.have[index] = 1
             partial.missing -= 1
@@ -89,20 +87,19 @@ class Reassembler:
                 return memoryview(partial.buffer)
         return Progress.STORED
 
-    def _open(self, fragment: Fragment, now: float) -> _Partial | None:
-        if len(self._partials) >= MAX_PEER_MESSAGES or self._bytes + fragment.total > MAX_PEER_BYTES:
-            self.expire(now)
-        if len(self._partials) >= MAX_PEER_MESSAGES:
-            self._dropped["reassembly_count"] += 1
-            return None
-        if self._bytes + fragment.total > MAX_PEER_BYTES:
-            self._dropped["reassembly_bytes"] += 1
-            return None
+    def _open(self, fragment: Fragment, now: float) -> _Partial:
+        partials = self._partials
+        while partials and (len(partials) >= MAX_PEER_MESSAGES or self._bytes + fragment.total > MAX_PEER_BYTES):
+            self._drop(next(iter(partials)), "reassembly_evicted")
         count = symbol_count(fragment.total, fragment.symbol)
         partial = _Partial(bytearray(fragment.total), fragment.symbol, count, bytearray(count), now)
-        self._partials[fragment.message] = partial
+        partials[fragment.message] = partial
         self._bytes += fragment.total
         return partial
+
+    def _drop(self, number: int, reason: str) -> None:
+        self._bytes -= len(self._partials.pop(number).buffer)
+        self._dropped[reason] += 1
 
     def _remember(self, number: int) -> None:
         self._finished[number] = None
@@ -113,5 +110,4 @@ class Reassembler:
         """Drop messages that got nothing new for MAX_AGE_S."""
         old = [number for number, partial in self._partials.items() if partial.touched_at + MAX_AGE_S <= now]
         for number in old:
-            self._bytes -= len(self._partials.pop(number).buffer)
-            self._dropped["reassembly_expired"] += 1
+            self._drop(number, "reassembly_expired")

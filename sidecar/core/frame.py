@@ -116,7 +116,7 @@ class Fragment(NamedTuple):
     message: int
     total: int
     symbol: int
-    index: int
+    symbol_index: int
     data: memoryview
 
 

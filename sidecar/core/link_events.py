@@ -151,12 +151,4 @@ class PeerClosed:
     peer: NodeName
 
 
-LinkEvent = (
-    FragmentReceived
-    | FragmentsLost
-    | MessageFinished
-    | PathChanged
-    | PathMeasured
-    | PeerRestarted
-    | PeerClosed
-)
+LinkEvent = FragmentReceived | FragmentsLost | MessageFinished | PathChanged | PathMeasured | PeerRestarted | PeerClosed

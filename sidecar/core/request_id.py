@@ -8,9 +8,12 @@ only brings the three to 16 bytes (collision chance for 10^9 requests about 10^-
 from __future__ import annotations
 
 import hashlib
+from typing import TYPE_CHECKING
 
-from protos.model import SessionId
 from sidecar.core.events import RequestId
+
+if TYPE_CHECKING:
+    from protos.model import SessionId
 
 REQUEST_ID_BYTES = 16
 

@@ -1,0 +1,214 @@
+"""Cloud side: every request runs at most once here, however many copies arrive (architecture: Semantics).
+
+A request is running (copies wait for its result), answered (copies get the cached answer) or forgotten: its id is
+kept as a tombstone after the answer had to go, so that a very late copy is refused and not run again.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from sidecar.core.events import AbandonExecution, ExecuteRequest, ExecutionId, RejectReason, RequestId
+from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
+
+if TYPE_CHECKING:
+    from protos.model import ServiceName
+    from sidecar.core.link_events import PathId
+    from sidecar.core.messages import RequestMessage
+    from sidecar.core.stats import EngineStats
+
+MAX_RUNNING = 8192
+"""Requests that local servers work on at once."""
+MAX_WAITERS = 16
+"""Copies that wait for one result; a robot sends one for each of its interfaces."""
+MAX_CACHED_BYTES = 64 * 1024 * 1024
+"""Answers kept for late copies."""
+MAX_REMEMBERED = 200_000
+"""Ids remembered; at 1000 requests a second more than three minutes of them."""
+REMEMBER_S = 120.0
+"""A copy can not arrive later than this: twice the longest lifetime that a sender may ask for."""
+MAX_LIFETIME_S = 60.0
+"""Lifetimes from the wire are cut to this."""
+
+
+@dataclass(frozen=True, slots=True)
+class Waiter:
+    """Where one copy's answer goes."""
+
+    path: PathId
+    copy: int
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """Send this to the robot; it is of no use after `expires`."""
+
+    waiter: Waiter
+    message: ResponseMessage | RejectionMessage
+    expires: float
+
+
+@dataclass(slots=True)
+class _Execution:
+    id: ExecutionId
+    request_id: RequestId
+    service: ServiceName
+    expires: float
+    waiters: list[Waiter] = field(default_factory=list)
+    finished_at: float | None = None
+    payload: bytes | None = None
+    processing_s: float = 0.0
+    refusal: tuple[RejectReason, str] | None = None
+
+
+class ExecutionTable:
+    """All requests this sidecar has seen lately."""
+
+    def __init__(self, stats: EngineStats) -> None:
+        self._stats = stats
+        self._by_request: dict[RequestId, _Execution] = {}
+        """Running."""
+        self._finished: dict[RequestId, _Execution] = {}
+        """In the order they finished."""
+        self._running: dict[ExecutionId, _Execution] = {}
+        self._cached: dict[RequestId, int] = {}
+        self._cached_bytes = 0
+        self._timers: list[tuple[float, ExecutionId]] = []
+        self._next_id = 0
+
+    @property
+    def running(self) -> int:
+        """How many requests are being worked on."""
+        return len(self._running)
+
+    def knows(self, request_id: RequestId) -> bool:
+        """Whether a copy of this request came before."""
+        return request_id in self._by_request or request_id in self._finished
+
+    def on_request(self, path: PathId, message: RequestMessage, now: float) -> ExecuteRequest | Reply | None:
+        """Take one copy: run the request, answer from the cache, refuse, or (None) let it wait for the result."""
+        waiter = Waiter(path, message.copy)
+        execution = self._by_request.get(message.request_id) or self._finished.get(message.request_id)
+        lifetime = min(message.lifetime_left_s, MAX_LIFETIME_S)
+        count = self._stats.executions
+        if execution is not None:
+            if execution.service != message.service:
+                self._stats.dropped["request_id_mismatch"] += 1
+                return None
+            if execution.finished_at is None:
+                if len(execution.waiters) < MAX_WAITERS and waiter not in execution.waiters:
+                    execution.waiters.append(waiter)
+                    execution.expires = max(execution.expires, now + lifetime)
+                count[message.service, "coalesced"] += 1
+                return None
+            count[message.service, "cached"] += 1
+            return self._reply(execution, waiter, now + lifetime)
+        self._forget_old(now)
+        if len(self._running) >= MAX_RUNNING or len(self._finished) >= MAX_REMEMBERED:
+            self._stats.dropped["executions_full"] += 1
+            return self.refuse_unseen(waiter, message, RejectReason.OVERLOADED, "too many requests", now)
+        execution = _Execution(
+            ExecutionId(self._next_id), message.request_id, message.service, now + lifetime, [waiter]
+        )
+        self._next_id += 1
+        self._by_request[message.request_id] = execution
+        self._running[execution.id] = execution
+        heapq.heappush(self._timers, (execution.expires, execution.id))
+        count[message.service, "run"] += 1
+        # bytes(): the buffer is the reassembler's and rmw wants bytes.
+        return ExecuteRequest(execution.id, message.service, message.type, bytes(message.payload), path.peer, lifetime)
+
+    def refuse_unseen(
+        self, waiter: Waiter, message: RequestMessage, reason: RejectReason, text: str, now: float
+    ) -> Reply:
+        """Refuse a copy without remembering it: the request has not run, and may run later."""
+        self._stats.executions[message.service, "refused"] += 1
+        rejection = RejectionMessage(message.request_id, message.copy, reason, text)
+        return Reply(waiter, rejection, now + min(message.lifetime_left_s, MAX_LIFETIME_S))
+
+    def complete(self, execution_id: ExecutionId, payload: bytes, processing_s: float, now: float) -> list[Reply]:
+        """The local server answered."""
+        if len(payload) > MAX_PAYLOAD_BYTES:
+            text = f"the answer has {len(payload)} bytes, the limit is {MAX_PAYLOAD_BYTES}"
+            return self.refuse(execution_id, RejectReason.TOO_LARGE, text, now)
+        execution = self._finish(execution_id, now)
+        if execution is None:
+            return []
+        execution.payload = payload
+        execution.processing_s = processing_s
+        self._cache(execution)
+        return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
+
+    def refuse(self, execution_id: ExecutionId, reason: RejectReason, text: str, now: float) -> list[Reply]:
+        """The local server did not answer."""
+        execution = self._finish(execution_id, now)
+        if execution is None:
+            return []
+        self._stats.executions[execution.service, "refused"] += 1
+        execution.refusal = (reason, text)
+        if reason.certainly_not_run:
+            del self._finished[execution.request_id]
+        return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
+
+    def next_timer(self) -> float | None:
+        """When `handle_timer` is wanted."""
+        return self._timers[0][0] if self._timers else None
+
+    def handle_timer(self, now: float) -> list[AbandonExecution]:
+        """Give up executions nobody waits for any more; they may have run, so their ids stay."""
+        abandoned = []
+        while self._timers and self._timers[0][0] <= now:
+            _, execution_id = heapq.heappop(self._timers)
+            execution = self._running.get(execution_id)
+            if execution is None:
+                continue
+            if execution.expires > now:
+                heapq.heappush(self._timers, (execution.expires, execution_id))
+                continue
+            self._finish(execution_id, now)
+            execution.refusal = (RejectReason.SERVER_LOST, "the server gave no answer in time")
+            self._stats.executions[execution.service, "abandoned"] += 1
+            abandoned.append(AbandonExecution(execution_id))
+        return abandoned
+
+    def _finish(self, execution_id: ExecutionId, now: float) -> _Execution | None:
+        execution = self._running.pop(execution_id, None)
+        if execution is None:
+            self._stats.dropped["answer_to_unknown_execution"] += 1
+            return None
+        execution.finished_at = now
+        del self._by_request[execution.request_id]
+        self._finished[execution.request_id] = execution
+        return execution
+
+    def _reply(self, execution: _Execution, waiter: Waiter, expires: float) -> Reply:
+        request_id = execution.request_id
+        if execution.payload is not None:
+            response = ResponseMessage(request_id, waiter.copy, execution.processing_s, execution.payload)
+            return Reply(waiter, response, expires)
+        reason, text = execution.refusal or (RejectReason.FORGOTTEN, "answered before; the answer is gone")
+        return Reply(waiter, RejectionMessage(request_id, waiter.copy, reason, text), expires)
+
+    def _cache(self, execution: _Execution) -> None:
+        size = len(execution.payload or b"")
+        self._cached[execution.request_id] = size
+        self._cached_bytes += size
+        while self._cached_bytes > MAX_CACHED_BYTES:
+            oldest = next(iter(self._cached))
+            self._cached_bytes -= self._cached.pop(oldest)
+            self._finished[oldest].payload = None
+            self._stats.dropped["cached_answer_evicted"] += 1
+
+    def _forget_old(self, now: float) -> None:
+        """Drop ids that no copy can ask for any more."""
+        finished = self._finished
+        while finished:
+            request_id, execution = next(iter(finished.items()))
+            if execution.finished_at is None or execution.finished_at + REMEMBER_S > now:
+                return
+            del finished[request_id]
+            size = self._cached.pop(request_id, None)
+            if size is not None:
+                self._cached_bytes -= size

@@ -1,0 +1,352 @@
+"""The sidecar's requests, peers and routes: what all links share. Sans-IO; the caller serialises the calls.
+
+Inputs are method calls with `now`; outputs are `take_commands` (for the links) and `take_events` (for the
+application). Nothing here builds, seals or parses a datagram.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from protos.errors import DecodeError
+from protos.model import MappingSet, PeerSet, Report, Role, ServiceUse
+from sidecar.core.dedup import ExecutionTable, Reply, Waiter
+from sidecar.core.events import (
+    AbandonExecution,
+    ApplicationEvent,
+    ExecuteRequest,
+    ExecutionId,
+    RejectReason,
+    RequestFailed,
+    RequestId,
+)
+from sidecar.core.fragments import Progress, Reassembler
+from sidecar.core.link_events import (
+    FragmentReceived,
+    FragmentsLost,
+    LinkCommand,
+    LinkEvent,
+    MessageFinished,
+    PathChanged,
+    PathId,
+    PathMeasured,
+    PathState,
+    PeerClosed,
+    PeerRestarted,
+    SendFinished,
+    SetPeers,
+)
+from sidecar.core.mapping import MappingTable
+from sidecar.core.measurements import Measurements
+from sidecar.core.messages import (
+    RequestMessage,
+    ResponseMessage,
+    decode_message,
+    encode_message,
+)
+from sidecar.core.offers import Offers
+from sidecar.core.outbox import Outbox
+from sidecar.core.peers import Peers
+from sidecar.core.requests import RequestParts, RequestTable
+from sidecar.core.routes import Routes
+from sidecar.core.rules import ServiceRule, find_rule
+from sidecar.core.stats import EngineStats
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceOffer
+
+SWEEP_EVERY_S = 1.0
+"""How often old messages and half messages are looked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class EngineConfig:
+    """What the engine must know from the configuration."""
+
+    role: Role
+    rules: tuple[ServiceRule, ...]
+
+
+class Engine:
+    """One sidecar without its sockets, its clock and ROS."""
+
+    def __init__(self, config: EngineConfig, now: float) -> None:
+        self._config = config
+        self.stats = EngineStats()
+        self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
+        self._events: list[ApplicationEvent] = []
+        self._interfaces: set[InterfaceName] = set()
+        self._local_offers: dict[ServiceName, ServiceOffer] = {}
+        self._carried: frozenset[ServiceName] = frozenset()
+        self._draining = False
+        self._sweep_at = now + SWEEP_EVERY_S
+        self._reassemblers: dict[NodeName, Reassembler] = {}
+        self.peers = Peers()
+        self.routes = Routes()
+        self.mapping = MappingTable(self.routes)
+        self._offers = Offers(config.rules)
+        self._outbox = Outbox(self.routes, self._to_link, self.stats)
+        self._measurements = Measurements()
+        self._executions = ExecutionTable(self.stats)
+        self._requests = RequestTable(
+            RequestParts(
+                self._offers,
+                self.mapping,
+                self.routes,
+                self._outbox,
+                self._measurements,
+                self.stats,
+                self._events.append,
+            )
+        )
+
+    # -- outputs --------------------------------------------------------------------------------------------------
+
+    def take_commands(self) -> list[tuple[InterfaceName | None, LinkCommand]]:
+        """Return what the links shall do; None as interface means all of them."""
+        commands, self._commands = self._commands, []
+        return commands
+
+    def take_events(self) -> list[ApplicationEvent]:
+        """Return what the application shall know."""
+        events = self._events[:]
+        self._events.clear()
+        return events
+
+    def _to_link(self, command: LinkCommand) -> None:
+        interface = None if isinstance(command, SetPeers) else command.path.interface  # type: ignore[union-attr]
+        self._commands.append((interface, command))
+
+    # -- the application's calls ----------------------------------------------------------------------------------
+
+    def submit(self, request_id: RequestId, service: ServiceName, payload: bytes, now: float) -> None:
+        """Robot: send a serialised request."""
+        rule = find_rule(self._config.rules, service)
+        kind = self._offers.offered.get(service)
+        if rule is None or kind is None:
+            self.stats.requests[service, "rejected"] += 1
+            self._events.append(
+                RequestFailed(request_id, service, "rejected", "no server offers this service any more", 0.0)
+            )
+            return
+        self._requests.submit(request_id, service, kind, rule, payload, now)
+        self.stats.in_flight = self._requests.unanswered
+
+    def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:
+        """Cloud: the local server answered."""
+        self._reply(self._executions.complete(execution, payload, processing_s, now))
+        self.stats.in_flight = self._executions.running
+
+    def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str, now: float) -> None:
+        """Cloud: the request was not or will not be answered."""
+        self._reply(self._executions.refuse(execution, reason, detail, now))
+        self.stats.in_flight = self._executions.running
+
+    def set_offers(self, offers: Iterable[ServiceOffer]) -> None:
+        """Cloud: the services that local servers offer right now."""
+        self._local_offers = {offer.name: offer for offer in offers}
+
+    def set_carried(self, services: frozenset[ServiceName]) -> None:
+        """Robot: the proxied services that exist right now."""
+        self._carried = services
+
+    def drain(self) -> None:
+        """Cloud: take no new requests; those in flight go on."""
+        self._draining = True
+
+    @property
+    def busy(self) -> int:
+        """Requests in flight here, in either role."""
+        return self._executions.running + self._requests.unanswered + len(self._outbox)
+
+    # -- the control plane ----------------------------------------------------------------------------------------
+
+    def offers(self) -> tuple[ServiceOffer, ...]:
+        """What this sidecar can run."""
+        return tuple(self._local_offers.values())
+
+    def uses(self) -> tuple[ServiceUse, ...]:
+        """What this sidecar carries."""
+        uses = []
+        for name, kind in self._offers.offered.items():
+            rule = find_rule(self._config.rules, name)
+            if rule is not None and name in self._carried:
+                uses.append(ServiceUse(name, kind, rule.deadline_s, rule.idempotent))
+        return tuple(uses)
+
+    def set_interfaces(self, interfaces: Iterable[InterfaceName]) -> None:
+        """The interfaces that have a link now."""
+        new = set(interfaces)
+        for gone in self._interfaces - new:
+            self.routes.forget_interface(gone)
+        self._interfaces = new
+        self._commands.append((None, SetPeers(self.peers.for_links())))
+
+    def apply_peers(self, peer_set: PeerSet, now: float) -> str | None:
+        """Take a view of the peers; returns why it is refused, or None."""
+        before = {peer.name: peer.session for peer in self.peers.all()}
+        error = self.peers.apply(peer_set, self.routes.reaches)
+        if error:
+            self.stats.nacks += 1
+            return error
+        self.stats.peers_version = self.peers.version
+        for name, session in before.items():
+            if self.peers.session(name) != session:
+                self._end_session(name, now)
+        self._commands.append((None, SetPeers(self.peers.for_links())))
+        self._update_offers(now)
+        return None
+
+    def apply_mapping(self, mapping: MappingSet) -> str | None:
+        """Take a mapping; returns why it is refused, or None."""
+        error = self.mapping.apply(mapping, self._interfaces, self.peers.names())
+        if error:
+            self.stats.nacks += 1
+            return error
+        self.stats.mapping_version = self.mapping.version
+        return None
+
+    def take_report(self) -> Report:
+        """Return what was measured since the last report."""
+        return self._measurements.take(self.routes, self.peers.names())
+
+    @property
+    def service_mappings(self) -> tuple[ServiceMapping, ...]:
+        """The mapping in force."""
+        return tuple(self.mapping.services.values())
+
+    # -- the links' events ----------------------------------------------------------------------------------------
+
+    def on_link_event(self, event: LinkEvent, now: float) -> None:
+        """Take what a link saw."""
+        match event:
+            case FragmentReceived():
+                self._on_fragment(event, now)
+            case MessageFinished(peer, number):
+                self._outbox.on_finished(peer, number)
+            case FragmentsLost():
+                self._outbox.on_lost(event, now)
+            case PathMeasured():
+                self.routes.set_rtt(event.path, event.smoothed_rtt_s)
+                self._measurements.path(event)
+            case PathChanged():
+                self._on_path_changed(event, now)
+            case PeerRestarted():
+                if self.peers.restarted(event):
+                    self._end_session(event.peer, now)
+                    self._commands.append((None, SetPeers(self.peers.for_links())))
+            case PeerClosed(peer):
+                self._on_peer_closed(peer, now)
+        self.stats.in_flight = self._requests.unanswered + self._executions.running
+
+    def _on_fragment(self, event: FragmentReceived, now: float) -> None:
+        path = event.path
+        if path.peer not in self.peers:
+            self.stats.dropped["fragment_of_unknown_peer"] += 1
+            return
+        reassembler = self._reassemblers.get(path.peer)
+        if reassembler is None:
+            reassembler = self._reassemblers[path.peer] = Reassembler(path.peer, self.stats.dropped)
+        whole = reassembler.add(event.fragment, now)
+        if isinstance(whole, Progress):
+            if whole is Progress.ALREADY_FINISHED:
+                self._commands.append((path.interface, SendFinished(path, event.fragment.message)))
+            return
+        self._commands.append((path.interface, SendFinished(path, event.fragment.message)))
+        try:
+            message = decode_message(whole)
+        except DecodeError:
+            self.stats.dropped["malformed_message"] += 1
+            return
+        robot = self._config.role is Role.ROBOT
+        if isinstance(message, RequestMessage):
+            if robot:
+                self.stats.dropped["request_to_a_robot"] += 1
+            else:
+                self._on_request(path, message, now)
+        elif not robot:
+            self.stats.dropped["response_to_a_cloud"] += 1
+        elif isinstance(message, ResponseMessage):
+            self._requests.on_response(path.peer, message, now)
+        else:
+            self._requests.on_rejection(path.peer, message, now)
+
+    def _on_request(self, path: PathId, message: RequestMessage, now: float) -> None:
+        waiter = Waiter(path, message.copy)
+        offer = self._local_offers.get(message.service)
+        refusal = None
+        if self._draining:
+            refusal = RejectReason.DRAINING, "the sidecar is going away"
+        elif offer is None:
+            refusal = RejectReason.NOT_OFFERED, f"no server for {message.service}"
+        elif offer.type != message.type:
+            refusal = RejectReason.WRONG_TYPE, f"{message.service} has type {offer.type}, not {message.type}"
+        if refusal and not self._executions.knows(message.request_id):
+            self._reply([self._executions.refuse_unseen(waiter, message, *refusal, now)])
+            return
+        outcome = self._executions.on_request(path, message, now)
+        if isinstance(outcome, ExecuteRequest):
+            self._events.append(outcome)
+        elif isinstance(outcome, Reply):
+            self._reply([outcome])
+
+    def _reply(self, replies: list[Reply]) -> None:
+        for reply in replies:
+            path = reply.waiter.path
+            if self.routes.state(path) is PathState.DOWN:
+                path = self.routes.best_to(path.peer) or path
+            self._outbox.send(path, encode_message(reply.message), deadline=reply.expires, expires=reply.expires)
+
+    def _on_path_changed(self, event: PathChanged, now: float) -> None:
+        path, state = event.path, event.state
+        if path.peer not in self.peers or path.interface not in self._interfaces:
+            return
+        self.routes.set_state(path, state)
+        if state is PathState.UP:
+            self._outbox.on_path_up(path)
+        elif state is PathState.DOWN and not self.routes.reaches(path.peer):
+            if self.peers.drop_if_unlisted(path.peer):
+                self._end_session(path.peer, now)
+                self._commands.append((None, SetPeers(self.peers.for_links())))
+        self._update_offers(now)
+        self._requests.on_path_changed(path, state, now)
+
+    def _on_peer_closed(self, name: NodeName, now: float) -> None:
+        """It said goodbye: nothing new goes there; the control plane will say the same."""
+        for route in self.routes.all_to(name):
+            self.routes.set_state(route.id, PathState.DOWN)
+        self._requests.on_peer_gone(name, now)
+        self._update_offers(now)
+
+    def _end_session(self, name: NodeName, now: float) -> None:
+        self._reassemblers.pop(name, None)
+        self._outbox.drop_peer(name)
+        self.routes.forget_peer(name)
+        self._update_offers(now)
+        self._requests.on_peer_gone(name, now)
+
+    def _update_offers(self, now: float) -> None:
+        if self._config.role is Role.ROBOT:
+            self._events.extend(self._offers.update(self.peers.all(), self.routes, now))
+
+    # -- time -----------------------------------------------------------------------------------------------------
+
+    def next_timer(self) -> float:
+        """When `handle_timer` is wanted next."""
+        timers = (self._requests.next_timer(), self._executions.next_timer(), self._offers.next_timer())
+        return min((self._sweep_at, *(timer for timer in timers if timer is not None)))
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due by now."""
+        self._requests.handle_timer(now)
+        abandoned: list[AbandonExecution] = self._executions.handle_timer(now)
+        self._events.extend(abandoned)
+        if now >= self._sweep_at:
+            self._sweep_at = now + SWEEP_EVERY_S
+            self._outbox.expire(now)
+            for reassembler in self._reassemblers.values():
+                reassembler.expire(now)
+        self._update_offers(now)

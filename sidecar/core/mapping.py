@@ -1,0 +1,101 @@
+"""Which paths a request takes: the control plane's mapping, and what the sidecar does where it does not hold.
+
+The mapping says which interface goes to which server (paper, section IV.A). Between two mappings a path may die:
+then the interface takes another live server, and with no mapping at all (or none of its paths alive) the sidecar
+assigns by round-trip time itself. A request never waits for the control plane.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from protos.model import MappingSet, ServiceMapping, Version
+from sidecar.core.link_events import PathState
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from protos.model import InterfaceName, NodeName, ServiceName
+    from sidecar.core.link_events import PathId
+    from sidecar.core.routes import Route, Routes
+
+
+class MappingTable:
+    """The mapping in force and the choice of paths."""
+
+    def __init__(self, routes: Routes) -> None:
+        self._routes = routes
+        self._services: dict[ServiceName, ServiceMapping] = {}
+        self.version = Version(0)
+
+    @property
+    def services(self) -> Mapping[ServiceName, ServiceMapping]:
+        """The mapping in force."""
+        return self._services
+
+    def apply(
+        self, mapping: MappingSet, interfaces: Collection[InterfaceName], servers: Collection[NodeName]
+    ) -> str | None:
+        """Put a mapping in force; returns what is wrong with it (and keeps the old one) or None."""
+        for service in mapping.services:
+            for assignment in service.assignments:
+                if assignment.interface not in interfaces:
+                    return f"{service.service}: no interface {assignment.interface!r} here"
+                if assignment.server not in servers:
+                    return f"{service.service}: no peer {assignment.server!r} known here"
+        self._services = {service.service: service for service in mapping.services}
+        self.version = mapping.version
+        return None
+
+    def choose(self, service: ServiceName, servers: Collection[NodeName], *, idempotent: bool) -> tuple[PathId, ...]:
+        """Return the paths for a new request's copies; empty when nothing reaches any of the `servers`.
+
+        `servers` are the live ones that offer the service. Requests that are not idempotent get one server only
+        (over every interface that reaches it: the server runs them once, `dedup.py`).
+        """
+        chosen = self._mapped(service, servers)
+        if not any(route.state is PathState.UP for route in chosen):
+            chosen = self._merge(chosen, self._by_round_trip_time(servers))
+        if not idempotent:
+            chosen = self._one_server(chosen)
+        return tuple(route.id for route in chosen)
+
+    def _mapped(self, service: ServiceName, servers: Collection[NodeName]) -> list[Route]:
+        mapping = self._services.get(service)
+        chosen: list[Route] = []
+        for assignment in mapping.assignments if mapping else ():
+            route = None
+            if assignment.server in servers:
+                route = self._routes.best_over(assignment.interface, assignment.server)
+            if route is None:
+                others = [other for other in self._routes.usable(servers) if other.id.interface == assignment.interface]
+                route = others[0] if others else None
+            if route is not None and route not in chosen:
+                chosen.append(route)
+        return chosen
+
+    def _by_round_trip_time(self, servers: Collection[NodeName]) -> list[Route]:
+        """Each interface takes its fastest server, another than the others' where there is one."""
+        chosen: dict[InterfaceName, Route] = {}
+        taken: set[NodeName] = set()
+        routes = self._routes.usable(servers)
+        for fresh_server_only in (True, False):
+            for route in routes:
+                if route.id.interface not in chosen and not (fresh_server_only and route.id.peer in taken):
+                    chosen[route.id.interface] = route
+                    taken.add(route.id.peer)
+        return list(chosen.values())
+
+    def _merge(self, first: list[Route], more: list[Route]) -> list[Route]:
+        return first + [route for route in more if route not in first]
+
+    def _one_server(self, routes: list[Route]) -> list[Route]:
+        if not routes:
+            return routes
+        server = next((route for route in routes if route.state is PathState.UP), routes[0]).id.peer
+        return [route for route in routes if route.id.peer == server]
+
+    def rescue(self, servers: Collection[NodeName]) -> PathId | None:
+        """Return the best path to any of these servers that is up, for a request whose copies are in trouble."""
+        routes = self._routes.usable(servers)
+        return routes[0].id if routes and routes[0].state is PathState.UP else None

@@ -1,0 +1,91 @@
+"""Robot side: which services exist on the robot, following the live servers.
+
+A service is offered only while a live server offers it. "Live" survives a tunnel: when all paths to all its servers
+are dark, the offer stays for WITHDRAW_AFTER_S, since requests wait for the first path that comes back; when the
+servers themselves left, it goes at once.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.events import OfferService, WithdrawService
+from sidecar.core.rules import find_rule
+
+if TYPE_CHECKING:
+    from protos.model import NodeName, Peer, ServiceName
+    from sidecar.core.routes import Routes
+    from sidecar.core.rules import ServiceRule
+
+WITHDRAW_AFTER_S = 15.0
+"""Longer than a cellular handover or a tunnel, shorter than a person's patience with a dead service."""
+
+
+class Offers:
+    """Services offered on the robot, and the servers behind each."""
+
+    def __init__(self, rules: tuple[ServiceRule, ...]) -> None:
+        self._rules = rules
+        self._offered: dict[ServiceName, str] = {}
+        self._servers: dict[ServiceName, tuple[NodeName, ...]] = {}
+        self._dark_since: dict[ServiceName, float] = {}
+        self.conflicts: set[tuple[ServiceName, NodeName, str]] = set()
+        """Servers left out because they offer another type than the rest."""
+
+    @property
+    def offered(self) -> dict[ServiceName, str]:
+        """Service names and types offered now."""
+        return self._offered
+
+    def servers(self, service: ServiceName) -> tuple[NodeName, ...]:
+        """Return the servers that a new request for this service may go to."""
+        return self._servers.get(service, ())
+
+    def update(self, peers: list[Peer], routes: Routes, now: float) -> list[OfferService | WithdrawService]:
+        """Follow the peers and their paths; returns what changes on the robot."""
+        wanted = self._wanted(peers)
+        self._servers = {name: servers for name, (_, servers) in wanted.items()}
+        events: list[OfferService | WithdrawService] = [
+            self._withdraw(name, "the last server is gone")
+            for name, kind in list(self._offered.items())
+            if name not in wanted or wanted[name][0] != kind
+        ]
+        for name, (kind, servers) in wanted.items():
+            if any(routes.reaches(server) for server in servers):
+                self._dark_since.pop(name, None)
+                if name not in self._offered:
+                    self._offered[name] = kind
+                    events.append(OfferService(name, kind))
+            elif name in self._offered:
+                since = self._dark_since.setdefault(name, now)
+                if since + WITHDRAW_AFTER_S <= now:
+                    events.append(self._withdraw(name, f"no path to a server for {WITHDRAW_AFTER_S:.0f} s"))
+        return events
+
+    def _withdraw(self, name: ServiceName, reason: str) -> WithdrawService:
+        del self._offered[name]
+        self._dark_since.pop(name, None)
+        return WithdrawService(name, reason)
+
+    def _wanted(self, peers: list[Peer]) -> dict[ServiceName, tuple[str, tuple[NodeName, ...]]]:
+        """Service -> (type, servers), servers that drain only where there is no other."""
+        by_name: dict[ServiceName, dict[str, list[Peer]]] = {}
+        for peer in peers:
+            for offer in peer.offers:
+                if find_rule(self._rules, offer.name) is not None:
+                    by_name.setdefault(offer.name, {}).setdefault(offer.type, []).append(peer)
+        wanted = {}
+        for name, by_type in by_name.items():
+            current = self._offered.get(name)
+            # Most servers win; the type already offered wins a tie, so that one odd server changes nothing.
+            kind = max(sorted(by_type), key=lambda kind: (len(by_type[kind]), kind == current))
+            self.conflicts.update(
+                (name, peer.name, other) for other, others in by_type.items() if other != kind for peer in others
+            )
+            fresh = [peer.name for peer in by_type[kind] if not peer.draining]
+            wanted[name] = (kind, tuple(fresh or [peer.name for peer in by_type[kind]]))
+        return wanted
+
+    def next_timer(self) -> float | None:
+        """When the oldest darkness ends an offer."""
+        return min(self._dark_since.values()) + WITHDRAW_AFTER_S if self._dark_since else None

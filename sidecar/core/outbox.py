@@ -1,0 +1,108 @@
+"""Messages that are not delivered yet, and over which path their missing symbols travel."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.link_events import Resend, Send
+from sidecar.core.outbound import OutboundMessage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import NodeName
+    from sidecar.core.link_events import FragmentsLost, LinkCommand, PathId
+    from sidecar.core.routes import Routes
+    from sidecar.core.stats import EngineStats
+
+MAX_MESSAGES = 16_384
+MAX_BYTES = 256 * 1024 * 1024
+"""All undelivered messages together: sixteen of the largest."""
+
+
+class Outbox:
+    """Undelivered messages, by number. The numbers are this session's own, never reused."""
+
+    def __init__(self, routes: Routes, command: Callable[[LinkCommand], None], stats: EngineStats) -> None:
+        self._routes = routes
+        self._command = command
+        self._stats = stats
+        self._messages: dict[int, OutboundMessage] = {}
+        self._parked: dict[NodeName, dict[int, OutboundMessage]] = {}
+        self._bytes = 0
+        self._next_number = 1
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of all undelivered messages."""
+        return self._bytes
+
+    def has_room(self, size: int) -> bool:
+        """Whether another message of this size may be sent."""
+        return len(self._messages) < MAX_MESSAGES and self._bytes + size <= MAX_BYTES
+
+    def send(self, path: PathId, data: bytes, *, deadline: float, expires: float) -> OutboundMessage | None:
+        """Send a message over `path`; None (counted) when there is no room."""
+        if not self.has_room(len(data)):
+            self._stats.dropped["outbox_full"] += 1
+            return None
+        message = OutboundMessage(self._next_number, path.peer, data, deadline=deadline, expires=expires)
+        self._next_number += 1
+        self._messages[message.number] = message
+        self._bytes += len(data)
+        self._command(Send(path, message))
+        return message
+
+    def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
+        """The peer holds all of it. None when it is not one of the peer's messages, or was over before."""
+        message = self._messages.get(number)
+        if message is None or message.peer != peer:
+            return None
+        self.drop(message)
+        return message
+
+    def drop(self, message: OutboundMessage) -> None:
+        """Nothing more of it needs to travel."""
+        message.over = True
+        if self._messages.pop(message.number, None) is not None:
+            self._bytes -= len(message.data)
+            self._parked.get(message.peer, {}).pop(message.number, None)
+
+    def drop_peer(self, peer: NodeName) -> None:
+        """The peer's session is over: what was meant for it can not arrive."""
+        for message in [message for message in self._messages.values() if message.peer == peer]:
+            self.drop(message)
+        self._parked.pop(peer, None)
+
+    def on_lost(self, event: FragmentsLost, now: float) -> None:
+        """Send lost symbols again over the best path to that peer; without one, keep them until there is one."""
+        message = event.message
+        if message.over:
+            return
+        if message.expires <= now:
+            self.drop(message)
+            return
+        indices = tuple(index for index in event.indices if message.needs(index))
+        if not indices:
+            return
+        path = self._routes.best_to(message.peer, avoid=event.path if event.timed_out else None)
+        if path is None:
+            self._parked.setdefault(message.peer, {})[message.number] = message
+        else:
+            self._command(Resend(path, message, indices))
+
+    def on_path_up(self, path: PathId) -> None:
+        """Send what waited for a path to this peer."""
+        for message in self._parked.pop(path.peer, {}).values():
+            missing = tuple(index for index in range(message.count) if message.needs(index))
+            if missing:
+                self._command(Resend(path, message, missing))
+
+    def expire(self, now: float) -> None:
+        """Drop messages whose time is over."""
+        for message in [message for message in self._messages.values() if message.expires <= now]:
+            self.drop(message)
+            self._stats.dropped["message_expired"] += 1

@@ -1,0 +1,374 @@
+"""Robot side: replicate a request, take the first valid response, notice the deadline (paper, figure "Workflow
+Diagram", request steps 3 to 10).
+
+A copy is one sending of a request to one server. Every copy's latency is measured, also when it lost the race. Once
+the deadline is over and another copy has won, what is left unsent of a copy is called off and counts as lost: its
+latency is known to be beyond the deadline, which is all that the prediction needs.
+"""
+
+from __future__ import annotations
+
+import enum
+import heapq
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from protos.histogram import Histogram
+from protos.model import Assignment
+from sidecar.core.events import (
+    ApplicationEvent,
+    DeadlineMissed,
+    RequestFailed,
+    RequestId,
+    ResponseArrived,
+)
+from sidecar.core.link_events import PathId, PathState
+from sidecar.core.messages import (
+    MAX_NAME_BYTES,
+    MAX_PAYLOAD_BYTES,
+    RejectionMessage,
+    RequestMessage,
+    ResponseMessage,
+    encode_message,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import NodeName, ServiceName
+    from sidecar.core.mapping import MappingTable
+    from sidecar.core.measurements import Measurements
+    from sidecar.core.offers import Offers
+    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.outbox import Outbox
+    from sidecar.core.routes import Routes
+    from sidecar.core.rules import ServiceRule
+    from sidecar.core.stats import EngineStats
+
+MAX_IN_FLIGHT = 8192
+"""Requests that wait for a response."""
+MAX_COPIES = 8
+"""Copies of one request, those sent in trouble included."""
+
+
+class CopyState(enum.Enum):
+    """What became of a copy."""
+
+    PENDING = "pending"
+    ANSWERED = "answered"
+    REJECTED = "rejected"
+    DEAD = "dead"
+    """Its server's session ended, or it was called off."""
+
+
+@dataclass(slots=True)
+class Copy:
+    """One sending of a request to one server."""
+
+    path: PathId
+    sent_at: float
+    message: OutboundMessage
+    state: CopyState = CopyState.PENDING
+    certainly_not_run: bool = False
+
+
+@dataclass(slots=True)
+class Request:
+    """A request until all its copies are settled."""
+
+    id: RequestId
+    service: ServiceName
+    type: str
+    rule: ServiceRule
+    payload: bytes | None
+    submitted_at: float
+    copies: list[Copy] = field(default_factory=list)
+    done: bool = False
+    """The application got its response, or the request failed."""
+    missed: bool = False
+
+    @property
+    def deadline_at(self) -> float:
+        return self.submitted_at + self.rule.deadline_s
+
+    @property
+    def expires_at(self) -> float:
+        return self.submitted_at + self.rule.lifetime_s
+
+    def pending(self) -> list[Copy]:
+        return [copy for copy in self.copies if copy.state is CopyState.PENDING]
+
+
+@dataclass(frozen=True, slots=True)
+class RequestParts:
+    """What the request table works with."""
+
+    offers: Offers
+    mapping: MappingTable
+    routes: Routes
+    outbox: Outbox
+    measurements: Measurements
+    stats: EngineStats
+    emit: Callable[[ApplicationEvent], None]
+
+
+class RequestTable:
+    """All requests in flight."""
+
+    def __init__(self, parts: RequestParts) -> None:
+        self._parts = parts
+        self._requests: dict[RequestId, Request] = {}
+        self._timers: list[tuple[float, RequestId]] = []
+        self.unanswered = 0
+
+    # -- the application ------------------------------------------------------------------------------------------
+
+    def submit(
+        self,
+        request_id: RequestId,
+        service: ServiceName,
+        kind: str,
+        rule: ServiceRule,
+        payload: bytes,
+        now: float,
+    ) -> None:
+        """Send a request; ends in exactly one ResponseArrived or RequestFailed."""
+        request = Request(request_id, service, kind, rule, payload, now)
+        problem = self._problem(request)
+        if problem:
+            self._parts.stats.requests[service, "rejected"] += 1
+            self._parts.measurements.outcome(service, "rejected")
+            self._parts.emit(RequestFailed(request_id, service, "rejected", problem, 0.0))
+            return
+        self._requests[request_id] = request
+        self.unanswered += 1
+        heapq.heappush(self._timers, (request.deadline_at, request_id))
+        self._dispatch(request, now)
+
+    def _problem(self, request: Request) -> str | None:
+        size = len(request.payload or b"")
+        if size > MAX_PAYLOAD_BYTES:
+            return f"the request has {size} bytes, the limit is {MAX_PAYLOAD_BYTES}"
+        if len(request.service.encode()) > MAX_NAME_BYTES or len(request.type.encode()) > MAX_NAME_BYTES:
+            return f"the service's name or type is longer than {MAX_NAME_BYTES} bytes"
+        if self.unanswered >= MAX_IN_FLIGHT:
+            return f"{MAX_IN_FLIGHT} requests are in flight already"
+        if not self._parts.outbox.has_room(size):
+            return "too many bytes wait to be sent"
+        if request.id in self._requests:
+            return "a request with this identity is in flight already"
+        return None
+
+    def _dispatch(self, request: Request, now: float) -> None:
+        servers = self._parts.offers.servers(request.service)
+        idempotent = request.rule.idempotent
+        for path in self._parts.mapping.choose(request.service, servers, idempotent=idempotent):
+            self._send_copy(request, path, now)
+
+    def _send_copy(self, request: Request, path: PathId, now: float) -> None:
+        if request.payload is None or len(request.copies) >= MAX_COPIES:
+            return
+        head = RequestMessage(
+            request.id,
+            len(request.copies),
+            request.expires_at - now,
+            request.service,
+            request.type,
+            request.payload,
+        )
+        message = self._parts.outbox.send(
+            path, encode_message(head), deadline=request.deadline_at, expires=request.expires_at
+        )
+        if message is not None:
+            request.copies.append(Copy(path, now, message))
+
+    # -- the peers ------------------------------------------------------------------------------------------------
+
+    def on_response(self, server: NodeName, response: ResponseMessage, now: float) -> None:
+        """A copy was answered."""
+        found = self._find(server, response.request_id, response.copy)
+        if found is None:
+            return
+        request, copy = found
+        if copy.state is CopyState.ANSWERED:
+            self._parts.stats.duplicate_responses += 1
+            return
+        copy.state = CopyState.ANSWERED
+        # The response proves that the request arrived, also when the peer's FINISHED got lost.
+        self._parts.outbox.drop(copy.message)
+        self._parts.measurements.answered(copy.path, request.service, now - copy.sent_at, response.processing_s)
+        if request.done:
+            self._parts.stats.duplicate_responses += 1
+        else:
+            self._deliver(request, copy, response, now)
+        self._settle(request, now)
+
+    def _deliver(self, request: Request, copy: Copy, response: ResponseMessage, now: float) -> None:
+        stats = self._parts.stats
+        elapsed = now - request.submitted_at
+        late = elapsed > request.rule.deadline_s
+        if late and not request.missed:
+            self._miss(request)
+        self._finish(request, "deadline_missed" if late else "ok")
+        stats.durations.setdefault(request.service, Histogram()).record(elapsed)
+        if late and request.rule.drop_late:
+            stats.late_dropped[request.service] += 1
+            self._parts.emit(
+                RequestFailed(request.id, request.service, "late_dropped", "came after its deadline", elapsed)
+            )
+            return
+        stats.wins[copy.path.interface, copy.path.peer, request.service] += 1
+        # bytes(): the buffer is the reassembler's and rmw wants bytes.
+        payload = bytes(response.payload)
+        self._parts.emit(
+            ResponseArrived(request.id, request.service, payload, copy.path.peer, copy.path.interface, elapsed, late)
+        )
+
+    def on_rejection(self, server: NodeName, rejection: RejectionMessage, now: float) -> None:
+        """A server did not run a copy, or can not say what came of it."""
+        found = self._find(server, rejection.request_id, rejection.copy)
+        if found is None:
+            return
+        request, copy = found
+        if copy.state is not CopyState.PENDING:
+            return
+        copy.state = CopyState.REJECTED
+        copy.certainly_not_run = rejection.reason.certainly_not_run
+        self._parts.outbox.drop(copy.message)
+        self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
+        if not request.done:
+            self._rescue(request, now)
+            if not request.pending():
+                reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
+                self._fail(request, "rejected", reason, now)
+        self._settle(request, now)
+
+    def _find(self, server: NodeName, request_id: RequestId, number: int) -> tuple[Request, Copy] | None:
+        dropped = self._parts.stats.dropped
+        request = self._requests.get(request_id)
+        if request is None:
+            dropped["answer_to_unknown_request"] += 1
+            return None
+        if number >= len(request.copies):
+            dropped["answer_to_unknown_copy"] += 1
+            return None
+        copy = request.copies[number]
+        if copy.path.peer != server:
+            dropped["answer_from_wrong_server"] += 1
+            return None
+        return request, copy
+
+    def on_peer_gone(self, peer: NodeName, now: float) -> None:
+        """A peer's session ended: its copies get no answer any more."""
+        for request in list(self._requests.values()):
+            hit = [copy for copy in request.pending() if copy.path.peer == peer]
+            for copy in hit:
+                copy.state = CopyState.DEAD
+                self._parts.measurements.lost(copy.path, request.service)
+            if hit and not request.done:
+                self._rescue(request, now)
+                if not request.pending() and not request.rule.idempotent:
+                    self._fail(request, "failed", f"{peer} went away; it may have run the request", now)
+            self._settle(request, now)
+
+    def on_path_changed(self, path: PathId, state: PathState, now: float) -> None:
+        """Bring requests whose copies are in trouble to another path."""
+        for request in list(self._requests.values()):
+            if request.done:
+                continue
+            if state is not PathState.UP:
+                if any(copy.path == path for copy in request.pending()):
+                    self._rescue(request, now)
+            elif not request.pending():
+                self._redispatch(request, now)
+
+    def _redispatch(self, request: Request, now: float) -> None:
+        if not request.copies:
+            self._dispatch(request, now)
+        else:
+            self._rescue(request, now)
+
+    def _rescue(self, request: Request, now: float, *, insist: bool = False) -> None:
+        """Send one more copy when no pending one is on a path that is up (or when `insist`)."""
+        pending = request.pending()
+        routes = self._parts.routes
+        if not insist and any(routes.state(copy.path) is PathState.UP for copy in pending):
+            return
+        servers = self._parts.offers.servers(request.service)
+        if not request.rule.idempotent:
+            # Another server may run it only when it is certain that none has.
+            if not all(copy.state is CopyState.REJECTED and copy.certainly_not_run for copy in request.copies):
+                return
+        busy = {copy.path.peer for copy in pending}
+        refused = {copy.path.peer for copy in request.copies if copy.state is CopyState.REJECTED}
+        path = self._parts.mapping.rescue([server for server in servers if server not in busy | refused])
+        if path is not None:
+            self._send_copy(request, path, now)
+
+    # -- time -----------------------------------------------------------------------------------------------------
+
+    def next_timer(self) -> float | None:
+        """When `handle_timer` is wanted."""
+        return self._timers[0][0] if self._timers else None
+
+    def handle_timer(self, now: float) -> None:
+        """Deadlines and lifetimes that are over."""
+        while self._timers and self._timers[0][0] <= now:
+            _, request_id = heapq.heappop(self._timers)
+            request = self._requests.get(request_id)
+            if request is None:
+                continue
+            if request.expires_at <= now:
+                self._expire(request, now)
+                continue
+            heapq.heappush(self._timers, (request.expires_at, request_id))
+            if request.done:
+                self._call_off(request)
+                self._settle(request, now)
+            elif not request.missed:
+                self._miss(request)
+                if request.rule.idempotent:
+                    self._rescue(request, now, insist=True)
+
+    def _miss(self, request: Request) -> None:
+        request.missed = True
+        copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
+        self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
+
+    def _call_off(self, request: Request) -> None:
+        for copy in request.pending():
+            if not copy.message.over:
+                self._parts.outbox.drop(copy.message)
+                copy.state = CopyState.DEAD
+                self._parts.measurements.lost(copy.path, request.service)
+
+    def _expire(self, request: Request, now: float) -> None:
+        for copy in request.pending():
+            copy.state = CopyState.DEAD
+            self._parts.outbox.drop(copy.message)
+            self._parts.measurements.lost(copy.path, request.service)
+        if not request.done:
+            why = "no answer" if request.copies else "no path to any server"
+            self._fail(request, "failed", f"{why} within {request.rule.lifetime_s:g} s", now)
+        self._settle(request, now)
+
+    def _fail(self, request: Request, outcome: str, reason: str, now: float) -> None:
+        self._finish(request, outcome)
+        elapsed = now - request.submitted_at
+        self._parts.emit(RequestFailed(request.id, request.service, outcome, reason, elapsed))
+
+    def _finish(self, request: Request, outcome: str) -> None:
+        request.done = True
+        request.payload = None
+        self.unanswered -= 1
+        self._parts.stats.requests[request.service, outcome] += 1
+        self._parts.measurements.outcome(request.service, outcome)
+
+    def _settle(self, request: Request, now: float) -> None:
+        """Forget a request whose copies have all come to an end."""
+        if request.done and not request.pending():
+            self._requests.pop(request.id, None)
+        elif request.done and request.deadline_at <= now:
+            self._call_off(request)
+            if not request.pending():
+                self._requests.pop(request.id, None)
