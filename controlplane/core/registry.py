@@ -1,0 +1,241 @@
+"""Who is there: registrations with leases, without IO.
+
+A sidecar is known by its name from its registration until its lease ends or it says goodbye. Losing the stream alone does not remove it: a robot in a tunnel is still there.
+"""
+
+from __future__ import annotations
+
+import enum
+import heapq
+from collections import OrderedDict
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NewType
+
+from protos.model import (
+    NodeName,
+    Peer,
+    Registration,
+    RemovalReason,
+    Role,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from protos.model import Candidate, ServiceOffer, ServiceUse
+
+StreamId = NewType("StreamId", int)
+"""Number of one stream, unique in one run of the control plane."""
+
+MAX_SIDECARS = 4096
+"""Sidecars known at once: as many as one set of peers holds. One more is refused, not let in for another."""
+
+MAX_REMEMBERED_REMOVALS = 4096
+"""Reasons of removals kept for notices; beyond that the oldest goes, and its notice says "lease expired"."""
+
+
+class Refusal(enum.Enum):
+    """Why a registration is not accepted."""
+
+    OLDER_INCARNATION = "a newer incarnation of this name is registered"
+    NAME_TAKEN = "another sidecar holds this name, and its lease has not ended"
+    FULL = f"{MAX_SIDECARS} sidecars are registered, which is the limit"
+
+
+@dataclass(frozen=True, slots=True)
+class Admission:
+    """A registration was accepted; `replaced` is the stream that has to end for it."""
+
+    replaced: StreamId | None
+    new_run: bool
+    """The sidecar is new, or was started anew; not merely connected again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sidecar:
+    """One registered sidecar; replaced as a whole when anything about it changes."""
+
+    registration: Registration
+    lease_end: float
+    stream: StreamId | None
+    candidates: tuple[Candidate, ...] = ()
+    offers: tuple[ServiceOffer, ...] = ()
+    uses: tuple[ServiceUse, ...] = ()
+    draining: bool = False
+
+    @property
+    def name(self) -> NodeName:
+        """Its name."""
+        return self.registration.name
+
+    @property
+    def role(self) -> Role:
+        """What it is for."""
+        return self.registration.role
+
+    def as_peer(self) -> Peer:
+        """What its peers are told of it."""
+        return Peer(
+            name=self.registration.name,
+            role=self.registration.role,
+            session=self.registration.session,
+            token=self.registration.token,
+            incarnation=self.registration.incarnation,
+            candidates=self.candidates,
+            offers=self.offers,
+            draining=self.draining,
+        )
+
+
+@dataclass(slots=True)
+class RegistryCounters:
+    """What happened, for the metrics."""
+
+    refused: dict[Refusal, int] = field(default_factory=lambda: dict.fromkeys(Refusal, 0))
+    expired: int = 0
+    left: int = 0
+    removals_forgotten: int = 0
+
+
+class Registry:
+    """All registered sidecars. Times are monotonic seconds."""
+
+    def __init__(self, *, lease_s: float) -> None:
+        self._lease_s = lease_s
+        self._sidecars: dict[NodeName, Sidecar] = {}
+        self._removals: OrderedDict[NodeName, RemovalReason] = OrderedDict()
+        # One entry a name, at most as late as its lease ends: renewing a lease does not touch it.
+        self._ends: list[tuple[float, NodeName]] = []
+        self._awaited: set[NodeName] = set()
+        self.counters = RegistryCounters()
+
+    def __iter__(self) -> Iterator[Sidecar]:
+        return iter(self._sidecars.values())
+
+    def __len__(self) -> int:
+        return len(self._sidecars)
+
+    def get(self, name: NodeName) -> Sidecar | None:
+        """The sidecar of that name."""
+        return self._sidecars.get(name)
+
+    def register(self, registration: Registration, stream: StreamId, now: float) -> Admission | Refusal:
+        """Let a sidecar in, or say why not.
+
+        A name belongs to the token that took it first for as long as its lease lasts, and within a token to the
+        newest incarnation; the same run that connects again replaces its own older stream.
+        """
+        name = registration.name
+        known = self._sidecars.get(name)
+        if known is None:
+            if len(self._sidecars) >= MAX_SIDECARS:
+                return self._refuse(Refusal.FULL)
+            self._removals.pop(name, None)
+            self._sidecars[name] = Sidecar(registration, now + self._lease_s, stream)
+            self._await_end(name)
+            return Admission(replaced=None, new_run=True)
+        before = known.registration
+        if registration.token != before.token:
+            return self._refuse(Refusal.NAME_TAKEN)
+        if registration.incarnation < before.incarnation:
+            return self._refuse(Refusal.OLDER_INCARNATION)
+        same_run = registration.session == before.session
+        if registration.incarnation == before.incarnation and not same_run:
+            return self._refuse(Refusal.NAME_TAKEN)
+        if same_run:
+            # Keeps what it said last until it says it anew, so that its peers see no gap.
+            self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False)
+        else:
+            self._sidecars[name] = Sidecar(registration, known.lease_end, stream)
+        self._renew(name, now)
+        return Admission(replaced=known.stream, new_run=not same_run)
+
+    def _refuse(self, refusal: Refusal) -> Refusal:
+        self.counters.refused[refusal] += 1
+        return refusal
+
+    def _renew(self, name: NodeName, now: float) -> None:
+        end = now + self._lease_s
+        self._sidecars[name] = replace(self._sidecars[name], lease_end=end)
+
+    def touch(self, name: NodeName, stream: StreamId, now: float) -> bool:
+        """Renew the lease because `stream` spoke; False if it is not the sidecar's stream any more."""
+        if not self._is_current(name, stream):
+            return False
+        self._renew(name, now)
+        return True
+
+    def _is_current(self, name: NodeName, stream: StreamId) -> bool:
+        known = self._sidecars.get(name)
+        return known is not None and known.stream == stream
+
+    def set_candidates(self, name: NodeName, candidates: tuple[Candidate, ...]) -> bool:
+        """Replace its addresses; True if they changed."""
+        known = self._sidecars[name]
+        self._sidecars[name] = replace(known, candidates=candidates)
+        return candidates != known.candidates
+
+    def set_services(self, name: NodeName, offers: tuple[ServiceOffer, ...], uses: tuple[ServiceUse, ...]) -> bool:
+        """Replace its services; True if they changed."""
+        known = self._sidecars[name]
+        self._sidecars[name] = replace(known, offers=offers, uses=uses)
+        return (offers, uses) != (known.offers, known.uses)
+
+    def set_draining(self, name: NodeName) -> bool:
+        """It is about to go; True if that is news."""
+        known = self._sidecars[name]
+        self._sidecars[name] = replace(known, draining=True)
+        return not known.draining
+
+    def disconnect(self, name: NodeName, stream: StreamId) -> RemovalReason | None:
+        """Its stream ended: who was draining has left, others stay until their lease ends.
+
+        Returns the reason if it was removed.
+        """
+        if not self._is_current(name, stream):
+            return None
+        known = self._sidecars[name]
+        if known.draining:
+            self.counters.left += 1
+            self._remove(name, RemovalReason.LEFT)
+            return RemovalReason.LEFT
+        self._sidecars[name] = replace(known, stream=None)
+        return None
+
+    def _await_end(self, name: NodeName) -> None:
+        if name not in self._awaited:
+            self._awaited.add(name)
+            heapq.heappush(self._ends, (self._sidecars[name].lease_end, name))
+
+    def next_expiry(self) -> float | None:
+        """When to call `expire` next; it may then find that the lease was renewed."""
+        return self._ends[0][0] if self._ends else None
+
+    def expire(self, now: float) -> list[Sidecar]:
+        """Remove those whose lease ended, and return them as they were."""
+        gone: list[Sidecar] = []
+        while self._ends and self._ends[0][0] <= now:
+            _, name = heapq.heappop(self._ends)
+            self._awaited.discard(name)
+            known = self._sidecars.get(name)
+            if known is None:
+                continue
+            if known.lease_end > now:
+                self._await_end(name)
+                continue
+            self.counters.expired += 1
+            gone.append(known)
+            self._remove(name, RemovalReason.LEASE_EXPIRED)
+        return gone
+
+    def _remove(self, name: NodeName, reason: RemovalReason) -> None:
+        del self._sidecars[name]
+        self._removals[name] = reason
+        self._removals.move_to_end(name)
+        if len(self._removals) > MAX_REMEMBERED_REMOVALS:
+            self._removals.popitem(last=False)
+            self.counters.removals_forgotten += 1
+
+    def removal_reason(self, name: NodeName) -> RemovalReason:
+        """Why that sidecar is not there; "lease expired" of one never known or forgotten, the careful guess."""
+        return self._removals.get(name, RemovalReason.LEASE_EXPIRED)

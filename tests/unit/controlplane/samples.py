@@ -1,0 +1,100 @@
+"""Small valid values of the model for the tests of the control plane."""
+
+from __future__ import annotations
+
+import zlib
+
+from controlplane.core.registry import StreamId
+from protos.histogram import Histogram
+from protos.model import (
+    PROTOCOL_VERSION,
+    Candidate,
+    CandidateKind,
+    InterfaceId,
+    InterfaceName,
+    LatencyReport,
+    NodeName,
+    PathReport,
+    Registration,
+    Role,
+    ServiceName,
+    ServiceOffer,
+    ServiceUse,
+    SessionId,
+    Version,
+)
+
+PLAN = ServiceName("/plan")
+PLAN_TYPE = "nav_msgs/srv/GetPlan"
+
+
+def registration(
+    name: str,
+    role: Role = Role.ROBOT,
+    *,
+    incarnation: int = 1,
+    token: bytes | None = None,
+    session: int | None = None,
+    held: int = 0,
+) -> Registration:
+    return Registration(
+        protocol_version=PROTOCOL_VERSION,
+        name=NodeName(name),
+        role=role,
+        session=SessionId(session if session is not None else zlib.crc32(name.encode()) + incarnation),
+        token=token if token is not None else name.encode().ljust(16, b"*")[:16],
+        incarnation=incarnation,
+        software_version="test",
+        peers_version=Version(held),
+        mapping_version=Version(held),
+    )
+
+
+def candidate(interface: str, number: int = 0, ip: str = "10.0.0.1", port: int = 4000) -> Candidate:
+    return Candidate(InterfaceId(number), InterfaceName(interface), CandidateKind.HOST, (ip, port))
+
+
+def interfaces(*names: str) -> tuple[Candidate, ...]:
+    return tuple(candidate(name, number) for number, name in enumerate(names))
+
+
+def use(name: str = PLAN, *, deadline_s: float = 0.1, idempotent: bool = True, type_: str = PLAN_TYPE) -> ServiceUse:
+    return ServiceUse(ServiceName(name), type_, deadline_s, idempotent)
+
+
+def offer(name: str = PLAN, *, capacity: int = 0, type_: str = PLAN_TYPE) -> ServiceOffer:
+    return ServiceOffer(ServiceName(name), type_, capacity)
+
+
+def histogram(*seconds: float, times: int = 1, lost: int = 0) -> Histogram:
+    made = Histogram()
+    for _ in range(times):
+        for value in seconds:
+            made.record(value)
+    made.record_lost(lost)
+    return made
+
+
+def path(interface: str, server: str, *, up: bool = True, rtt: Histogram | None = None) -> PathReport:
+    return PathReport(InterfaceName(interface), NodeName(server), up, rtt if rtt is not None else Histogram())
+
+
+def latency(
+    interface: str,
+    server: str,
+    measured: Histogram,
+    *,
+    processing: Histogram | None = None,
+    service: str = PLAN,
+) -> LatencyReport:
+    return LatencyReport(
+        InterfaceName(interface),
+        NodeName(server),
+        ServiceName(service),
+        measured,
+        processing if processing is not None else Histogram(),
+    )
+
+
+def stream(number: int) -> StreamId:
+    return StreamId(number)

@@ -1,0 +1,146 @@
+"""Leases, incarnations and limits of the registry, in simulated time."""
+
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core import registry as registry_module
+from controlplane.core.registry import Admission, Refusal, Registry
+from protos.model import NodeName, RemovalReason, Role
+from tests.unit.controlplane.samples import interfaces, offer, registration, stream, use
+
+ROBOT = NodeName("robot")
+LEASE_S = 5.0
+
+
+@pytest.fixture
+def registry() -> Registry:
+    return Registry(lease_s=LEASE_S)
+
+
+def test_a_silent_sidecar_disappears_when_its_lease_ends(registry: Registry) -> None:
+    assert registry.register(registration("robot"), stream(1), 0.0) == Admission(None, new_run=True)
+    assert registry.next_expiry() == LEASE_S
+    assert registry.expire(LEASE_S - 0.01) == []
+    assert [gone.name for gone in registry.expire(LEASE_S)] == [ROBOT]
+    assert registry.get(ROBOT) is None
+    assert registry.removal_reason(ROBOT) is RemovalReason.LEASE_EXPIRED
+    assert registry.counters.expired == 1
+    assert registry.next_expiry() is None
+
+
+def test_every_message_renews_the_lease(registry: Registry) -> None:
+    registry.register(registration("robot"), stream(1), 0.0)
+    for now in (2.0, 4.0, 6.0, 8.0):
+        assert registry.touch(ROBOT, stream(1), now)
+        assert registry.expire(now) == []
+    assert registry.expire(8.0 + LEASE_S - 0.01) == []
+    assert len(registry.expire(8.0 + LEASE_S)) == 1
+
+
+def test_losing_the_stream_keeps_the_sidecar_until_its_lease_ends(registry: Registry) -> None:
+    registry.register(registration("robot"), stream(1), 0.0)
+    registry.set_candidates(ROBOT, interfaces("wlan0"))
+    assert registry.disconnect(ROBOT, stream(1)) is None
+    known = registry.get(ROBOT)
+    assert known is not None
+    assert known.stream is None
+    assert registry.register(registration("robot"), stream(2), 1.0) == Admission(None, new_run=False)
+    again = registry.get(ROBOT)
+    assert again is not None
+    assert again.candidates == interfaces("wlan0")
+
+
+def test_who_drained_has_left_when_its_stream_ends(registry: Registry) -> None:
+    registry.register(registration("robot"), stream(1), 0.0)
+    assert registry.set_draining(ROBOT)
+    assert not registry.set_draining(ROBOT)
+    assert registry.disconnect(ROBOT, stream(1)) is RemovalReason.LEFT
+    assert registry.get(ROBOT) is None
+    assert registry.removal_reason(ROBOT) is RemovalReason.LEFT
+
+
+def test_a_newer_incarnation_replaces_the_older_stream_and_its_state(registry: Registry) -> None:
+    registry.register(registration("robot", incarnation=1), stream(1), 0.0)
+    registry.set_candidates(ROBOT, interfaces("wlan0"))
+    registry.set_services(ROBOT, (), (use(),))
+    result = registry.register(registration("robot", incarnation=2), stream(2), 1.0)
+    assert result == Admission(replaced=stream(1), new_run=True)
+    known = registry.get(ROBOT)
+    assert known is not None
+    assert known.candidates == ()
+    assert known.uses == ()
+    assert known.lease_end == 1.0 + LEASE_S
+    assert not registry.touch(ROBOT, stream(1), 2.0)
+    assert registry.disconnect(ROBOT, stream(1)) is None
+    assert known == registry.get(ROBOT)
+
+
+def test_an_older_incarnation_is_refused(registry: Registry) -> None:
+    registry.register(registration("robot", incarnation=2), stream(1), 0.0)
+    result = registry.register(registration("robot", incarnation=1), stream(2), 1.0)
+    assert result is Refusal.OLDER_INCARNATION
+    assert registry.touch(ROBOT, stream(1), 2.0)
+    assert registry.counters.refused[Refusal.OLDER_INCARNATION] == 1
+
+
+def test_a_name_belongs_to_its_token_while_the_lease_lasts(registry: Registry) -> None:
+    registry.register(registration("robot"), stream(1), 0.0)
+    stranger = registration("robot", incarnation=9, token=b"another sidecar!")
+    assert registry.register(stranger, stream(2), 1.0) is Refusal.NAME_TAKEN
+    twin = registration("robot", session=99)
+    assert registry.register(twin, stream(2), 1.0) is Refusal.NAME_TAKEN
+    registry.expire(LEASE_S)
+    assert isinstance(registry.register(stranger, stream(2), LEASE_S), Admission)
+
+
+def test_a_full_registry_refuses_newcomers_and_keeps_the_known(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry_module, "MAX_SIDECARS", 2)
+    registry.register(registration("a"), stream(1), 0.0)
+    registry.register(registration("b"), stream(2), 0.0)
+    assert registry.register(registration("c"), stream(3), 0.0) is Refusal.FULL
+    assert isinstance(registry.register(registration("b", incarnation=2), stream(4), 0.0), Admission)
+    assert {sidecar.name for sidecar in registry} == {"a", "b"}
+    assert registry.counters.refused[Refusal.FULL] == 1
+
+
+def test_reasons_of_removals_are_bounded(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry_module, "MAX_REMEMBERED_REMOVALS", 3)
+    for number in range(5):
+        name = f"robot-{number}"
+        registry.register(registration(name), stream(number), 0.0)
+        registry.set_draining(NodeName(name))
+        registry.disconnect(NodeName(name), stream(number))
+    assert registry.removal_reason(NodeName("robot-4")) is RemovalReason.LEFT
+    assert registry.removal_reason(NodeName("robot-0")) is RemovalReason.LEASE_EXPIRED
+    assert registry.counters.removals_forgotten == 2
+
+
+def test_setters_say_whether_anything_changed(registry: Registry) -> None:
+    registry.register(registration("cloud", Role.CLOUD), stream(1), 0.0)
+    name = NodeName("cloud")
+    assert registry.set_candidates(name, interfaces("eth0"))
+    assert not registry.set_candidates(name, interfaces("eth0"))
+    assert registry.set_services(name, (offer(),), ())
+    assert not registry.set_services(name, (offer(),), ())
+    known = registry.get(name)
+    assert known is not None
+    peer = known.as_peer()
+    assert (peer.name, peer.role, peer.candidates, peer.offers) == (
+        name,
+        Role.CLOUD,
+        interfaces("eth0"),
+        (offer(),),
+    )
+
+
+def test_coming_and_going_leaves_nothing_behind(registry: Registry) -> None:
+    for round_ in range(50):
+        registry.register(registration("robot", incarnation=round_), stream(round_), 0.001 * round_)
+        registry.set_draining(ROBOT)
+        registry.disconnect(ROBOT, stream(round_))
+    assert len(registry._ends) == 1
+    registry.expire(100.0)
+    assert registry.next_expiry() is None
