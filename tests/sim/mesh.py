@@ -1,0 +1,277 @@
+"""A mesh of real cores in simulated time: engines and links joined by a lossy, reordering, duplicating network."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from dataclasses import dataclass, field
+from itertools import count
+from typing import TYPE_CHECKING
+
+from protos.model import (
+    Candidate,
+    CandidateKind,
+    InterfaceId,
+    InterfaceName,
+    MappingSet,
+    NodeName,
+    Peer,
+    PeerSet,
+    Role,
+    ServiceName,
+    ServiceOffer,
+    SessionId,
+    Version,
+)
+from sidecar.core.engine import Engine, EngineConfig
+from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestId, ResponseArrived
+from sidecar.core.link import Link, LinkIdentity
+from sidecar.core.link_events import SetReady
+from sidecar.core.request_id import make_request_id
+from sidecar.core.rules import ServiceRule
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import Address
+
+SERVICE = ServiceName("/echo")
+TYPE = "plr_test/srv/Echo"
+
+
+@dataclass
+class Wire:
+    """What happens to datagrams between two addresses, in one direction."""
+
+    delay_s: float = 0.010
+    jitter_s: float = 0.0
+    loss: float = 0.0
+    duplicate: float = 0.0
+    cut: bool = False
+    bytes_per_s: float = 0.0
+    """0 means no limit."""
+    busy_until: float = 0.0
+    carried: int = 0
+
+
+class Node:
+    """One sidecar: an engine and its links, driven by the mesh."""
+
+    def __init__(self, mesh: Mesh, name: str, role: Role, interfaces: list[str], rules: tuple[ServiceRule, ...]) -> None:
+        self.mesh = mesh
+        self.name = NodeName(name)
+        self.role = role
+        self.interfaces = [InterfaceName(interface) for interface in interfaces]
+        self.rules = rules
+        self.token = mesh.rng.randbytes(16)
+        self.offers: tuple[ServiceOffer, ...] = ()
+        self.server_delay: Callable[[], float | None] = lambda: 0.001
+        self.events: list[ApplicationEvent] = []
+        self.alive = True
+        self.start()
+
+    def start(self) -> None:
+        now = self.mesh.now
+        self.session = SessionId(self.mesh.rng.getrandbits(64))
+        self.incarnation = int(now * 1e6) + 1
+        self.engine = Engine(EngineConfig(self.role, self.rules), now)
+        self.links = {
+            interface: Link(
+                LinkIdentity(interface, InterfaceId(number), self.session, self.token, self.incarnation),
+                random.Random(self.mesh.rng.random()),
+                now,
+            )
+            for number, interface in enumerate(self.interfaces)
+        }
+        for link in self.links.values():
+            link.execute(SetReady(ready=True), now)
+        self.engine.set_interfaces(self.links)
+        self.engine.set_offers(self.offers)
+        self.executed: list[RequestId | int] = []
+        self.sequence = 0
+        self.alive = True
+
+    def address(self, interface: InterfaceName) -> Address:
+        return (f"{self.name}.{interface}", 1)
+
+    def as_peer(self) -> Peer:
+        candidates = tuple(
+            Candidate(InterfaceId(number), interface, CandidateKind.HOST, self.address(interface))
+            for number, interface in enumerate(self.interfaces)
+        )
+        return Peer(self.name, self.role, self.session, self.token, self.incarnation, candidates, self.offers)
+
+    def submit(self, payload: bytes, service: ServiceName = SERVICE) -> RequestId:
+        self.sequence += 1
+        request_id = make_request_id(self.session, b"guid", self.sequence)
+        self.engine.submit(request_id, service, payload, self.mesh.now)
+        self.mesh.pump(self)
+        return request_id
+
+    def responses(self) -> list[ResponseArrived]:
+        return [event for event in self.events if isinstance(event, ResponseArrived)]
+
+    def next_timer(self) -> float:
+        return min(self.engine.next_timer(), *(link.next_timer() for link in self.links.values()))
+
+
+@dataclass(order=True)
+class _Due:
+    at: float
+    order: int
+    act: Callable[[], None] = field(compare=False)
+
+
+class Mesh:
+    """All nodes, the wires between them, and the clock."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = random.Random(seed)
+        self.now = 1000.0
+        self.nodes: dict[str, Node] = {}
+        self.wires: dict[tuple[str, str], Wire] = {}
+        self._due: list[_Due] = []
+        self._order = count()
+        self.version = 0
+
+    def add(self, name: str, role: Role, interfaces: list[str], rules: tuple[ServiceRule, ...]) -> Node:
+        node = self.nodes[name] = Node(self, name, role, interfaces, rules)
+        return node
+
+    def robot(self, *interfaces: str, rules: tuple[ServiceRule, ...] | None = None) -> Node:
+        return self.add("robot", Role.ROBOT, list(interfaces), rules or (rule(),))
+
+    def cloud(self, name: str) -> Node:
+        node = self.add(name, Role.CLOUD, ["eth0"], (rule(),))
+        node.offers = (ServiceOffer(SERVICE, TYPE),)
+        node.engine.set_offers(node.offers)
+        return node
+
+    def wire(self, source: str, destination: str) -> Wire:
+        """The wire from one address's host part to another's."""
+        return self.wires.setdefault((source, destination), Wire())
+
+    def both_ways(self, one: str, other: str) -> tuple[Wire, Wire]:
+        return self.wire(one, other), self.wire(other, one)
+
+    def all_wires_of(self, address: str) -> list[Wire]:
+        """Every wire from or to one interface, existing ones and those still to come between known nodes."""
+        for node in self.nodes.values():
+            for interface in node.interfaces:
+                host = node.address(interface)[0]
+                if host != address:
+                    self.both_ways(address, host)
+        return [wire for ends, wire in self.wires.items() if address in ends]
+
+    def push_views(self) -> None:
+        """What a control plane would do: everybody learns of the other role."""
+        self.version += 1
+        for node in self.nodes.values():
+            peers = tuple(
+                other.as_peer() for other in self.nodes.values() if other.role is not node.role and other.alive
+            )
+            assert node.engine.apply_peers(PeerSet(Version(self.version), self.version, peers), self.now) is None
+            self.pump(node)
+
+    def push_mapping(self, node: Node, mapping: MappingSet) -> str | None:
+        return node.engine.apply_mapping(mapping)
+
+    def at(self, delay: float, act: Callable[[], None]) -> None:
+        heapq.heappush(self._due, _Due(self.now + delay, next(self._order), act))
+
+    def run(self, seconds: float) -> None:
+        end = self.now + seconds
+        while True:
+            alive = [node for node in self.nodes.values() if node.alive]
+            timers = [(node.next_timer(), index) for index, node in enumerate(alive)]
+            timer, index = min(timers, default=(end, 0))
+            due = self._due[0].at if self._due else float("inf")
+            step = min(timer, due)
+            if step > end:
+                self.now = end
+                return
+            self.now = max(self.now, step)
+            if due <= timer:
+                heapq.heappop(self._due).act()
+            else:
+                node = alive[index]
+                node.engine.handle_timer(self.now)
+                for link in node.links.values():
+                    link.handle_timer(self.now)
+                self.pump(node)
+
+    def pump(self, node: Node) -> None:
+        """Move everything that is ready inside one node, and its datagrams onto the wires."""
+        engine, now = node.engine, self.now
+        while True:
+            busy = False
+            for interface, command in engine.take_commands():
+                busy = True
+                for link in node.links.values() if interface is None else [node.links[interface]]:
+                    link.execute(command, now)
+            for link in node.links.values():
+                while (event := link.next_event()) is not None:
+                    busy = True
+                    engine.on_link_event(event, now)
+            for application_event in engine.take_events():
+                busy = True
+                self._application(node, application_event)
+            if not busy:
+                break
+        for interface, link in node.links.items():
+            while datagrams := link.datagrams_to_send(now):
+                for destination, data in datagrams:
+                    self._carry(node.address(interface), destination, data)
+            while (event := link.next_event()) is not None:
+                engine.on_link_event(event, now)
+
+    def _application(self, node: Node, event: ApplicationEvent) -> None:
+        node.events.append(event)
+        if isinstance(event, ExecuteRequest):
+            session, execution = node.session, event.execution
+            node.executed.append(RequestId(event.payload))
+            delay = node.server_delay()
+            if delay is None:
+                return
+
+            def answer() -> None:
+                if node.alive and node.session == session:
+                    node.engine.complete(execution, b"echo:" + event.payload, delay, self.now)
+                    self.pump(node)
+
+            self.at(delay, answer)
+        elif type(event).__name__ == "OfferService":
+            node.engine.set_carried(frozenset(node.engine._offers.offered))
+
+    def _carry(self, source: Address, destination: Address, data: bytes) -> None:
+        wire = self.wire(source[0], destination[0])
+        wire.carried += len(data)
+        copies = 2 if self.rng.random() < wire.duplicate else 1
+        for _ in range(copies):
+            if wire.cut or self.rng.random() < wire.loss:
+                continue
+            start = max(self.now, wire.busy_until)
+            if wire.bytes_per_s:
+                if start - self.now > 1.0:
+                    continue  # the queue is full
+                wire.busy_until = start = start + len(data) / wire.bytes_per_s
+            arrival = start - self.now + wire.delay_s + self.rng.uniform(0, wire.jitter_s)
+            self.at(arrival, lambda: self._arrive(source, destination, data))
+
+    def _arrive(self, source: Address, destination: Address, data: bytes) -> None:
+        name, interface = destination[0].rsplit(".", 1)
+        node = self.nodes.get(name)
+        if node is None or not node.alive:
+            return
+        node.links[InterfaceName(interface)].receive_datagram(data, source, self.now)
+        self.pump(node)
+
+
+def rule(**changes: object) -> ServiceRule:
+    values: dict[str, object] = {
+        "pattern": SERVICE,
+        "deadline_s": 0.1,
+        "lifetime_s": 10.0,
+        "idempotent": True,
+    }
+    return ServiceRule(**{**values, **changes})  # type: ignore[arg-type]  # test convenience
