@@ -1,0 +1,175 @@
+"""The host's network interfaces as netlink tells them, and which of them carry data.
+
+Netlink rather than /sys: it answers for the network namespace of the caller, while /sys shows the one it was
+mounted in, and it alone knows the kind of a link.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import socket
+from dataclasses import dataclass
+from ipaddress import ip_address
+from typing import TYPE_CHECKING, Any
+
+from pyroute2 import IPRoute
+
+from protos.model import InterfaceName
+from sidecar.config_fields import is_glob
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+_IFF_UP = 0x1
+_IFF_LOOPBACK = 0x8
+_IFF_LOWER_UP = 0x10000
+_SCOPE_LINK = 253
+_RTN_UNICAST = 1
+_IFA_F_DADFAILED = 0x08
+_IFA_F_DEPRECATED = 0x20
+_IFA_F_TENTATIVE = 0x40
+_UNUSABLE_ADDRESS = _IFA_F_DADFAILED | _IFA_F_DEPRECATED | _IFA_F_TENTATIVE
+
+LOOPBACK = "loopback"
+"""`Interface.kind` of lo, which netlink gives none."""
+
+_ORDINARY_KINDS = frozenset({"", "bond", "team", "vlan", "wwan", "rmnet", "ppp"})
+"""Kinds of link that lead out of the machine: hardware (no kind), what bundles or splits it, and modems."""
+
+_CONTAINER_AND_TUNNEL_NAMES = (
+    "docker*", "br-*", "veth*", "virbr*", "vnet*", "lxc*", "lxdbr*", "podman*", "cni*", "cali*", "flannel*",
+    "cilium*", "kube-*", "tun*", "tap*", "wg*", "tailscale*", "zt*", "utun*",
+)  # fmt: skip
+"""Names of the same things, for kernels and drivers that tell no kind."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """One interface at one moment."""
+
+    name: InterfaceName
+    index: int
+    kind: str
+    """Netlink's kind (veth, bridge, wireguard, ...), LOOPBACK, or "" for hardware."""
+    up: bool
+    """Switched on by the administrator."""
+    carrier: bool
+    """The cable is in, the access point or cell is joined."""
+    mtu: int
+    addresses: tuple[str, ...] = ()
+    """IPv4 and IPv6 of global or unique-local scope, in canonical form; no link-local ones."""
+    default_route: bool = False
+    """Some default route, of either family and in whatever table, leaves by it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SkippedInterface:
+    """An interface that is there but not used."""
+
+    name: InterfaceName
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class InterfaceChoice:
+    """What `choose` found."""
+
+    usable: tuple[Interface, ...]
+    skipped: tuple[SkippedInterface, ...]
+    missing: tuple[str, ...]
+    """Names (not globs) that were wanted and do not exist."""
+
+
+def list_interfaces() -> tuple[Interface, ...]:
+    """Return the interfaces of the caller's network namespace by index; raises OSError when netlink fails."""
+    with IPRoute() as netlink:
+        addresses = _addresses_by_index(netlink.get_addr())
+        routed = frozenset(_default_route_indices(netlink.get_routes()))
+        interfaces = [_interface(link, addresses, routed) for link in netlink.get_links()]
+    return tuple(sorted(interfaces, key=lambda interface: interface.index))
+
+
+def choose(interfaces: Iterable[Interface], wanted: Sequence[str] | None) -> InterfaceChoice:
+    """Pick the interfaces that carry data: all ordinary ones, or those that `wanted` names or matches.
+
+    Loopback, containers, bridges and tunnels are used only under their exact name: neither the default nor a
+    glob brings them in. An interface that is wanted but not up, without carrier or without address is skipped.
+    """
+    usable: list[Interface] = []
+    skipped: list[SkippedInterface] = []
+    names = set()
+    for interface in interfaces:
+        names.add(interface.name)
+        reason = _reason_to_skip(interface, wanted)
+        if reason is None:
+            usable.append(interface)
+        else:
+            skipped.append(SkippedInterface(interface.name, reason))
+    missing = tuple(name for name in wanted or () if not is_glob(name) and name not in names)
+    return InterfaceChoice(tuple(usable), tuple(skipped), missing)
+
+
+def _reason_to_skip(interface: Interface, wanted: Sequence[str] | None) -> str | None:
+    name = interface.name
+    if wanted is not None and not any(fnmatch.fnmatchcase(name, pattern) for pattern in wanted):
+        return "not in the configuration"
+    if wanted is None or name not in wanted:
+        kind = _virtual_kind(interface)
+        if kind is not None:
+            return f"{kind}: used only when the configuration has its exact name"
+    if not interface.up:
+        return "down"
+    if not interface.carrier:
+        return "no carrier"
+    if not interface.addresses:
+        return "no address"
+    return None
+
+
+def _virtual_kind(interface: Interface) -> str | None:
+    if interface.kind not in _ORDINARY_KINDS:
+        return interface.kind
+    if any(fnmatch.fnmatchcase(interface.name, pattern) for pattern in _CONTAINER_AND_TUNNEL_NAMES):
+        return "container or tunnel by its name"
+    return None
+
+
+def _interface(link: Any, addresses: dict[int, list[str]], routed: frozenset[int]) -> Interface:
+    flags = link["flags"]
+    index = link["index"]
+    kind = LOOPBACK if flags & _IFF_LOOPBACK else link.get(("linkinfo", "kind")) or ""
+    return Interface(
+        name=InterfaceName(link.get("ifname")),
+        index=index,
+        kind=kind,
+        up=bool(flags & _IFF_UP),
+        carrier=bool(flags & _IFF_LOWER_UP),
+        mtu=link.get("mtu") or 0,
+        addresses=tuple(addresses.get(index, ())),
+        default_route=index in routed,
+    )
+
+
+def _addresses_by_index(messages: Iterable[Any]) -> dict[int, list[str]]:
+    addresses: dict[int, list[str]] = {}
+    for message in messages:
+        # On point-to-point links IFA_ADDRESS is the far end; IFA_LOCAL, where it exists, is ours.
+        text = message.get("local") or message.get("address")
+        flags = message.get("flags") or 0
+        if text is None or flags & _UNUSABLE_ADDRESS or message["scope"] == _SCOPE_LINK:
+            continue
+        address = ip_address(text)
+        if not address.is_link_local:
+            addresses.setdefault(message["index"], []).append(str(address))
+    return addresses
+
+
+def _default_route_indices(messages: Iterable[Any]) -> Iterator[int]:
+    for message in messages:
+        unicast = message["type"] == _RTN_UNICAST and message["family"] in (socket.AF_INET, socket.AF_INET6)
+        if not unicast or message["dst_len"] != 0:
+            continue
+        if message.get("oif") is not None:
+            yield message.get("oif")
+        for hop in message.get("multipath") or ():
+            yield hop["oif"]

@@ -1,0 +1,150 @@
+"""One UDP socket for one interface, and addresses in the two forms that sockets and cores want them."""
+
+from __future__ import annotations
+
+import enum
+import errno
+import functools
+import logging
+import socket
+from ipaddress import IPv4Address, IPv6Address, ip_address
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import Address
+    from sidecar.net.interfaces import Interface
+
+log = logging.getLogger(__name__)
+
+SOCKET_BUFFER_BYTES = 4 << 20
+"""A quarter of the largest message: what arrives while the interpreter is held has to wait here."""
+
+ADDRESS_CACHE_ENTRIES = 4096
+"""More than the addresses of all peers of one sidecar; a flood of forged sources only empties the cache."""
+
+# Numbers of linux/in.h, linux/in6.h and asm/socket.h that the socket module does not name.
+_IP_MTU_DISCOVER = 10
+_IPV6_MTU_DISCOVER = 23
+_PMTUDISC_PROBE = 3
+_IP_UNICAST_IF = 50
+_IPV6_UNICAST_IF = 76
+_SO_SNDBUFFORCE = 32
+_SO_RCVBUFFORCE = 33
+
+_NO_IPV6 = frozenset({errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL, errno.EPROTONOSUPPORT})
+
+
+class BoundTo(enum.StrEnum):
+    """What keeps a socket on its interface."""
+
+    DEVICE = "device"
+    """SO_BINDTODEVICE: it sends and receives by this interface only."""
+    ADDRESS = "address"
+    """The interface's address, one family only: the kernel refused to bind to the device."""
+
+
+class DataSocket(NamedTuple):
+    """An open socket and what it is bound to."""
+
+    socket: socket.socket
+    bound_to: BoundTo
+
+
+def open_socket(interface: Interface, port: int) -> DataSocket:
+    """Open the non-blocking UDP socket of `interface` on `port`, 0 for any free one.
+
+    IPv4 and IPv6 in one socket where the host has both. Linux before 5.7 lets only CAP_NET_RAW bind to a device,
+    and a sandbox may forbid it to anyone: there the socket is bound to the interface's first address instead,
+    IPv4 preferred. Raises OSError, such as EADDRINUSE for a taken port.
+    """
+    try:
+        return DataSocket(_open(lambda sock: _bind_to_device(sock, interface, port)), BoundTo.DEVICE)
+    except PermissionError:
+        if not interface.addresses:
+            raise
+        address = min(interface.addresses, key=lambda text: ":" in text)
+        log.warning(
+            "%s: not allowed to bind to the device (CAP_NET_RAW): bound to its address %s instead",
+            interface.name,
+            address,
+        )
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    sock = _open(lambda sock: _bind_to_address(sock, interface, (address, port)), family)
+    return DataSocket(sock, BoundTo.ADDRESS)
+
+
+@functools.lru_cache(ADDRESS_CACHE_ENTRIES)
+def normalise(address: tuple[Any, ...]) -> Address:
+    """Return what recvfrom calls the sender as the cores know it: IPv4-mapped addresses become IPv4."""
+    host, port = address[0], address[1]
+    if host.startswith("::ffff:") and "." in host:
+        host = host[len("::ffff:") :]
+    return host, port
+
+
+@functools.lru_cache(ADDRESS_CACHE_ENTRIES)
+def to_sockaddr(family: int, address: Address) -> tuple[str, int] | tuple[str, int, int, int] | None:
+    """Return `address` as sendto of a socket of `family` wants it, or None when that socket cannot reach it.
+
+    Raises ValueError for a host that is not an IP address: sendto would look it up and block.
+    """
+    host, port = address
+    ip = ip_address(host)
+    if family == socket.AF_INET6:
+        return (f"::ffff:{host}" if isinstance(ip, IPv4Address) else host), port, 0, 0
+    return None if isinstance(ip, IPv6Address) else (host, port)
+
+
+def _open(bind: Callable[[socket.socket], None], family: int | None = None) -> socket.socket:
+    """Return a bound socket with our options; without `family` dual-stack, or IPv4 where IPv6 is off."""
+    try:
+        sock = socket.socket(family or socket.AF_INET6, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        try:
+            _set_options(sock)
+            bind(sock)
+        except BaseException:
+            sock.close()
+            raise
+    except OSError as error:
+        if family is None and error.errno in _NO_IPV6:
+            return _open(bind, socket.AF_INET)
+        raise
+    return sock
+
+
+def _set_options(sock: socket.socket) -> None:
+    sock.setblocking(False)
+    _raise_buffer(sock, _SO_RCVBUFFORCE, socket.SO_RCVBUF)
+    _raise_buffer(sock, _SO_SNDBUFFORCE, socket.SO_SNDBUF)
+    # Never fragmented (one lost fragment loses the datagram), and no belief in ICMP, which anybody may forge.
+    sock.setsockopt(socket.IPPROTO_IP, _IP_MTU_DISCOVER, _PMTUDISC_PROBE)
+    if sock.family == socket.AF_INET6:
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+        sock.setsockopt(socket.IPPROTO_IPV6, _IPV6_MTU_DISCOVER, _PMTUDISC_PROBE)
+
+
+def _raise_buffer(sock: socket.socket, forced: int, polite: int) -> None:
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, forced, SOCKET_BUFFER_BYTES)
+    except PermissionError:
+        sock.setsockopt(socket.SOL_SOCKET, polite, SOCKET_BUFFER_BYTES)
+        # The kernel doubles what it grants, for its own bookkeeping.
+        granted = sock.getsockopt(socket.SOL_SOCKET, polite) // 2
+        if granted < SOCKET_BUFFER_BYTES:
+            log.info("socket buffer of %d bytes instead of %d: raise net.core", granted, SOCKET_BUFFER_BYTES)
+
+
+def _bind_to_device(sock: socket.socket, interface: Interface, port: int) -> None:
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.name.encode())
+    sock.bind(("::", port) if sock.family == socket.AF_INET6 else ("0.0.0.0", port))  # noqa: S104
+
+
+def _bind_to_address(sock: socket.socket, interface: Interface, address: tuple[str, int]) -> None:
+    sock.bind(address)
+    # Needs no capability. The address alone does not choose the way out: Linux routes by destination.
+    if sock.family == socket.AF_INET:
+        sock.setsockopt(socket.IPPROTO_IP, _IP_UNICAST_IF, socket.htonl(interface.index))
+    else:
+        sock.setsockopt(socket.IPPROTO_IPV6, _IPV6_UNICAST_IF, socket.htonl(interface.index))
