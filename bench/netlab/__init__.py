@@ -23,6 +23,7 @@ the frames between two TAP devices through a seeded `LinkModel`.
         cloud.address()                         # "198.18.3.2"; address("eth0", family=6)
         server = cloud.popen([...], log_path="cloud.log")   # a subprocess.Popen; signals reach the program
         robot.run(["ping", "-c1", "cloud_a"], check=True)   # a CompletedProcess[str]
+        robot.socket(device="wwan0")            # a UDP socket of the robot in this very process
         cloud.kill(server)                      # SIGKILL and wait
 
         wlan = lab.link("wlan0")                # up: robot to internet, down: back

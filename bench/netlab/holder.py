@@ -15,6 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
+import traceback
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -62,12 +63,21 @@ def main(argv: list[str]) -> None:
     signal.signal(signal.SIGCHLD, _reap)
     while (message := lifeline.receive()) is not None:
         try:
-            with kernel.network_namespace_of(message["flush_connections_of"]):
-                flush_connection_tracking()
+            _serve(message, lifeline)
         except OSError as error:
             lifeline.send({"error": str(error)})
-        else:
+
+
+def _serve(message: dict[str, Any], lifeline: LineSocket) -> None:
+    with kernel.network_namespace_of(message["machine"]):
+        if message["op"] == "flush_connections":
+            flush_connection_tracking()
             lifeline.send({})
+        else:
+            with socket.socket(message["family"], message["kind"]) as made:
+                if message["device"] is not None:
+                    made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, message["device"].encode())
+                lifeline.send_with_descriptor({}, made.fileno())
 
 
 class _Holder:
@@ -111,8 +121,10 @@ class _Holder:
                 self._ready_fd = writer
                 child()
                 os._exit(0)
-            except BaseException as error:
-                print(f"{what}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+            except BaseException:
+                print(f"{what}:", file=sys.stderr)
+                traceback.print_exc()
+                sys.stderr.flush()
                 os._exit(1)
         os.close(writer)
         told = os.read(reader, 1)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import socket
 import subprocess
 import time
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import IO, TYPE_CHECKING, Any
 from bench.netlab.errors import LabError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
 # nsenter needs a few ms to fork; far more means that the machine is overloaded or the lab is gone.
 _START_TIMEOUT_S = 10.0
@@ -42,10 +44,15 @@ class HostProcess(subprocess.Popen[bytes]):
         """Send `sig` to the program; nothing happens if it has ended."""
         pid = self.inner_pid
         if pid is not None:
-            try:
+            with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, sig)
-            except ProcessLookupError:
-                return
+            if sig in (signal.SIGKILL, signal.SIGCONT):
+                self.wake()
+
+    def wake(self) -> None:
+        """Let nsenter go on: it stops itself when the program is stopped, and would not see its end."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGCONT)
 
 
 class Host:
@@ -60,6 +67,7 @@ class Host:
         addresses: Mapping[str, Mapping[int, str]],
         interface_lines: Mapping[str, Sequence[str]],
         environment: Mapping[str, str],
+        open_socket: Callable[[int, int, str | None], socket.socket],
     ) -> None:
         self.name = name
         self.anchor_pid = anchor_pid
@@ -69,6 +77,7 @@ class Host:
         self._user_namespace = user_namespace
         self._addresses = addresses
         self._interface_lines = interface_lines
+        self._open_socket = open_socket
         self._processes: list[HostProcess] = []
 
     @property
@@ -187,6 +196,24 @@ class Host:
             done.check_returncode()
         return done
 
+    def socket(
+        self,
+        family: int = socket.AF_INET,
+        kind: int = socket.SOCK_DGRAM,
+        *,
+        device: str | None = None,
+    ) -> socket.socket:
+        """A socket of this host in the caller's own hands: what is sent on it leaves from here.
+
+        Args:
+            family, kind: as for `socket.socket`.
+            device: bind it to this interface (SO_BINDTODEVICE).
+
+        Raises:
+            LabError: the kernel refused.
+        """
+        return self._open_socket(family, kind, device)
+
     def kill(self, process: HostProcess, sig: int = signal.SIGKILL, *, timeout: float = 10.0) -> int:
         """Signal a program and wait for its end; its return code. Raises subprocess.TimeoutExpired."""
         process.send_signal(sig)
@@ -215,6 +242,8 @@ class Host:
     def reap(self) -> None:
         """Wait for every program that was started; for `Lab.close`, after the lab's end."""
         for process in self._processes:
+            if process.poll() is None:
+                process.wake()
             process.wait()
             for pipe in (process.stdin, process.stdout, process.stderr):
                 if pipe is not None:

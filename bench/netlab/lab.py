@@ -12,6 +12,7 @@ import sys
 import tempfile
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self, TypeVar
 
@@ -37,6 +38,8 @@ _REPOSITORY = Path(__file__).resolve().parents[2]
 _BUILD_TIMEOUT_S = 60.0
 # SIGKILL takes effect at once; taking down the namespaces' processes some tens of ms.
 _END_TIMEOUT_S = 20.0
+# Of the lab's own processes; they write when something goes wrong.
+_MAX_LOG_BYTES = 1 << 16
 _NEEDED_PROGRAMS = ("ip", "nft", "nsenter", "setpriv", "unshare")
 _Part = TypeVar("_Part")
 
@@ -87,6 +90,7 @@ class Lab:
         self._holder: subprocess.Popen[bytes] | None = None
         self._inner_pids: dict[str, int] = {}
         self._lifeline: LineSocket | None = None
+        self._log: IO[bytes] | None = None
         self._lifeline_lock = threading.Lock()
         self.port_kind = ""
         """`tap` or `packet`: how the emulator gets its frames."""
@@ -172,6 +176,9 @@ class Lab:
             link.close()
         for machine in self._machines.values():
             machine.reap()
+        if self._log is not None:
+            self._log.close()
+            self._log = None
 
     def _start(self) -> None:
         missing = [program for program in _NEEDED_PROGRAMS if shutil.which(program) is None]
@@ -185,20 +192,23 @@ class Lab:
             own_end, emulator_end = socket.socketpair()
             link_ends.append(emulator_end)
             up, down = LinkProfile.from_json(link.up), LinkProfile.from_json(link.down)
-            handle = Link(link.host, link.interface, LineSocket(own_end), up, down)
+            handle = Link(
+                link.host,
+                link.interface,
+                LineSocket(own_end),
+                up=up,
+                down=down,
+                last_words=self._read_log,
+            )
             self._links[link.host, link.interface] = handle
-        with tempfile.TemporaryFile() as log:
-            self._holder = _start_holder([theirs, *link_ends], log, user_namespace=user_namespace)
-            theirs.close()
-            for end in link_ends:
-                end.close()
-            ready = self._build(self._plan)
-            if "ready" not in ready:
-                log.seek(0)
-                detail = log.read().decode(errors="replace").strip()
-                raise LabError(
-                    f"the lab could not be built: {ready.get('error', 'its holder died')}\n{detail}"
-                )
+        self._log = tempfile.TemporaryFile()
+        self._holder = _start_holder([theirs, *link_ends], self._log, user_namespace=user_namespace)
+        for end in (theirs, *link_ends):
+            end.close()
+        ready = self._build(self._plan)
+        if "ready" not in ready:
+            why = ready.get("error", "its holder died")
+            raise LabError(f"the lab could not be built: {why}\n{self._read_log()}")
         self.port_kind = ready["links"][0] if ready["links"] else "none"
         self._inner_pids = ready["pids"]
         outer_pids = _outer_pids(self._holder.pid)
@@ -209,6 +219,7 @@ class Lab:
                 user_namespace=user_namespace,
                 addresses=self._plan.addresses[name],
                 interface_lines=namespace.interface_lines,
+                open_socket=partial(self._socket, name),
                 environment={"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "NETLAB_HOST": name},
             )
         for spec in self.config.hosts:
@@ -226,16 +237,29 @@ class Lab:
         except OSError as error:
             return {"error": str(error)}
 
-    def _flush_connections(self, machine: str) -> None:
+    def _read_log(self) -> str:
+        if self._log is None:
+            return ""
+        return os.pread(self._log.fileno(), _MAX_LOG_BYTES, 0).decode(errors="replace").strip()
+
+    def _ask_holder(self, op: str, machine: str, **fields: Any) -> None:
+        """Have the holder do something on a machine; the caller holds the lifeline's lock."""
         if self._lifeline is None:
             raise LabError("the lab is closed")
-        with self._lifeline_lock:
-            self._lifeline.send({"flush_connections_of": self._inner_pids[machine]})
-            answer = self._lifeline.receive()
+        self._lifeline.send({"op": op, "machine": self._inner_pids[machine], **fields})
+        answer = self._lifeline.receive()
         if answer is None or "error" in answer:
-            raise LabError(
-                f"{machine}: connections not flushed: {answer['error'] if answer else 'the lab is dead'}"
-            )
+            raise LabError(f"{machine}: {op}: {answer['error'] if answer else 'the lab is dead'}")
+
+    def _flush_connections(self, machine: str) -> None:
+        with self._lifeline_lock:
+            self._ask_holder("flush_connections", machine)
+
+    def _socket(self, machine: str, family: int, kind: int, device: str | None) -> socket.socket:
+        with self._lifeline_lock:
+            self._ask_holder("socket", machine, family=family, kind=kind, device=device)
+            assert self._lifeline is not None
+            return socket.socket(fileno=self._lifeline.take_descriptor())
 
 
 def _start_holder(

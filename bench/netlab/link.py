@@ -11,6 +11,8 @@ from bench.netlab.errors import LabError
 from bench.netlab.profile import DropReason, LinkProfile
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from bench.netlab.traces import Trace
     from bench.netlab.wire import LineSocket
 
@@ -66,6 +68,8 @@ class LinkStats:
     """Of trace steps behind their time, since the last reset."""
     turns: int
     """Turns of the emulator's loop."""
+    realtime: bool
+    """Whether the emulator goes before ordinary processes (SCHED_RR); if not, mind the lateness."""
     longest_turn_s: float
     """A packet that arrived meanwhile waited so long before its arrival was noticed; since the last reset."""
     cpu_s: float
@@ -76,12 +80,20 @@ class Link:
     """The emulated link of one interface, made by `Lab`; both directions. Safe to use from any thread."""
 
     def __init__(
-        self, host: str, interface: str, control: LineSocket, up: LinkProfile, down: LinkProfile
+        self,
+        host: str,
+        interface: str,
+        control: LineSocket,
+        *,
+        up: LinkProfile,
+        down: LinkProfile,
+        last_words: Callable[[], str],
     ) -> None:
         self.host = host
         self.interface = interface
         self._control = control
         self._first = (up, down)
+        self._last_words = last_words  # what the lab's processes wrote on stderr
         self._lock = threading.Lock()
         control.settimeout(_ANSWER_TIMEOUT_S)
 
@@ -152,6 +164,7 @@ class Link:
             lateness=Lateness(**answer["lateness"]),
             step_lateness=Lateness(**answer["step_lateness"]),
             turns=answer["turns"],
+            realtime=answer["realtime"],
             longest_turn_s=answer["longest_turn_s"],
             cpu_s=answer["cpu_s"],
         )
@@ -165,10 +178,12 @@ class Link:
             try:
                 self._control.send({"op": op, **fields})
                 answer = self._control.receive()
+            except ConnectionError:
+                answer = None
             except OSError as error:
                 raise LabError(f"link {self.host}/{self.interface}: {error}") from error
         if answer is None:
-            raise LabError(f"link {self.host}/{self.interface}: its emulator has died")
+            raise LabError(f"link {self.host}/{self.interface}: its emulator has died\n{self._last_words()}")
         if not answer["ok"]:
             raise LabError(f"link {self.host}/{self.interface}: {answer['error']}")
         return answer

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from bench.netlab.topology import NatSpec
 
-# Source ports of the n-th rebinding; disjoint from those of the rebindings before and after it.
-_REBIND_FIRST_PORT = 20_000
-_REBIND_PORTS = 2_000
-_REBIND_RANGES = 20
+# Source ports of the n-th rebinding: disjoint from those of the rebindings before and after it, and
+# above Linux's ephemeral ports (32768..60999), as a port that is in the range already would be kept.
+_REBIND_FIRST_PORT = 61_000
+_REBIND_PORTS = 500
+_REBIND_RANGES = 9
 # linux/netlink.h, linux/netfilter/nfnetlink.h, nfnetlink_conntrack.h
 _NETLINK_NETFILTER = 12
 _CTNETLINK_DELETE = (1 << 8) | 2

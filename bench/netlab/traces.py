@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import math
 import zlib
 from dataclasses import dataclass
 from itertools import pairwise
@@ -109,6 +110,8 @@ def parse_trace(text: str, *, name: str = "trace", queue_bytes: int = DEFAULT_QU
             raise LabConfigError(f"trace {name}: expected the columns {', '.join(_COLUMNS)}")
         for row in reader:
             try:
+                if None in row or not math.isfinite(float(row["t_s"])):
+                    raise ValueError("expected finite numbers, one a column")
                 values = {column: float(row[column]) for column in _COLUMNS}
                 for path, path_steps in steps.items():
                     path_steps.append(_step(values, path, queue_bytes))

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+import socket
+from typing import Any
 
 from bench.netlab.errors import LabError
-
-if TYPE_CHECKING:
-    import socket
 
 
 class LineSocket:
@@ -17,6 +15,7 @@ class LineSocket:
     def __init__(self, connection: socket.socket) -> None:
         self._socket = connection
         self._received = bytearray()
+        self._descriptors: list[int] = []
 
     def fileno(self) -> int:
         """Readable when more may be received."""
@@ -29,6 +28,16 @@ class LineSocket:
     def send(self, message: dict[str, Any]) -> None:
         """Send one message. Raises OSError."""
         self._socket.sendall(json.dumps(message).encode() + b"\n")
+
+    def send_with_descriptor(self, message: dict[str, Any], descriptor: int) -> None:
+        """Send one message and, with it, an open file. Raises OSError."""
+        socket.send_fds(self._socket, [json.dumps(message).encode() + b"\n"], [descriptor])
+
+    def take_descriptor(self) -> int:
+        """The open file that came with a message. Raises LabError if there was none."""
+        if not self._descriptors:
+            raise LabError("the lab's control socket: no open file came along")
+        return self._descriptors.pop(0)
 
     def receive(self) -> dict[str, Any] | None:
         """The next message, waiting for it; None: the other side is gone. Raises LabError on garbage."""
@@ -52,10 +61,11 @@ class LineSocket:
 
     def _fill(self) -> bool:
         try:
-            data = self._socket.recv(1 << 16)
+            data, descriptors, _, _ = socket.recv_fds(self._socket, 1 << 16, 4, socket.MSG_CMSG_CLOEXEC)
         except ConnectionError:
             return False
         self._received += data
+        self._descriptors += descriptors
         return bool(data)
 
     def _pop(self) -> dict[str, Any]:
