@@ -1,6 +1,7 @@
 """Who is there: registrations with leases, without IO.
 
-A sidecar is known by its name from its registration until its lease ends or it says goodbye. Losing the stream alone does not remove it: a robot in a tunnel is still there.
+A sidecar is known by its name from its registration until its lease ends or it says goodbye. Losing the stream
+alone does not remove it: a robot in a tunnel is still there.
 """
 
 from __future__ import annotations

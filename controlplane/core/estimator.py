@@ -1,0 +1,254 @@
+"""Probability that a request misses its deadline, for every (robot, interface, server, service).
+
+Requests that really ran are the best witness. For pairs that carried few or none, the round trips of the path and
+the server's processing times (whoever measured them) stand in: see `Estimator.miss_probability`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+from controlplane.core.fading import FadedCount, FadedHistogram, sum_exceeds
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from protos.model import InterfaceName, NodeName, PathReport, Report, ServiceName
+
+    Pair = tuple[InterfaceName, NodeName, ServiceName]
+    PathKey = tuple[InterfaceName, NodeName]
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+PRIOR_MISSES = 0.5
+PRIOR_REQUESTS = 1.0
+"""Jeffreys' prior, Beta(1/2, 1/2): a pair of which nothing is known misses one request in two."""
+
+FEW_REQUESTS = 100.0
+"""From this many real requests on, the estimate from round trips has no say; below, ever more."""
+
+MODEL_MAX_REQUESTS = 100.0
+"""The estimate from round trips never counts for more real requests than this, however many probes back it."""
+
+OVERHEAD_MIN_REQUESTS = 20.0
+"""Requests a pair must have carried before it tells how much slower requests are than probes."""
+
+MAX_PAIRS_PER_ROBOT = 1024
+"""Latency histograms kept of one robot, the least recently reported goes: 4 interfaces, 16 servers, 16 services."""
+
+MAX_PATHS_PER_ROBOT = 1024
+"""Paths kept of one robot, the least recently reported goes."""
+
+MAX_OUTCOMES_PER_ROBOT = 1024
+"""Services kept of one robot, the least recently reported goes: as many as it can carry."""
+
+MAX_HISTOGRAMS = 65_536
+"""Histograms kept of all robots (3 kB each): beyond that, the robot that reported least recently is forgotten."""
+
+MAX_PROCESSING = 8192
+"""Processing histograms kept, one for each (server, service); the least recently reported goes."""
+
+
+@dataclass(slots=True)
+class PathState:
+    """What is known of one path."""
+
+    up: bool
+    rtt: FadedHistogram
+    datagrams: FadedCount
+    last: PathReport
+
+    def loss(self) -> float:
+        """Share of what was sent that got lost, as datagrams or as probes, whichever is worse."""
+        found = [ratio for ratio in (self.datagrams.ratio(), self.rtt.lost_share()) if not math.isnan(ratio)]
+        return max(found, default=0.0)
+
+
+class _Robot:
+    """Tables fed by one robot."""
+
+    __slots__ = ("latencies", "outcomes", "paths")
+
+    def __init__(self) -> None:
+        self.latencies: OrderedDict[Pair, FadedHistogram] = OrderedDict()
+        self.paths: OrderedDict[PathKey, PathState] = OrderedDict()
+        self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
+
+    def histograms(self) -> int:
+        return len(self.latencies) + len(self.paths)
+
+
+class Estimator:
+    """Everything the robots measured, fading. Times are monotonic seconds."""
+
+    def __init__(self, *, half_life_s: float) -> None:
+        self._half_life_s = half_life_s
+        self._robots: OrderedDict[NodeName, _Robot] = OrderedDict()
+        self._processing: OrderedDict[tuple[NodeName, ServiceName], FadedHistogram] = OrderedDict()
+        self._histograms = 0
+        self.dropped = 0
+        """Entries evicted because a table was full."""
+
+    def merge(self, robot: NodeName, report: Report, now: float) -> bool:
+        """Add a report; True if a path went up or down with it, or is reported for the first time."""
+        tables = self._robots.get(robot)
+        if tables is None:
+            tables = self._robots[robot] = _Robot()
+        self._robots.move_to_end(robot)
+        self._histograms -= tables.histograms()
+        for latency in report.latencies:
+            pair = (latency.interface, latency.server, latency.service)
+            if latency.latency.total:
+                self._histogram(tables.latencies, pair, MAX_PAIRS_PER_ROBOT, now).add(latency.latency, now)
+            if latency.processing.total:
+                key = (latency.server, latency.service)
+                self._histogram(self._processing, key, MAX_PROCESSING, now).add(latency.processing, now)
+        changed = False
+        for path in report.paths:
+            changed |= self._merge_path(tables, path, now)
+        for outcome in report.outcomes:
+            bad = outcome.deadline_missed + outcome.failed
+            count = tables.outcomes.get(outcome.service) or FadedCount(self._half_life_s, now)
+            tables.outcomes[outcome.service] = count
+            self._trim(tables.outcomes, outcome.service, MAX_OUTCOMES_PER_ROBOT)
+            count.add(outcome.ok + bad, bad, now)
+        self._histograms += tables.histograms()
+        while self._histograms > MAX_HISTOGRAMS and len(self._robots) > 1:
+            _, forgotten = self._robots.popitem(last=False)
+            self._histograms -= forgotten.histograms()
+            self.dropped += forgotten.histograms()
+        return changed
+
+    def _histogram(self, table: OrderedDict[K, FadedHistogram], key: K, limit: int, now: float) -> FadedHistogram:
+        histogram = table.get(key)
+        if histogram is None:
+            histogram = table[key] = FadedHistogram(self._half_life_s, now)
+        self._trim(table, key, limit)
+        return histogram
+
+    def _trim(self, table: OrderedDict[K, V], key: K, limit: int) -> None:
+        """Mark `key` as used last, and evict the least recently used beyond `limit`."""
+        table.move_to_end(key)
+        if len(table) > limit:
+            table.popitem(last=False)
+            self.dropped += 1
+
+    def _merge_path(self, tables: _Robot, path: PathReport, now: float) -> bool:
+        key = (path.interface, path.server)
+        known = tables.paths.get(key)
+        if known is None:
+            rtt = FadedHistogram(self._half_life_s, now)
+            state = PathState(path.up, rtt, FadedCount(self._half_life_s, now), path)
+        else:
+            state = known
+        tables.paths[key] = state
+        self._trim(tables.paths, key, MAX_PATHS_PER_ROBOT)
+        changed = known is None or known.up != path.up
+        state.up = path.up
+        state.last = path
+        state.rtt.add(path.rtt, now)
+        # What was sent before the last report may be found lost only now: no more is lost than is sent.
+        state.datagrams.add(path.datagrams_sent, min(path.datagrams_lost, path.datagrams_sent), now)
+        return changed
+
+    def forget_paths(self, robot: NodeName) -> None:
+        """The robot is gone or was started anew: whether its paths are up is not known any more."""
+        tables = self._robots.get(robot)
+        if tables is not None:
+            self._histograms -= len(tables.paths)
+            tables.paths.clear()
+
+    def paths(self, robot: NodeName) -> Iterator[PathReport]:
+        """The last report of each path of a robot."""
+        tables = self._robots.get(robot)
+        if tables is not None:
+            yield from (state.last for state in tables.paths.values())
+
+    def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
+        """Whether the path was up when last reported; None if it never was reported."""
+        tables = self._robots.get(robot)
+        state = tables.paths.get((interface, server)) if tables is not None else None
+        return state.up if state is not None else None
+
+    def observed_miss_ratio(self, robot: NodeName, service: ServiceName, now: float) -> float | None:
+        """Share of the robot's recent requests that missed their deadline or failed; None without any."""
+        tables = self._robots.get(robot)
+        count = tables.outcomes.get(service) if tables is not None else None
+        if count is None or count.weight(now) < PRIOR_MISSES:
+            return None
+        return count.ratio()
+
+    def overhead(self, robot: NodeName, service: ServiceName, now: float) -> float:
+        """How much slower, in seconds, this robot's requests of this service are than probes and processing.
+
+        Probes are small: what the request's size costs shows only in pairs that carried some. Without this a pair
+        never tried would look better than it is, and the plan would swing to it and back.
+        """
+        tables = self._robots.get(robot)
+        if tables is None:
+            return 0.0
+        total = weights = 0.0
+        for (interface, server, of_service), latency in tables.latencies.items():
+            if of_service != service:
+                continue
+            path = tables.paths.get((interface, server))
+            weight = latency.weight(now)
+            if path is None or weight < OVERHEAD_MIN_REQUESTS:
+                continue
+            excess = latency.median() - path.rtt.median()
+            processing = self._processing.get((server, service))
+            if processing is not None:
+                excess -= processing.median()
+            if math.isfinite(excess):
+                total += weight * max(0.0, excess)
+                weights += weight
+        return total / weights if weights else 0.0
+
+    def miss_probability(
+        self,
+        robot: NodeName,
+        interface: InterfaceName,
+        server: NodeName,
+        service: ServiceName,
+        deadline_s: float,
+        now: float,
+        *,
+        overhead_s: float = 0.0,
+    ) -> float:
+        """epsilon_ij = P(L_ij > deadline), never quite 0 nor 1.
+
+        With n requests that ran on this pair, m of them too late, and a model that gives p:
+        (m + w p + PRIOR_MISSES) / (n + w + PRIOR_REQUESTS), the posterior mean of a Beta prior, where w is the
+        model's worth in requests; it falls to 0 as n reaches `FEW_REQUESTS`.
+        """
+        tables = self._robots.get(robot)
+        if tables is None:
+            return PRIOR_MISSES / PRIOR_REQUESTS
+        requests = misses = 0.0
+        latency = tables.latencies.get((interface, server, service))
+        if latency is not None:
+            requests = latency.weight(now)
+            misses = requests * latency.fraction_over(deadline_s) if requests else 0.0
+        model_weight = model = 0.0
+        path = tables.paths.get((interface, server))
+        if path is not None and requests < FEW_REQUESTS:
+            model = self._model(path, self._processing.get((server, service)), deadline_s - overhead_s)
+            if math.isfinite(model):
+                backing = min(path.rtt.weight(now), MODEL_MAX_REQUESTS)
+                model_weight = backing * (1.0 - requests / FEW_REQUESTS)
+            else:
+                model = 0.0
+        return (misses + model_weight * model + PRIOR_MISSES) / (requests + model_weight + PRIOR_REQUESTS)
+
+    @staticmethod
+    def _model(path: PathState, processing: FadedHistogram | None, deadline_s: float) -> float:
+        """P(round trip + processing > deadline); what is lost costs one more round trip to be noticed and sent."""
+        loss = path.loss()
+        prompt = sum_exceeds(path.rtt, processing, deadline_s)
+        if not loss or math.isnan(prompt):
+            return prompt
+        return (1.0 - loss) * prompt + loss * sum_exceeds(path.rtt, processing, deadline_s, times=2.0)

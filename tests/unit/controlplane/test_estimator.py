@@ -1,0 +1,152 @@
+"""What the estimator believes of a pair, from much, little and no evidence."""
+
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core import estimator as estimator_module
+from controlplane.core.estimator import Estimator
+from protos.model import InterfaceName, NodeName, OutcomeReport, PathReport, Report, ServiceName
+from tests.unit.controlplane.samples import PLAN, histogram, latency, path
+
+ROBOT = NodeName("robot")
+A, B = NodeName("cloud-a"), NodeName("cloud-b")
+WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")
+DEADLINE_S = 0.1
+
+
+@pytest.fixture
+def estimator() -> Estimator:
+    return Estimator(half_life_s=60.0)
+
+
+def miss(estimator: Estimator, server: NodeName = A, now: float = 0.0, interface: InterfaceName = WLAN) -> float:
+    overhead = estimator.overhead(ROBOT, PLAN, now)
+    return estimator.miss_probability(ROBOT, interface, server, PLAN, DEADLINE_S, now, overhead_s=overhead)
+
+
+def test_a_pair_never_heard_of_is_a_coin_toss(estimator: Estimator) -> None:
+    assert miss(estimator) == 0.5
+    estimator.merge(ROBOT, Report(paths=(path("wlan0", "cloud-a"),)), 0.0)
+    assert miss(estimator) == 0.5
+
+
+def test_many_real_requests_decide_alone(estimator: Estimator) -> None:
+    measured = histogram(0.05, times=900)
+    measured.merge(histogram(0.2, times=60, lost=40))
+    reported = Report(
+        latencies=(latency("wlan0", "cloud-a", measured),),
+        # The round trips alone would promise no miss at all.
+        paths=(path("wlan0", "cloud-a", rtt=histogram(0.01, times=500)),),
+    )
+    estimator.merge(ROBOT, reported, 0.0)
+    assert miss(estimator) == pytest.approx((100 + 0.5) / (1000 + 1))
+
+
+def test_no_requests_let_round_trips_and_processing_decide(estimator: Estimator) -> None:
+    quick = Report(
+        latencies=(latency("wwan0", "cloud-a", histogram(), processing=histogram(0.02, 0.08, times=50)),),
+        paths=(path("wlan0", "cloud-a", rtt=histogram(0.04, times=200)),),
+    )
+    estimator.merge(ROBOT, quick, 0.0)
+    # 40 ms there and back: 20 ms of processing makes it, 80 ms does not, so every other request misses.
+    assert miss(estimator) == pytest.approx(0.5, abs=0.02)
+    estimator.merge(ROBOT, Report(paths=(path("wlan0", "cloud-b", rtt=histogram(0.04, times=200)),)), 0.0)
+    assert miss(estimator, B) < 0.01
+
+
+def test_few_requests_are_blended_with_the_round_trips(estimator: Estimator) -> None:
+    rtt = path("wlan0", "cloud-a", rtt=histogram(0.01, times=1000))
+    estimator.merge(ROBOT, Report(paths=(rtt,)), 0.0)
+    unused = miss(estimator)
+    estimator.merge(ROBOT, Report(latencies=(latency("wlan0", "cloud-a", histogram(0.2, times=10)),)), 0.0)
+    few = miss(estimator)
+    estimator.merge(ROBOT, Report(latencies=(latency("wlan0", "cloud-a", histogram(0.2, times=90)),)), 0.0)
+    many = miss(estimator)
+    assert unused < 0.01
+    assert few == pytest.approx(10.5 / (10 + 90 + 1), abs=0.01)
+    assert many > 0.99
+
+
+def test_loss_costs_a_round_trip(estimator: Estimator) -> None:
+    lossy = PathReport(WLAN, A, up=True, rtt=histogram(0.06, times=400), datagrams_sent=100, datagrams_lost=20)
+    estimator.merge(ROBOT, Report(paths=(lossy,)), 0.0)
+    assert miss(estimator) == pytest.approx(0.2, abs=0.01)
+    worse = PathReport(WLAN, B, up=True, rtt=histogram(0.06, times=300, lost=100))
+    estimator.merge(ROBOT, Report(paths=(worse,)), 0.0)
+    assert miss(estimator, B) == pytest.approx(0.25, abs=0.01)
+
+
+def test_a_pair_never_tried_is_charged_the_overhead_of_those_that_were(estimator: Estimator) -> None:
+    # Requests take 90 ms where probes take 20 ms and processing 30 ms: 40 ms go to the size of the request.
+    report = Report(
+        latencies=(latency("wlan0", "cloud-a", histogram(0.09, times=100), processing=histogram(0.03, times=100)),),
+        paths=(
+            path("wlan0", "cloud-a", rtt=histogram(0.02, times=100)),
+            path("wlan0", "cloud-b", rtt=histogram(0.07, times=100)),
+        ),
+    )
+    estimator.merge(ROBOT, report, 0.0)
+    assert estimator.overhead(ROBOT, PLAN, 0.0) == pytest.approx(0.04, abs=0.003)
+    assert miss(estimator, B) > 0.95
+    assert estimator.overhead(ROBOT, ServiceName("/other"), 0.0) == 0.0
+
+
+def test_old_evidence_fades_back_to_doubt(estimator: Estimator) -> None:
+    estimator.merge(ROBOT, Report(latencies=(latency("wlan0", "cloud-a", histogram(0.01, times=600)),)), 0.0)
+    fresh, hour_later = miss(estimator), miss(estimator, now=3600.0)
+    assert fresh < 0.001
+    assert hour_later == pytest.approx(0.5)
+
+
+def test_going_up_or_down_is_news(estimator: Estimator) -> None:
+    assert estimator.path_up(ROBOT, WLAN, A) is None
+    assert estimator.merge(ROBOT, Report(paths=(path("wlan0", "cloud-a"),)), 0.0)
+    assert not estimator.merge(ROBOT, Report(paths=(path("wlan0", "cloud-a"),)), 1.0)
+    assert estimator.path_up(ROBOT, WLAN, A) is True
+    assert estimator.merge(ROBOT, Report(paths=(path("wlan0", "cloud-a", up=False),)), 2.0)
+    assert estimator.path_up(ROBOT, WLAN, A) is False
+    assert [report.up for report in estimator.paths(ROBOT)] == [False]
+    estimator.forget_paths(ROBOT)
+    assert estimator.path_up(ROBOT, WLAN, A) is None
+
+
+def test_observed_misses(estimator: Estimator) -> None:
+    assert estimator.observed_miss_ratio(ROBOT, PLAN, 0.0) is None
+    estimator.merge(ROBOT, Report(outcomes=(OutcomeReport(PLAN, ok=90, deadline_missed=8, failed=2),)), 0.0)
+    assert estimator.observed_miss_ratio(ROBOT, PLAN, 0.0) == pytest.approx(0.1)
+    assert estimator.observed_miss_ratio(ROBOT, PLAN, 3600.0) is None
+
+
+def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimator_module, "MAX_PAIRS_PER_ROBOT", 4)
+    monkeypatch.setattr(estimator_module, "MAX_PATHS_PER_ROBOT", 4)
+    monkeypatch.setattr(estimator_module, "MAX_OUTCOMES_PER_ROBOT", 4)
+    monkeypatch.setattr(estimator_module, "MAX_PROCESSING", 4)
+    for number in range(6):
+        measured = histogram(0.01)
+        estimator.merge(
+            ROBOT,
+            Report(
+                latencies=(latency("wlan0", f"cloud-{number}", measured, processing=measured),),
+                paths=(path("wlan0", f"cloud-{number}"),),
+                outcomes=(OutcomeReport(ServiceName(f"/service_{number}"), ok=1),),
+            ),
+            float(number),
+        )
+    assert estimator.dropped == 4 * 2
+    assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-1")) is None
+    assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-5")) is True
+
+
+def test_the_robot_that_reported_least_recently_is_forgotten_first(
+    estimator: Estimator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimator_module, "MAX_HISTOGRAMS", 3)
+    for name in ("one", "two", "three"):
+        estimator.merge(NodeName(name), Report(paths=(path("wlan0", "cloud-a"),)), 0.0)
+    estimator.merge(NodeName("one"), Report(paths=(path("wwan0", "cloud-a"),)), 1.0)
+    assert estimator.path_up(NodeName("two"), WLAN, A) is None
+    assert estimator.path_up(NodeName("one"), WLAN, A) is True
+    assert estimator.path_up(NodeName("three"), WLAN, A) is True
+    assert estimator.dropped == 1
