@@ -86,9 +86,7 @@ class StunServer:
                 self.send_failures += 1
 
 
-async def start_stun_server(
-    hosts: str | Sequence[str], port: int, *, software: str | None = None
-) -> StunServer:
+async def start_stun_server(hosts: str | Sequence[str], port: int, *, software: str | None = None) -> StunServer:
     """Answer on every address of `hosts`, all on one port (0: a free one, see `addresses`).
 
     "" stands for all addresses of both families; only then may IPv6 be missing on the machine. Raises OSError

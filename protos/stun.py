@@ -134,14 +134,10 @@ def is_stun(data: bytes | memoryview) -> bool:
 def encode(message: StunMessage) -> bytes:
     """Write a message; raises ValueError where a field does not fit the format (a mistake of the caller)."""
     if len(message.transaction_id) != TRANSACTION_ID_BYTES:
-        raise ValueError(
-            f"transaction id has {len(message.transaction_id)} bytes, expected {TRANSACTION_ID_BYTES}"
-        )
+        raise ValueError(f"transaction id has {len(message.transaction_id)} bytes, expected {TRANSACTION_ID_BYTES}")
     body = bytearray()
     if message.error_code is not None:
-        body += _encode_attribute(
-            Attribute.ERROR_CODE, _error_value(message.error_code, message.error_reason)
-        )
+        body += _encode_attribute(Attribute.ERROR_CODE, _error_value(message.error_code, message.error_reason))
     if message.unknown_attributes:
         listed = message.unknown_attributes
         body += _encode_attribute(Attribute.UNKNOWN_ATTRIBUTES, struct.pack(f"!{len(listed)}H", *listed))

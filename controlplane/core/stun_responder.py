@@ -41,9 +41,7 @@ def respond(
     return response
 
 
-def _respond(
-    data: bytes | memoryview, source: Address, software: str | None
-) -> tuple[StunOutcome, bytes | None]:
+def _respond(data: bytes | memoryview, source: Address, software: str | None) -> tuple[StunOutcome, bytes | None]:
     if not is_stun(data):
         return StunOutcome.NOT_STUN, None
     if source[1] == 0:

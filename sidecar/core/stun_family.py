@@ -128,9 +128,7 @@ class StunFamilyClient:
             else:
                 self._give_up(transaction, f"no answer from {_text(transaction.server)}", now)
 
-    def handle_response(
-        self, transaction: StunTransaction, message: StunMessage, source: Address, now: float
-    ) -> None:
+    def handle_response(self, transaction: StunTransaction, message: StunMessage, source: Address, now: float) -> None:
         """Believe or drop a response that carries the transaction's id."""
         drops = self._outbox.drops
         if source != transaction.server:

@@ -26,9 +26,7 @@ class Retransmission:
 
     def __post_init__(self) -> None:
         if self.initial_rto_s <= 0 or self.max_requests < 1 or self.last_wait_factor <= 0:
-            raise ValueError(
-                "retransmission needs a positive RTO, at least one request and a positive last wait"
-            )
+            raise ValueError("retransmission needs a positive RTO, at least one request and a positive last wait")
 
 
 class StunTransaction:
@@ -54,9 +52,7 @@ class StunTransaction:
     ) -> None:
         self.server = server
         self.transaction_id = transaction_id
-        self.request = encode(
-            StunMessage(MessageClass.REQUEST, transaction_id, software=software, fingerprint=True)
-        )
+        self.request = encode(StunMessage(MessageClass.REQUEST, transaction_id, software=software, fingerprint=True))
         self.requests_sent = 0
         self.deadline = now
         """When handle_timer has something to do next; the first request is due at once."""

@@ -42,9 +42,7 @@ messages = st.builds(
     unknown_attributes=st.lists(st.integers(0, 65535), max_size=8).map(tuple),
     fingerprint=st.booleans(),
 )
-attributes = st.tuples(
-    st.sampled_from([int(a) for a in Attribute]) | st.integers(0, 65535), st.binary(max_size=24)
-)
+attributes = st.tuples(st.sampled_from([int(a) for a in Attribute]) | st.integers(0, 65535), st.binary(max_size=24))
 
 
 @st.composite
@@ -102,9 +100,7 @@ def test_the_responder_stands_and_never_amplifies(data: bytes, source: tuple[str
 
 
 @given(st.lists(datagrams, max_size=5), st.lists(well_framed(), max_size=5), st.integers())
-def test_the_client_stands_and_believes_no_stranger(
-    noise: list[bytes], framed: list[bytes], seed: int
-) -> None:
+def test_the_client_stands_and_believes_no_stranger(noise: list[bytes], framed: list[bytes], seed: int) -> None:
     server = ("192.0.2.1", 3478)
     client = StunClient([server], random.Random(seed))
     client.start(0.0)

@@ -182,9 +182,7 @@ def test_the_answer_comes_from_the_address_that_was_asked() -> None:
     # A wildcard socket left to itself would answer from 127.0.0.1, and no NAT would let that through.
     async def use(server: StunServer) -> None:
         asked = ("127.0.0.77", server.addresses[0][1])
-        _, answered_from = await asyncio.to_thread(
-            ask, asked, encode(StunMessage(MessageClass.REQUEST, bytes(12)))
-        )
+        _, answered_from = await asyncio.to_thread(ask, asked, encode(StunMessage(MessageClass.REQUEST, bytes(12))))
         assert answered_from == asked
 
     with_server("0.0.0.0", use)
@@ -216,9 +214,7 @@ def test_a_request_too_long_to_be_one_is_not_taken_for_its_beginning() -> None:
     async def use(server: StunServer) -> None:
         with udp_socket(4, "127.0.0.1") as sock:
             sock.sendto(padded, server.addresses[0])
-        await asyncio.to_thread(
-            ask, server.addresses[0], encode(StunMessage(MessageClass.REQUEST, bytes(12)))
-        )
+        await asyncio.to_thread(ask, server.addresses[0], encode(StunMessage(MessageClass.REQUEST, bytes(12))))
 
     assert with_server("127.0.0.1", use) == {StunOutcome.MALFORMED: 1, StunOutcome.ANSWERED: 1}
 

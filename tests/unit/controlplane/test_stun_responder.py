@@ -40,9 +40,7 @@ def test_a_binding_request_is_answered_with_its_source(source: tuple[str, int], 
 
 
 @pytest.mark.parametrize(("source", "growth"), [(SOURCE, 12), (("2001:db8::7", 40000), 24)])
-def test_an_answer_is_longer_than_its_request_by_the_address_only(
-    source: tuple[str, int], growth: int
-) -> None:
+def test_an_answer_is_longer_than_its_request_by_the_address_only(source: tuple[str, int], growth: int) -> None:
     for fingerprint in (False, True):
         asked = request(fingerprint=fingerprint)
         response = respond(asked, source, Counter())
@@ -83,9 +81,7 @@ def test_an_optional_extension_is_passed_over() -> None:
         (request(), ("198.51.100.7", 0), StunOutcome.BAD_SOURCE),
     ],
 )
-def test_anything_else_gets_silence_and_a_count(
-    data: bytes, source: tuple[str, int], outcome: StunOutcome
-) -> None:
+def test_anything_else_gets_silence_and_a_count(data: bytes, source: tuple[str, int], outcome: StunOutcome) -> None:
     outcomes: Counter[StunOutcome] = Counter()
     assert respond(data, source, outcomes) is None
     assert outcomes == {outcome: 1}

@@ -71,15 +71,11 @@ class Network:
 def reply(request: bytes, address: Address) -> bytes:
     asked = decode(request)
     assert asked.message_class is MessageClass.REQUEST
-    return encode(
-        StunMessage(MessageClass.SUCCESS, asked.transaction_id, xor_mapped_address=address, fingerprint=True)
-    )
+    return encode(StunMessage(MessageClass.SUCCESS, asked.transaction_id, xor_mapped_address=address, fingerprint=True))
 
 
 def refusal(request: bytes, code: int = 500) -> bytes:
-    return encode(
-        StunMessage(MessageClass.ERROR, decode(request).transaction_id, error_code=code, error_reason="Busy")
-    )
+    return encode(StunMessage(MessageClass.ERROR, decode(request).transaction_id, error_code=code, error_reason="Busy"))
 
 
 def make(*servers: Address, seed: int = 1, config: StunClientConfig | None = None) -> StunClient:
@@ -261,9 +257,7 @@ def test_strangers_are_counted_and_not_believed() -> None:
 )
 def test_an_answer_without_a_usable_address_fails(address: Address | None, drop: StunDrop) -> None:
     client = make(A)
-    answer = StunMessage(
-        MessageClass.SUCCESS, decode(start(client)).transaction_id, xor_mapped_address=address
-    )
+    answer = StunMessage(MessageClass.SUCCESS, decode(start(client)).transaction_id, xor_mapped_address=address)
     client.receive_datagram(encode(answer), A, 0.1)
     assert client.next_event() == Failed(4, "192.0.2.1:3478 answered without a usable address", None)
     assert client.drops == {drop: 1}
