@@ -1,0 +1,102 @@
+"""CP-SAT's answers equal brute force, and no problem is without an answer."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from controlplane.core.assignment import FleetKey, Problem, is_valid, price
+from controlplane.solver import RESOLUTION, solve
+from protos.model import NodeName
+from tests.unit.controlplane.problems import PLAN, best_price, block, choices_of, random_problem
+
+AMPLE_S = 60.0
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_equals_brute_force(seed: int) -> None:
+    rng = random.Random(seed)
+    for _ in range(40):
+        problem = random_problem(rng)
+        plan = solve(problem, time_limit_s=AMPLE_S)
+        assert plan.unproven == 0
+        choices = choices_of(problem, {key: made.assignments for key, made in plan.blocks.items()})
+        assert all(is_valid(part, choices[part.key]) for part in problem.blocks)
+        found, best = price(problem, choices), best_price(problem)
+        assert found.excess == best.excess == plan.relaxed
+        interfaces = sum(len(part.interfaces) for part in problem.blocks)
+        assert found.cost == pytest.approx(best.cost, abs=interfaces * RESOLUTION)
+        assert found.cost == pytest.approx(sum(made.cost for made in plan.blocks.values()))
+
+
+def test_the_paper_gives_two_interfaces_one_server_each() -> None:
+    part = block([[0.01, 0.02], [0.01, 0.30]])
+    made = solve(Problem((part,)), time_limit_s=AMPLE_S).blocks[part.key]
+    assert made.assignments == (("if0", "cloud-1"), ("if1", "cloud-0"))
+    assert made.excess == 0
+
+
+def test_more_interfaces_than_capacity_is_relaxed_by_the_least() -> None:
+    part = block([[0.1, 0.2], [0.1, 0.2], [0.1, 0.2]])
+    plan = solve(Problem((part,)), time_limit_s=AMPLE_S)
+    assert plan.relaxed == plan.blocks[part.key].excess == 1
+    assert len(plan.blocks[part.key].assignments) == 3
+    assert plan.blocks[part.key].cost == pytest.approx(0.1 + 0.1 + 0.2)
+
+
+def test_interfaces_that_reach_only_one_server_are_relaxed_there() -> None:
+    part = block([[0.1, None], [0.2, None]])
+    plan = solve(Problem((part,)), time_limit_s=AMPLE_S)
+    assert plan.relaxed == 1
+    assert {server for _, server in plan.blocks[part.key].assignments} == {"cloud-0"}
+
+
+def test_a_limit_over_all_robots_is_shared() -> None:
+    one = block([[0.1, 0.5]], robot="one")
+    two = block([[0.1, 0.2]], robot="two")
+    problem = Problem((one, two), {FleetKey(NodeName("cloud-0"), PLAN): 1})
+    plan = solve(problem, time_limit_s=AMPLE_S)
+    assert plan.blocks[one.key].assignments == (("if0", "cloud-0"),)
+    assert plan.blocks[two.key].assignments == (("if0", "cloud-1"),)
+    assert plan.relaxed == 0
+
+
+def test_a_limit_over_all_robots_is_relaxed_by_the_least() -> None:
+    robots = [block([[0.1]], robot=f"robot-{number}") for number in range(4)]
+    key = FleetKey(NodeName("cloud-0"), PLAN)
+    plan = solve(Problem(tuple(robots), {key: 1}), time_limit_s=AMPLE_S)
+    assert plan.fleet_excess == {key: 3}
+    assert plan.relaxed == 3
+
+
+def test_what_is_not_idempotent_goes_to_one_server_chosen_over_all_interfaces() -> None:
+    part = block([[0.01, 0.1], [0.9, 0.1]], idempotent=False)
+    made = solve(Problem((part,)), time_limit_s=AMPLE_S).blocks[part.key]
+    assert made.assignments == (("if0", "cloud-1"), ("if1", "cloud-1"))
+    assert made.excess == 0
+
+
+def test_nothing_to_assign_gives_an_empty_plan() -> None:
+    plan = solve(Problem(()), time_limit_s=AMPLE_S)
+    assert plan.blocks == {}
+    assert plan.relaxed == 0
+
+
+def test_out_of_time_there_is_still_a_valid_plan() -> None:
+    rng = random.Random(3)
+    robots = [
+        block([[rng.random() for _ in range(20)] for _ in range(4)], robot=f"robot-{number}") for number in range(40)
+    ]
+    limits = {FleetKey(NodeName(f"cloud-{j}"), PLAN): 8 for j in range(20)}
+    problem = Problem(tuple(robots), limits)
+    first = solve(problem, time_limit_s=1e-9)
+    choices = choices_of(problem, {key: made.assignments for key, made in first.blocks.items()})
+    assert all(is_valid(part, choices[part.key]) for part in problem.blocks)
+    hinted = solve(problem, time_limit_s=1e-9, hint=first)
+    assert sum(made.cost for made in hinted.blocks.values()) <= sum(made.cost for made in first.blocks.values()) + 1e-4
+
+
+def test_the_same_problem_gives_the_same_plan() -> None:
+    problem = random_problem(random.Random(21))
+    assert solve(problem, time_limit_s=AMPLE_S) == solve(problem, time_limit_s=AMPLE_S)
