@@ -1,0 +1,35 @@
+"""How long to wait before the next attempt: exponential backoff with full jitter."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import random
+
+
+class Backoff:
+    """Delays drawn evenly from 0 to a bound that doubles from `first_s` up to `max_s`.
+
+    Full jitter: after an outage a fleet comes back spread out, not in waves.
+    """
+
+    def __init__(self, rng: random.Random, *, first_s: float, max_s: float) -> None:
+        self._rng = rng
+        self._first_s = first_s
+        self._max_s = max_s
+        self._bound_s = first_s
+
+    def next_delay_s(self) -> float:
+        """Return the delay before the next attempt, and double the bound."""
+        delay_s = self._rng.uniform(0.0, self._bound_s)
+        self._bound_s = min(2.0 * self._bound_s, self._max_s)
+        return delay_s
+
+    def reset(self) -> None:
+        """The last attempt went well."""
+        self._bound_s = self._first_s
+
+    def exhaust(self) -> None:
+        """Trying again soon is of no use: continue from the largest bound."""
+        self._bound_s = self._max_s

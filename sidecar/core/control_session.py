@@ -1,0 +1,309 @@
+"""The sidecar's end of the control stream: what to say, what to believe, when to try again. Sans-IO.
+
+    OFFLINE ──(retry_at: open a stream)──▶ REGISTERING ──(Welcome)──▶ ONLINE
+       ▲                                       │                        │
+       └───────(stream ended, no Welcome)──────┴────────────────────────┘
+
+The rules are xDS's. A resource comes whole, with a version and a nonce; the answer repeats the nonce with the version
+that is then in force. Only the newest answer for each resource matters, since the control plane ignores stale nonces:
+so what waits to be sent is bounded without any queue.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from protos.model import (
+    Ack,
+    CandidateSet,
+    Drain,
+    Heartbeat,
+    MappingSet,
+    Nack,
+    PeerSet,
+    Report,
+    ResourceKind,
+    ServiceSet,
+    Version,
+    Welcome,
+)
+from sidecar.core.backoff import Backoff
+
+if TYPE_CHECKING:
+    import random
+
+    from protos.model import ControlMessage, Registration, SidecarMessage
+
+RETRY_FIRST_S = 0.2
+"""First bound of the delay before a new stream: a restarted control plane is back within about a second."""
+
+RETRY_MAX_S = 10.0
+"""Largest bound: the load of a fleet that waits, against how long a control plane that is back goes unnoticed."""
+
+WELCOME_TIMEOUT_S = 5.0
+"""A stream without Welcome for this long is given up: connection set-up over a bad cellular link takes 1 to 2 s."""
+
+STABLE_AFTER_S = 5.0
+"""A stream this old ended for a new reason: the backoff starts anew."""
+
+HEARTBEATS_PER_LEASE = 3.0
+"""Two may get lost before the lease ends."""
+
+MIN_INTERVAL_S = 0.05
+"""Floor of what the control plane may ask for: it must not be able to make the sidecar spin."""
+
+_NOTHING_MEASURED = Report()
+
+
+class ControlState(enum.Enum):
+    """Where the control stream stands."""
+
+    OFFLINE = "offline"
+    REGISTERING = "registering"
+    ONLINE = "online"
+
+
+@dataclass(slots=True)
+class ControlStats:
+    """What happened on the control stream."""
+
+    attempts: int = 0
+    streams: int = 0
+    """Streams that got their Welcome."""
+    reports: int = 0
+    reports_dropped: int = 0
+    """Collected, but the stream ended first; one already handed to the stream may get lost with it uncounted."""
+    heartbeats: int = 0
+    acks: Counter[ResourceKind] = field(default_factory=Counter)
+    nacks: Counter[ResourceKind] = field(default_factory=Counter)
+    ignored: Counter[str] = field(default_factory=Counter)
+    """Messages of the control plane not acted on, by reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Apply:
+    """Put this resource in force, then call `ControlSession.applied`."""
+
+    resource: ResourceKind
+    content: PeerSet | MappingSet
+
+
+ControlEvent = Welcome | Apply
+"""What a received message asks of the driver."""
+
+
+class ControlSession:
+    """One sidecar's dialogue with the control plane, over however many streams.
+
+    `registration` names the versions already in force, such as those loaded from disk.
+    """
+
+    def __init__(self, registration: Registration, rng: random.Random) -> None:
+        self._registration = registration
+        self._in_force = {
+            ResourceKind.PEERS: registration.peers_version,
+            ResourceKind.MAPPING: registration.mapping_version,
+        }
+        self._backoff = Backoff(rng, first_s=RETRY_FIRST_S, max_s=RETRY_MAX_S)
+        self._candidates = CandidateSet()
+        self._services = ServiceSet()
+        self._draining = False
+        self.state = ControlState.OFFLINE
+        self.stats = ControlStats()
+        self._retry_at = 0.0
+        self._opened_at = 0.0
+        self._heartbeat_interval_s = 0.0
+        self._report_interval_s = 0.0
+        self._heartbeat_at = 0.0
+        self._report_at = 0.0
+        self._clear_outgoing()
+
+    def _clear_outgoing(self) -> None:
+        self._register_due = False
+        self._candidates_due = False
+        self._services_due = False
+        self._drain_due = False
+        self._heartbeat_due = False
+        self._answers: dict[ResourceKind, Ack | Nack] = {}
+        self._report: Report | None = None
+
+    @property
+    def retry_at(self) -> float:
+        """When to open the next stream; of meaning while offline."""
+        return self._retry_at
+
+    def version(self, resource: ResourceKind) -> Version:
+        """The version in force; 0 means none."""
+        return self._in_force[resource]
+
+    # ── the stream ──
+
+    def opened(self, now: float) -> None:
+        """A stream is being opened: everything is said anew on it."""
+        self._clear_outgoing()
+        self.state = ControlState.REGISTERING
+        self.stats.attempts += 1
+        self._opened_at = now
+        self._register_due = True
+        self._candidates_due = True
+        self._services_due = True
+        self._drain_due = self._draining
+
+    def closed(self, now: float, *, refused: bool = False) -> float:
+        """The stream ended, or never came to be; returns the seconds until the next attempt.
+
+        `refused`: by the control plane's decision, which will hardly change within a second.
+        """
+        if self.state is ControlState.ONLINE and now - self._opened_at >= STABLE_AFTER_S:
+            self._backoff.reset()
+        if refused:
+            self._backoff.exhaust()
+        if self._report is not None:
+            self.stats.reports_dropped += 1
+        self._clear_outgoing()
+        self.state = ControlState.OFFLINE
+        delay_s = self._backoff.next_delay_s()
+        self._retry_at = now + delay_s
+        return delay_s
+
+    # ── from the control plane ──
+
+    def receive(self, message: ControlMessage, now: float) -> ControlEvent | None:
+        """Take a message of the current stream; returns what the driver has to do about it."""
+        match message:
+            case Welcome():
+                return self._receive_welcome(message, now)
+            case PeerSet():
+                return self._receive_resource(ResourceKind.PEERS, message)
+            case MappingSet():
+                return self._receive_resource(ResourceKind.MAPPING, message)
+
+    def _receive_welcome(self, welcome: Welcome, now: float) -> Welcome:
+        if self.state is not ControlState.ONLINE:
+            self.stats.streams += 1
+        self.state = ControlState.ONLINE
+        self._heartbeat_interval_s = max(welcome.lease_s / HEARTBEATS_PER_LEASE, MIN_INTERVAL_S)
+        self._report_interval_s = max(welcome.report_interval_s, MIN_INTERVAL_S)
+        self._heartbeat_at = now + self._heartbeat_interval_s
+        self._report_at = now + self._report_interval_s
+        return welcome
+
+    def _receive_resource(self, resource: ResourceKind, content: PeerSet | MappingSet) -> Apply | None:
+        in_force = self._in_force[resource]
+        if content.version > in_force:
+            return Apply(resource, content)
+        if content.version == in_force:
+            self.stats.ignored[f"{resource.value}_repeated"] += 1
+            self._ack(resource, content.nonce)
+        else:
+            self.stats.ignored[f"{resource.value}_older"] += 1
+            self._nack(resource, content.nonce, f"version {content.version} is older than {in_force} in force")
+        return None
+
+    def applied(self, apply: Apply, error: str | None) -> None:
+        """The driver put the resource in force, or could not because of `error`."""
+        if error is not None:
+            self._nack(apply.resource, apply.content.nonce, error)
+            return
+        self._in_force[apply.resource] = apply.content.version
+        self._ack(apply.resource, apply.content.nonce)
+
+    def undecodable(self, resource: ResourceKind | None, nonce: int, error: str) -> None:
+        """A message broke its format; `resource` and `nonce` as far as they could be read."""
+        self.stats.ignored["undecodable"] += 1
+        if resource is not None:
+            self._nack(resource, nonce, error)
+
+    def _ack(self, resource: ResourceKind, nonce: int) -> None:
+        self.stats.acks[resource] += 1
+        self._answers[resource] = Ack(resource, self._in_force[resource], nonce)
+
+    def _nack(self, resource: ResourceKind, nonce: int, error: str) -> None:
+        self.stats.nacks[resource] += 1
+        self._answers[resource] = Nack(resource, self._in_force[resource], nonce, error)
+
+    # ── from the sidecar ──
+
+    def set_candidates(self, candidates: CandidateSet) -> None:
+        """Replace what is said of our addresses."""
+        if candidates != self._candidates:
+            self._candidates = candidates
+            self._candidates_due = self.state is not ControlState.OFFLINE
+
+    def set_services(self, services: ServiceSet) -> None:
+        """Replace what is said of our services."""
+        if services != self._services:
+            self._services = services
+            self._services_due = self.state is not ControlState.OFFLINE
+
+    def drain(self) -> None:
+        """Say goodbye, on this stream and on later ones."""
+        if not self._draining:
+            self._draining = True
+            self._drain_due = self.state is not ControlState.OFFLINE
+
+    def report_due(self, now: float) -> bool:
+        """Whether the driver is to collect a report and pass it to `send_report`."""
+        return self.state is ControlState.ONLINE and self._report is None and now >= self._report_at
+
+    def send_report(self, report: Report, now: float) -> None:
+        """Send what was measured since the last report; one that holds nothing is left out."""
+        self._report_at = now + self._report_interval_s
+        if report != _NOTHING_MEASURED and self.state is ControlState.ONLINE:
+            self._report = report
+
+    # ── time ──
+
+    def next_timer(self) -> float:
+        """When `handle_timer` (offline: a new stream) is due."""
+        match self.state:
+            case ControlState.OFFLINE:
+                return self._retry_at
+            case ControlState.REGISTERING:
+                return self._opened_at + WELCOME_TIMEOUT_S
+            case ControlState.ONLINE:
+                return min(self._heartbeat_at, self._report_at)
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due."""
+        if self.state is ControlState.ONLINE and now >= self._heartbeat_at:
+            self._heartbeat_due = True
+
+    def welcome_overdue(self, now: float) -> bool:
+        """Whether the stream is to be given up."""
+        return self.state is ControlState.REGISTERING and now >= self._opened_at + WELCOME_TIMEOUT_S
+
+    # ── to the control plane ──
+
+    def messages_to_send(self, now: float) -> list[SidecarMessage]:
+        """Return what is to be sent on the current stream, in order."""
+        messages: list[SidecarMessage] = []
+        if self._register_due:
+            messages.append(self._current_registration())
+        if self._candidates_due:
+            messages.append(self._candidates)
+        if self._services_due:
+            messages.append(self._services)
+        messages += self._answers.values()
+        if self._report is not None:
+            messages.append(self._report)
+            self.stats.reports += 1
+        if self._drain_due:
+            messages.append(Drain())
+        if self._heartbeat_due and not messages:
+            messages.append(Heartbeat())
+            self.stats.heartbeats += 1
+        if messages:
+            self._heartbeat_at = now + self._heartbeat_interval_s
+        self._clear_outgoing()
+        return messages
+
+    def _current_registration(self) -> Registration:
+        return replace(
+            self._registration,
+            peers_version=self._in_force[ResourceKind.PEERS],
+            mapping_version=self._in_force[ResourceKind.MAPPING],
+        )

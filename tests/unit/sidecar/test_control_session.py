@@ -1,0 +1,338 @@
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protos.model import (
+    PROTOCOL_VERSION,
+    Ack,
+    Candidate,
+    CandidateKind,
+    CandidateSet,
+    Drain,
+    Heartbeat,
+    InterfaceId,
+    InterfaceName,
+    MappingSet,
+    Nack,
+    NodeName,
+    OutcomeReport,
+    PeerSet,
+    Registration,
+    Report,
+    ResourceKind,
+    Role,
+    ServiceName,
+    ServiceOffer,
+    ServiceSet,
+    SessionId,
+    SidecarMessage,
+    Version,
+    Welcome,
+)
+from sidecar.core.control_session import (
+    MIN_INTERVAL_S,
+    RETRY_FIRST_S,
+    RETRY_MAX_S,
+    STABLE_AFTER_S,
+    WELCOME_TIMEOUT_S,
+    Apply,
+    ControlSession,
+    ControlState,
+)
+
+WELCOME = Welcome(lease_s=3.0, report_interval_s=0.5, stun_servers=("192.0.2.9:3478",))
+CANDIDATES = CandidateSet((Candidate(InterfaceId(0), InterfaceName("wlan0"), CandidateKind.HOST, ("192.0.2.2", 1)),))
+SERVICES = ServiceSet(offers=(ServiceOffer(ServiceName("/plan"), "nav_msgs/srv/GetPlan"),))
+REPORT = Report(outcomes=(OutcomeReport(ServiceName("/plan"), ok=3),))
+
+
+def make_session(peers: int = 0, mapping: int = 0, seed: int = 1) -> ControlSession:
+    registration = Registration(
+        PROTOCOL_VERSION,
+        NodeName("robot-1"),
+        Role.ROBOT,
+        SessionId(7),
+        bytes(16),
+        incarnation=3,
+        software_version="0",
+        peers_version=Version(peers),
+        mapping_version=Version(mapping),
+    )
+    return ControlSession(registration, random.Random(seed))
+
+
+def online(session: ControlSession, now: float = 0.0) -> ControlSession:
+    session.opened(now)
+    session.messages_to_send(now)
+    session.receive(WELCOME, now)
+    return session
+
+
+def peers(version: int, nonce: int = 1) -> PeerSet:
+    return PeerSet(Version(version), nonce)
+
+
+def mapping(version: int, nonce: int = 1) -> MappingSet:
+    return MappingSet(Version(version), nonce)
+
+
+def answer(session: ControlSession, now: float = 0.0) -> SidecarMessage:
+    (message,) = session.messages_to_send(now)
+    return message
+
+
+def test_a_stream_starts_with_the_registration_then_everything_we_are() -> None:
+    session = make_session(peers=4, mapping=5)
+    session.set_candidates(CANDIDATES)
+    session.set_services(SERVICES)
+    session.opened(0.0)
+    registration, *rest = session.messages_to_send(0.0)
+    assert isinstance(registration, Registration)
+    assert (registration.peers_version, registration.mapping_version) == (4, 5)
+    assert rest == [CANDIDATES, SERVICES]
+    assert session.messages_to_send(0.0) == []
+
+
+def test_nothing_is_sent_offline_and_the_newest_sets_on_the_next_stream() -> None:
+    session = make_session()
+    session.set_candidates(CANDIDATES)
+    assert session.messages_to_send(0.0) == []
+    session.opened(1.0)
+    assert session.messages_to_send(1.0)[1:] == [CANDIDATES, ServiceSet()]
+    session.closed(2.0)
+    session.set_services(SERVICES)
+    session.opened(3.0)
+    assert session.messages_to_send(3.0)[1:] == [CANDIDATES, SERVICES]
+
+
+def test_a_changed_set_is_sent_once_and_an_equal_one_not_at_all() -> None:
+    session = online(make_session())
+    session.set_candidates(CandidateSet())
+    assert session.messages_to_send(0.0) == []
+    session.set_candidates(CANDIDATES)
+    session.set_candidates(CANDIDATES)
+    assert session.messages_to_send(0.0) == [CANDIDATES]
+    assert session.messages_to_send(0.0) == []
+
+
+@pytest.mark.parametrize("content", [peers(9, nonce=5), mapping(9, nonce=5)])
+def test_an_applied_resource_is_acked_with_its_nonce_and_version(content: PeerSet | MappingSet) -> None:
+    session = online(make_session())
+    event = session.receive(content, 0.0)
+    assert isinstance(event, Apply)
+    assert event.content is content
+    assert session.messages_to_send(0.0) == []
+    session.applied(event, None)
+    assert answer(session) == Ack(event.resource, Version(9), 5)
+    assert session.version(event.resource) == 9
+
+
+def test_a_refused_resource_is_nacked_with_the_version_still_in_force() -> None:
+    session = online(make_session(mapping=4))
+    event = session.receive(mapping(5, nonce=8), 0.0)
+    assert isinstance(event, Apply)
+    session.applied(event, "no interface 'wwan7' here")
+    assert answer(session) == Nack(ResourceKind.MAPPING, Version(4), 8, "no interface 'wwan7' here")
+    assert session.version(ResourceKind.MAPPING) == 4
+    # The same version again, mended or not, is tried again: it was never in force.
+    assert isinstance(session.receive(mapping(5, nonce=9), 0.0), Apply)
+
+
+def test_the_version_in_force_sent_again_is_acked_without_being_applied() -> None:
+    session = online(make_session(peers=6))
+    assert session.receive(peers(6, nonce=3), 0.0) is None
+    assert answer(session) == Ack(ResourceKind.PEERS, Version(6), 3)
+
+
+def test_an_older_version_is_refused() -> None:
+    session = online(make_session(peers=6))
+    assert session.receive(peers(5, nonce=3), 0.0) is None
+    nack = answer(session)
+    assert isinstance(nack, Nack)
+    assert (nack.version, nack.nonce) == (6, 3)
+    assert "older" in nack.error
+    assert session.stats.ignored["peers_older"] == 1
+
+
+def test_only_the_newest_answer_waits_however_much_is_pushed() -> None:
+    session = online(make_session())
+    for version in range(1, 1000):
+        for content in (peers(version, nonce=version), mapping(version, nonce=version)):
+            event = session.receive(content, 0.0)
+            assert isinstance(event, Apply)
+            session.applied(event, None)
+    assert session.messages_to_send(0.0) == [
+        Ack(ResourceKind.PEERS, Version(999), 999),
+        Ack(ResourceKind.MAPPING, Version(999), 999),
+    ]
+
+
+def test_an_undecodable_resource_is_nacked_as_far_as_it_can_be_read() -> None:
+    session = online(make_session(peers=2))
+    session.undecodable(None, 0, "no known kind")
+    assert session.messages_to_send(0.0) == []
+    session.undecodable(ResourceKind.PEERS, 11, "port 0")
+    assert answer(session) == Nack(ResourceKind.PEERS, Version(2), 11, "port 0")
+
+
+def test_a_new_stream_says_what_is_held_by_now_and_forgets_old_nonces() -> None:
+    session = online(make_session())
+    event = session.receive(peers(7, nonce=4), 0.0)
+    assert isinstance(event, Apply)
+    session.applied(event, None)
+    session.closed(1.0)
+    session.opened(2.0)
+    first, *rest = session.messages_to_send(2.0)
+    assert isinstance(first, Registration)
+    assert first.peers_version == 7
+    assert not any(isinstance(message, Ack) for message in rest)
+
+
+def test_heartbeats_fill_the_silence_thrice_a_lease() -> None:
+    session = online(make_session())
+    sent: list[float] = []
+    now = 0.0
+    while now < 9.0:
+        now = session.next_timer()
+        session.handle_timer(now)
+        if session.report_due(now):
+            session.send_report(Report(), now)
+        if session.messages_to_send(now) == [Heartbeat()]:
+            sent.append(now)
+    assert sent == pytest.approx([1.0 * beat for beat in range(1, len(sent) + 1)])
+    assert len(sent) == 9
+
+
+def test_reports_come_at_their_interval_and_stand_for_heartbeats() -> None:
+    session = online(make_session())
+    sent: list[tuple[float, SidecarMessage]] = []
+    now = 0.0
+    while now < 4.9:
+        now = session.next_timer()
+        session.handle_timer(now)
+        if session.report_due(now):
+            session.send_report(REPORT, now)
+        sent += [(now, message) for message in session.messages_to_send(now)]
+    assert [at for at, _ in sent] == pytest.approx([0.5 * count for count in range(1, 11)])
+    assert {message for _, message in sent} == {REPORT}
+
+
+def test_an_absurd_welcome_cannot_make_the_sidecar_spin() -> None:
+    session = make_session()
+    session.opened(0.0)
+    session.receive(Welcome(lease_s=1e-6, report_interval_s=1e-6), 0.0)
+    assert session.next_timer() >= MIN_INTERVAL_S
+
+
+def test_no_report_is_taken_while_offline_or_registering() -> None:
+    session = make_session()
+    assert not session.report_due(100.0)
+    session.opened(0.0)
+    assert not session.report_due(100.0)
+    session.receive(WELCOME, 100.0)
+    assert not session.report_due(100.0)
+    assert session.report_due(100.5)
+
+
+def test_a_report_that_the_stream_did_not_live_to_take_is_counted() -> None:
+    session = online(make_session())
+    session.send_report(REPORT, 1.0)
+    session.closed(1.0)
+    assert session.stats.reports_dropped == 1
+    assert session.stats.reports == 0
+
+
+def test_a_stream_without_welcome_is_given_up() -> None:
+    session = make_session()
+    session.opened(10.0)
+    assert session.next_timer() == 10.0 + WELCOME_TIMEOUT_S
+    assert not session.welcome_overdue(10.0 + WELCOME_TIMEOUT_S - 0.01)
+    assert session.welcome_overdue(10.0 + WELCOME_TIMEOUT_S)
+    session.receive(WELCOME, 11.0)
+    assert not session.welcome_overdue(100.0)
+
+
+def test_goodbye_comes_last_and_is_said_again_on_a_later_stream() -> None:
+    session = online(make_session())
+    session.set_services(SERVICES)
+    session.drain()
+    session.drain()
+    assert session.messages_to_send(0.0) == [SERVICES, Drain()]
+    session.closed(0.0)
+    session.opened(1.0)
+    assert session.messages_to_send(1.0)[-1] == Drain()
+
+
+def outage(session: ControlSession, start: float, until: float) -> list[float]:
+    """Delays while no stream gets a Welcome."""
+    delays, now = [], start
+    while now < until:
+        session.opened(now)
+        delays.append(session.closed(now))
+        assert session.next_timer() == session.retry_at
+        now = session.retry_at
+    return delays
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_delays_during_an_outage_stay_within_their_bounds(seed: int) -> None:
+    delays = outage(make_session(seed=seed), 0.0, 600.0)
+    for attempt, delay in enumerate(delays):
+        assert 0.0 <= delay <= min(RETRY_FIRST_S * 2**attempt, RETRY_MAX_S)
+    # The load on a control plane that is away: about one attempt in five seconds.
+    assert 70 < len(delays) < 200
+
+
+def test_a_long_stream_resets_the_backoff_and_a_short_one_does_not() -> None:
+    assert max(delay_after_a_stream(seed, lasted=0.1) for seed in range(40)) > RETRY_FIRST_S
+    assert max(delay_after_a_stream(seed, lasted=STABLE_AFTER_S) for seed in range(40)) <= RETRY_FIRST_S
+
+
+def delay_after_a_stream(seed: int, *, lasted: float) -> float:
+    session = make_session(seed=seed)
+    outage(session, 0.0, 100.0)
+    online(session, 200.0)
+    return session.closed(200.0 + lasted)
+
+
+def test_a_refusal_is_not_repeated_at_once() -> None:
+    delays = []
+    for seed in range(40):
+        session = make_session(seed=seed)
+        session.opened(0.0)
+        delays.append(session.closed(0.0, refused=True))
+    assert max(delays) > RETRY_MAX_S / 2
+    assert max(delays) <= RETRY_MAX_S
+
+
+VERSIONS = st.integers(0, 12)
+PUSHES = st.lists(st.tuples(st.booleans(), VERSIONS, st.booleans(), st.booleans()), max_size=60)
+
+
+@given(PUSHES)
+def test_versions_in_force_only_grow_and_every_push_gets_its_answer(
+    pushes: list[tuple[bool, int, bool, bool]],
+) -> None:
+    session = online(make_session())
+    now = 0.0
+    for nonce, (is_peers, version, accept, reconnect) in enumerate(pushes, start=1):
+        now += 0.01
+        if reconnect:
+            session.closed(now)
+            online(session, now)
+        kind = ResourceKind.PEERS if is_peers else ResourceKind.MAPPING
+        before = session.version(kind)
+        event = session.receive(peers(version, nonce) if is_peers else mapping(version, nonce), now)
+        if isinstance(event, Apply):
+            assert version > before
+            session.applied(event, None if accept else "refused")
+        reply = answer(session, now)
+        assert isinstance(reply, Ack | Nack)
+        assert (reply.resource, reply.nonce) == (kind, nonce)
+        assert reply.version == session.version(kind) >= before
+        assert isinstance(reply, Ack) == (reply.version == version)
+    assert session.state is ControlState.ONLINE
