@@ -1,0 +1,1 @@
+"""Human detection as a service: people in camera frames (plr_demo_interfaces/srv/DetectPeople)."""

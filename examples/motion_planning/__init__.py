@@ -1,0 +1,1 @@
+"""Motion planning as a service: A* on a warehouse map (nav_msgs/srv/GetPlan)."""
