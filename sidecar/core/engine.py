@@ -177,12 +177,16 @@ class Engine:
                 uses.append(ServiceUse(name, kind, rule.deadline_s, rule.idempotent))
         return tuple(uses)
 
-    def set_interfaces(self, interfaces: Iterable[InterfaceName]) -> None:
+    def set_interfaces(self, interfaces: Iterable[InterfaceName], now: float) -> None:
         """The interfaces that have a link now."""
         new = set(interfaces)
-        for gone in self._interfaces - new:
-            self.routes.forget_interface(gone)
+        gone = self._interfaces - new
         self._interfaces = new
+        for interface in gone:
+            paths = self.routes.forget_interface(interface)
+            self._outbox.on_interface_gone(interface, now)
+            for path in paths:
+                self._requests.on_path_changed(path, PathState.DOWN, now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def apply_peers(self, peer_set: PeerSet, now: float) -> str | None:

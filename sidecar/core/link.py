@@ -71,7 +71,6 @@ class Link:
         self.identity = identity
         self.stats = LinkStats(identity.interface)
         self._rng = rng
-        self._peers: dict[NodeName, LinkPeer] = {}
         self._by_session: dict[SessionId, LinkPeer] = {}
         self._by_token: dict[bytes, LinkPeer] = {}
         self._paths: dict[tuple[NodeName, InterfaceId], Path] = {}
@@ -83,6 +82,7 @@ class Link:
         self._timer_of: dict[PathId, float] = {}
         self._order = count()
         self._measure_at = now + MEASURE_EVERY_S
+        self._first_number = 0
 
     # -- what the driver calls ------------------------------------------------------------------------------------
 
@@ -371,8 +371,7 @@ class Link:
         self._events.append(PathChanged(path.id, PathState.DOWN, reason))
         self._report_lost(path, path.recovery.give_up_all())
         for message in path.queue.clear():
-            missing = tuple(index for index in range(message.count) if message.needs(index))
-            self._events.append(FragmentsLost(path.id, message, missing))
+            self._events.append(FragmentsLost(path.id, message, message.missing()))
 
     def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
         by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}
@@ -424,7 +423,9 @@ class Link:
 
     def _set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> None:
         before = self._paths
-        self._peers = {peer.name: peer for peer in peers}
+        # A peer that comes back may remember our old packet numbers under the same session: never use one again.
+        used = (path.recovery.next_number for path in before.values())
+        first_number = self._first_number = max((self._first_number, *used))
         self._by_session = {peer.session: peer for peer in peers}
         self._by_token = {peer.token: peer for peer in peers}
         self._paths = {}
@@ -436,7 +437,8 @@ class Link:
                 else:
                     if path is not None:
                         before[peer.name, remote] = path
-                    path = Path(PathId(self.identity.interface, peer.name, remote), peer.session, addresses, now)
+                    path_id = PathId(self.identity.interface, peer.name, remote)
+                    path = Path(path_id, peer.session, addresses, first_number, now)
                 self._paths[peer.name, remote] = path
                 self._dirty[path.id] = path
         for path in before.values():

@@ -8,6 +8,7 @@ from sidecar.core.frame import MAX_SYMBOL_BYTES, symbol_count
 
 if TYPE_CHECKING:
     from protos.model import NodeName
+    from sidecar.core.link_events import PathId
 
 
 class OutboundMessage:
@@ -17,12 +18,12 @@ class OutboundMessage:
     that reads an old value merely sends a symbol that is no longer needed.
     """
 
-    __slots__ = ("acked", "count", "data", "deadline", "expires", "number", "over", "peer", "symbol")
+    __slots__ = ("acked", "count", "data", "deadline", "expires", "number", "over", "path", "symbol")
 
     def __init__(
         self,
         number: int,
-        peer: NodeName,
+        path: PathId,
         data: bytes,
         *,
         deadline: float,
@@ -30,7 +31,8 @@ class OutboundMessage:
         symbol: int = MAX_SYMBOL_BYTES,
     ) -> None:
         self.number = number
-        self.peer = peer
+        self.path = path
+        """Where the engine last sent it; links do not look at this."""
         self.data = memoryview(data)
         self.deadline = deadline
         self.expires = expires
@@ -39,6 +41,15 @@ class OutboundMessage:
         self.acked = bytearray(self.count)
         self.over = False
         """Delivered, cancelled or expired: nothing of it needs to travel any more."""
+
+    @property
+    def peer(self) -> NodeName:
+        """Whom it is for."""
+        return self.path.peer
+
+    def missing(self) -> tuple[int, ...]:
+        """The symbols that still have to travel."""
+        return tuple(index for index in range(self.count) if self.needs(index))
 
     def needs(self, index: int) -> bool:
         """Whether this symbol still has to travel."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.link_events import Resend, Send
+from sidecar.core.link_events import FragmentsLost, Resend, Send
 from sidecar.core.outbound import OutboundMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import NodeName
-    from sidecar.core.link_events import FragmentsLost, LinkCommand, PathId
+    from protos.model import InterfaceName, NodeName
+    from sidecar.core.link_events import LinkCommand, PathId
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
 
@@ -49,7 +49,7 @@ class Outbox:
         if not self.has_room(len(data)):
             self._stats.dropped["outbox_full"] += 1
             return None
-        message = OutboundMessage(self._next_number, path.peer, data, deadline=deadline, expires=expires)
+        message = OutboundMessage(self._next_number, path, data, deadline=deadline, expires=expires)
         self._next_number += 1
         self._messages[message.number] = message
         self._bytes += len(data)
@@ -92,14 +92,21 @@ class Outbox:
         if path is None:
             self._parked.setdefault(message.peer, {})[message.number] = message
         else:
+            message.path = path
             self._command(Resend(path, message, indices))
 
     def on_path_up(self, path: PathId) -> None:
         """Send what waited for a path to this peer."""
         for message in self._parked.pop(path.peer, {}).values():
-            missing = tuple(index for index in range(message.count) if message.needs(index))
+            missing = message.missing()
             if missing:
+                message.path = path
                 self._command(Resend(path, message, missing))
+
+    def on_interface_gone(self, interface: InterfaceName, now: float) -> None:
+        """The interface's link is gone with all it had queued: its messages take other paths."""
+        for message in [message for message in self._messages.values() if message.path.interface == interface]:
+            self.on_lost(FragmentsLost(message.path, message, message.missing(), timed_out=True), now)
 
     def expire(self, now: float) -> None:
         """Drop messages whose time is over."""

@@ -59,7 +59,9 @@ class Path:
         "window",
     )
 
-    def __init__(self, path_id: PathId, session: SessionId, candidates: tuple[Address, ...], now: float) -> None:
+    def __init__(
+        self, path_id: PathId, session: SessionId, candidates: tuple[Address, ...], first_number: int, now: float
+    ) -> None:
         self.id = path_id
         self.remote_id: InterfaceId = path_id.remote
         self.session = session
@@ -67,7 +69,7 @@ class Path:
         self.remote: Address | None = None
         """Where the newest authentic datagram came from."""
         self.state = PathState.DOWN
-        self.recovery = Recovery()
+        self.recovery = Recovery(first_number)
         self.received = ReceivedPackets()
         self.window = Window()
         self.queue = SendQueue()

@@ -49,18 +49,23 @@ class Recovery:
         "total_sent",
     )
 
-    def __init__(self) -> None:
+    def __init__(self, first_number: int) -> None:
         self.rtt = RttEstimator()
         self.sent: dict[int, Sent] = {}
         self.in_flight = 0
         self.acked_bytes = 0
-        self.largest_acked = -1
+        self.largest_acked = first_number - 1
         self.last_eliciting_at = 0.0
         self.total_sent = 0
         self.total_lost = 0
-        self._next_number = 0
+        self._next_number = first_number
         self._lost_at: float | None = None
         self._pto_count = 0
+
+    @property
+    def next_number(self) -> int:
+        """The packet number that comes next."""
+        return self._next_number
 
     def take_number(self) -> int:
         """Return the packet number of the next datagram."""
@@ -110,8 +115,6 @@ class Recovery:
     def detect_lost(self, now: float) -> list[Sent]:
         """Return what packet and time threshold call lost by now, and arm the time threshold for the rest."""
         self._lost_at = None
-        if self.largest_acked < 0:
-            return []
         delay = self.rtt.loss_delay()
         lost: list[int] = []
         for number, datagram in self.sent.items():

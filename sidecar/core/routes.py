@@ -56,11 +56,13 @@ class Routes:
         for path in self._by_peer.pop(peer, {}):
             del self._routes[path]
 
-    def forget_interface(self, interface: InterfaceName) -> None:
-        """The interface is gone."""
-        for path in [path for path in self._routes if path.interface == interface]:
+    def forget_interface(self, interface: InterfaceName) -> list[PathId]:
+        """The interface is gone; returns the paths it had."""
+        paths = [path for path in self._routes if path.interface == interface]
+        for path in paths:
             del self._routes[path]
             del self._by_peer[path.peer][path]
+        return paths
 
     def state(self, path: PathId) -> PathState:
         """Return a path's liveness; unknown paths are down."""

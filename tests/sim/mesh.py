@@ -57,7 +57,9 @@ class Wire:
 class Node:
     """One sidecar: an engine and its links, driven by the mesh."""
 
-    def __init__(self, mesh: Mesh, name: str, role: Role, interfaces: list[str], rules: tuple[ServiceRule, ...]) -> None:
+    def __init__(
+        self, mesh: Mesh, name: str, role: Role, interfaces: list[str], rules: tuple[ServiceRule, ...]
+    ) -> None:
         self.mesh = mesh
         self.name = NodeName(name)
         self.role = role
@@ -85,7 +87,7 @@ class Node:
         }
         for link in self.links.values():
             link.execute(SetReady(ready=True), now)
-        self.engine.set_interfaces(self.links)
+        self.engine.set_interfaces(self.links, now)
         self.engine.set_offers(self.offers)
         self.executed: list[RequestId | int] = []
         self.sequence = 0
@@ -133,6 +135,7 @@ class Mesh:
         self._due: list[_Due] = []
         self._order = count()
         self.version = 0
+        self.calls = 0
 
     def add(self, name: str, role: Role, interfaces: list[str], rules: tuple[ServiceRule, ...]) -> Node:
         node = self.nodes[name] = Node(self, name, role, interfaces, rules)

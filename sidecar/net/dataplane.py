@@ -1,0 +1,242 @@
+"""The data plane as the rest of the sidecar sees it: the engine behind one lock, a thread for each interface.
+
+Who waits for whom (docs/adr/0004-threads.md): an interface's thread builds, parses and sends its datagrams without
+any lock; the engine's lock is held only while tables are read and written. There is no coordinator thread: whoever
+has news for the engine (a link's thread, a ROS thread) takes the lock, tells it, and queues what comes out.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sidecar.core.engine import Engine, EngineConfig
+from sidecar.core.link_events import SendClose
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import (
+        InterfaceName,
+        MappingSet,
+        PeerSet,
+        Report,
+        ServiceMapping,
+        ServiceName,
+        ServiceOffer,
+        ServiceUse,
+        SessionId,
+    )
+    from sidecar.core.events import ExecutionId, RejectReason, RequestId
+    from sidecar.core.link_events import LinkEvent
+    from sidecar.core.stats import EngineStats, LinkStats
+    from sidecar.core.stun_events import StunEvent
+    from sidecar.net.interface_thread import InterfaceThread
+    from sidecar.ports import Application
+
+log = logging.getLogger(__name__)
+
+MAX_TIMER_SLEEP_S = 1.0
+"""The timer thread looks at least this often."""
+
+
+@dataclass(frozen=True, slots=True)
+class DataPlaneHooks:
+    """Whom the data plane tells."""
+
+    application: Application
+    stun: Callable[[InterfaceName, StunEvent], None]
+    services_changed: Callable[[], None]
+    """Offers or uses may have changed: the control plane wants to know."""
+
+
+class ThreadedDataPlane:
+    """Implements `sidecar.ports.DataPlane` and `LinkOwner`; every method may be called from any thread."""
+
+    def __init__(self, config: EngineConfig, session: SessionId, hooks: DataPlaneHooks) -> None:
+        self._session = session
+        self._hooks = hooks
+        self._clock = time.monotonic
+        self._engine = Engine(config, self._clock())
+        self._lock = threading.Lock()
+        self._links: dict[InterfaceName, InterfaceThread] = {}
+        self._wake_timer = threading.Event()
+        self._timer_due = 0.0
+        self._stopping = False
+        self._timer = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
+
+    # -- life -----------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start the timer; interfaces come by `set_links`."""
+        self._timer.start()
+
+    def set_links(self, links: dict[InterfaceName, InterfaceThread]) -> None:
+        """Use these interfaces from now on; starting and stopping their threads is the caller's."""
+        with self._lock:
+            self._links = dict(links)
+            self._engine.set_interfaces(links, self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+
+    def drain(self) -> None:
+        """Take no new requests."""
+        with self._lock:
+            self._engine.drain()
+
+    @property
+    def busy(self) -> int:
+        """Requests and messages in flight."""
+        return self._engine.busy
+
+    def stop(self) -> None:
+        """Say goodbye to the peers and end the timer; the caller stops the links after it."""
+        with self._lock:
+            links = list(self._links.values())
+        for link in links:
+            link.post(SendClose())
+            link.wake()
+        self._stopping = True
+        self._wake_timer.set()
+        self._timer.join(2.0)
+
+    # -- sidecar.ports.DataPlane ----------------------------------------------------------------------------------
+
+    @property
+    def session(self) -> SessionId:
+        """This run's session."""
+        return self._session
+
+    def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
+        """Robot: send a serialised request."""
+        with self._lock:
+            self._engine.submit(request_id, service, payload, self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+
+    def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
+        """Cloud: the local server answered."""
+        with self._lock:
+            self._engine.complete(execution, payload, processing_s, self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+
+    def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str) -> None:
+        """Cloud: the request was not or will not be answered."""
+        with self._lock:
+            self._engine.refuse(execution, reason, detail, self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+
+    def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
+        """Cloud: the services that local servers offer right now."""
+        with self._lock:
+            self._engine.set_offers(offers)
+        self._hooks.services_changed()
+
+    def set_carried(self, services: frozenset[ServiceName]) -> None:
+        """Robot: the proxied services that exist right now."""
+        with self._lock:
+            self._engine.set_carried(services)
+        self._hooks.services_changed()
+
+    # -- the control client ---------------------------------------------------------------------------------------
+
+    def services(self) -> tuple[tuple[ServiceOffer, ...], tuple[ServiceUse, ...]]:
+        """Return what is offered and what is carried right now."""
+        with self._lock:
+            return self._engine.offers(), self._engine.uses()
+
+    def apply_peers(self, peer_set: PeerSet) -> str | None:
+        """Take a view of the peers; returns why it is refused, or None."""
+        with self._lock:
+            error = self._engine.apply_peers(peer_set, self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+        return error
+
+    def apply_mapping(self, mapping: MappingSet) -> str | None:
+        """Take a mapping; returns why it is refused, or None."""
+        with self._lock:
+            return self._engine.apply_mapping(mapping)
+
+    def take_report(self) -> Report:
+        """Return what was measured since the last call."""
+        with self._lock:
+            return self._engine.take_report()
+
+    # -- what metrics and status read -----------------------------------------------------------------------------
+
+    @property
+    def engine_stats(self) -> EngineStats:
+        """The requests' counters."""
+        return self._engine.stats
+
+    def link_stats(self) -> list[LinkStats]:
+        """The interfaces' counters."""
+        return [link.link.stats for link in list(self._links.values())]
+
+    @property
+    def service_mappings(self) -> tuple[ServiceMapping, ...]:
+        """The mapping in force."""
+        with self._lock:
+            return self._engine.service_mappings
+
+    # -- LinkOwner ------------------------------------------------------------------------------------------------
+
+    def on_link_events(self, events: list[LinkEvent]) -> None:
+        """Take what a link saw."""
+        now = self._clock()
+        engine = self._engine
+        with self._lock:
+            for event in events:
+                engine.on_link_event(event, now)
+            woken = self._queue_outputs()
+        self._wake(woken)
+
+    def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
+        """Take what STUN found."""
+        self._hooks.stun(interface, event)
+
+    # -- under the lock -------------------------------------------------------------------------------------------
+
+    def _queue_outputs(self) -> set[InterfaceThread]:
+        """Queue commands to links and events to the application, in order; returns the links to wake."""
+        woken: set[InterfaceThread] = set()
+        for interface, command in self._engine.take_commands():
+            for link in self._links_for(interface):
+                link.post(command)
+                woken.add(link)
+        for event in self._engine.take_events():
+            self._hooks.application.handle(event)
+        due = self._engine.next_timer()
+        if due < self._timer_due:
+            self._timer_due = due
+            self._wake_timer.set()
+        return woken
+
+    def _links_for(self, interface: InterfaceName | None) -> list[InterfaceThread]:
+        if interface is None:
+            return list(self._links.values())
+        link = self._links.get(interface)
+        return [] if link is None else [link]
+
+    @staticmethod
+    def _wake(links: set[InterfaceThread]) -> None:
+        for link in links:
+            link.wake()
+
+    # -- the timer's thread ---------------------------------------------------------------------------------------
+
+    def _run_timer(self) -> None:
+        while not self._stopping:
+            with self._lock:
+                self._wake_timer.clear()
+                self._engine.handle_timer(self._clock())
+                woken = self._queue_outputs()
+                self._timer_due = self._engine.next_timer()
+            self._wake(woken)
+            self._wake_timer.wait(min(max(0.0, self._timer_due - self._clock()), MAX_TIMER_SLEEP_S))
