@@ -1,0 +1,213 @@
+"""The files of deploy/: systemd and promtool accept them, the examples load, and only metrics that exist are used."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import yaml
+
+from protos.model import Role
+from sidecar.config import load_config
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+DEPLOY = Path(__file__).parents[2] / "deploy"
+UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
+DASHBOARDS = sorted((DEPLOY / "grafana").glob("*.json"))
+RULES = DEPLOY / "prometheus" / "plr-rules.yml"
+
+MAX_EXPOSURE_TENTHS = 20
+"""systemd-analyze's scale of 0 to 10.0, in tenths: a service without any hardening has 96."""
+
+CONTRACT: dict[str, set[str]] = {
+    "plr_requests_total": {"service", "outcome"},
+    "plr_request_duration_seconds": {"service"},
+    "plr_path_rtt_seconds": {"interface", "peer"},
+    "plr_path_up": {"interface", "peer"},
+    "plr_path_wins_total": {"interface", "peer", "service"},
+    "plr_duplicate_responses_total": set(),
+    "plr_datagrams_total": {"interface", "direction", "kind"},
+    "plr_datagrams_dropped_total": {"interface", "reason"},
+    "plr_bytes_total": {"interface", "direction"},
+    "plr_mapping_version": set(),
+    "plr_nacks_total": set(),
+    "plr_predicted_miss_probability": {"robot", "service"},
+    "plr_observed_miss_ratio": {"robot", "service"},
+    "plr_solve_duration_seconds": set(),
+    "plr_connected_sidecars": set(),
+}
+"""The metrics that users may rely on, with their labels."""
+
+SCRAPE_LABELS = {"instance", "job", "le"}
+"""Labels that Prometheus itself and histograms add."""
+
+
+def run(*command: str | Path, cwd: Path | None = None) -> str:
+    """Output of a command that must succeed."""
+    assert shutil.which(str(command[0])), f"{command[0]} is missing: run deploy/dev/setup.sh"
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture
+def host(tmp_path: Path) -> Path:
+    """Root of a host that has Debian's units, ours, and programs at the paths that ours name."""
+    shutil.copytree("/usr/lib/systemd/system", tmp_path / "usr/lib/systemd/system", symlinks=True)
+    (tmp_path / "lib").symlink_to("usr/lib")
+    etc = tmp_path / "etc/systemd/system"
+    etc.mkdir(parents=True)
+    for unit in UNITS:
+        shutil.copy(unit, etc)
+        program = re.search(r"^ExecStart=(\S+)", unit.read_text(), re.MULTILINE)
+        assert program
+        path = tmp_path / program[1].lstrip("/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch(mode=0o755)
+    return tmp_path
+
+
+def test_there_is_a_unit_for_each_program() -> None:
+    assert [unit.name for unit in UNITS] == ["plr-controlplane.service", "plr-sidecar.service"]
+
+
+def test_systemd_understands_the_units(host: Path) -> None:
+    names = [unit.name for unit in UNITS]
+    # An unknown key is only warned of, hence the empty output.
+    assert run("systemd-analyze", "verify", "--man=no", f"--root={host}", *names) == ""
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
+def test_the_units_expose_little(unit: Path) -> None:
+    run("systemd-analyze", "security", "--offline=true", f"--threshold={MAX_EXPOSURE_TENTHS}", "--no-pager", unit)
+
+
+def settings(unit: str, key: str) -> list[str]:
+    text = (DEPLOY / "systemd" / f"{unit}.service").read_text()
+    return re.findall(rf"^{key}=(.*)$", text, re.MULTILINE)
+
+
+def test_only_the_sidecar_has_a_capability_and_only_that_one() -> None:
+    for key in ("AmbientCapabilities", "CapabilityBoundingSet"):
+        assert settings("plr-sidecar", key) == ["CAP_NET_RAW"]
+        assert settings("plr-controlplane", key) == [""]
+
+
+@pytest.mark.parametrize("unit", [unit.stem for unit in UNITS])
+def test_the_units_restart_on_failure_but_not_on_a_wrong_configuration(unit: str) -> None:
+    assert settings(unit, "Type") == ["notify"]
+    assert settings(unit, "Restart") == ["on-failure"]
+    assert settings(unit, "RestartPreventExitStatus") == ["2"]
+    assert settings(unit, "StartLimitIntervalSec") == ["0"]
+
+
+def test_the_account_of_the_units_is_made(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    run("systemd-sysusers", f"--root={tmp_path}", DEPLOY / "sysusers.d" / "plr.conf")
+    accounts = [line.split(":")[0] for line in (tmp_path / "etc/passwd").read_text().splitlines()]
+    assert accounts == ["plr"]
+    for unit in UNITS:
+        assert settings(unit.stem, "User") == accounts
+
+
+@pytest.mark.parametrize("role", list(Role))
+def test_the_example_configurations_of_the_sidecar_load(role: Role) -> None:
+    config = load_config(DEPLOY / "config" / f"sidecar-{role.value}.yaml")
+    assert config.role is role
+    # Where the unit lets the sidecar write.
+    assert config.state_dir == Path("/var/lib") / settings("plr-sidecar", "StateDirectory")[0]
+
+
+def test_prometheus_accepts_its_configuration() -> None:
+    output = run("promtool", "check", "config", "prometheus.yml", cwd=DEPLOY / "prometheus")
+    assert "1 rule files found" in output
+
+
+def test_each_alert_fires_when_it_should_and_only_then() -> None:
+    tests = Path(__file__).with_name("plr_rules_test.yml")
+    run("promtool", "test", "rules", tests.name, cwd=tests.parent)
+    cases = yaml.safe_load(tests.read_text())["tests"]
+    fired = {rule["alertname"] for case in cases for rule in case["alert_rule_test"] if rule.get("exp_alerts")}
+    assert fired == {rule["alert"] for rule in rules()}
+
+
+def rules() -> list[dict[str, Any]]:
+    return [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]
+
+
+def panels(dashboard: Path) -> Iterator[dict[str, Any]]:
+    for panel in json.loads(dashboard.read_text())["panels"]:
+        yield from panel.get("panels", ())
+        if panel["type"] != "row":
+            yield panel
+
+
+def dashboard_expressions(dashboard: Path) -> list[str]:
+    return [target["expr"] for panel in panels(dashboard) for target in panel["targets"]]
+
+
+def expressions() -> list[str]:
+    return [rule["expr"] for rule in rules()] + [e for path in DASHBOARDS for e in dashboard_expressions(path)]
+
+
+def family(name: str) -> str:
+    """Name of the metric that a series belongs to."""
+    stripped = re.sub(r"_(bucket|sum|count)$", "", name)
+    return stripped if stripped in CONTRACT else name
+
+
+@pytest.mark.parametrize("expression", expressions())
+def test_expressions_use_only_metrics_and_labels_of_the_contract(expression: str) -> None:
+    names = {family(name) for name in re.findall(r"\bplr_\w+", expression)}
+    assert names <= CONTRACT.keys()
+    known = SCRAPE_LABELS.union(*(CONTRACT[name] for name in names))
+    compared = re.findall(r'(\w+)\s*(?:=~|!~|!=|=)\s*"', expression)
+    grouped = [
+        label for labels in re.findall(r"\b(?:by|on|without)\s*\(([^)]*)\)", expression) for label in labels.split(",")
+    ]
+    assert {label.strip() for label in compared + grouped if label.strip()} <= known
+
+
+def test_the_dashboards_show_every_metric_of_the_contract() -> None:
+    shown = {family(name) for e in expressions() for name in re.findall(r"\bplr_\w+", e)}
+    assert shown == CONTRACT.keys()
+
+
+@pytest.mark.parametrize("dashboard", DASHBOARDS, ids=lambda path: path.stem)
+def test_prometheus_understands_the_expressions_of_the_dashboards(dashboard: Path, tmp_path: Path) -> None:
+    variables = {"$__rate_interval": "1m", "$__range": "1h", "$instance": ".*", "$service": ".*"}
+    records = []
+    for number, expression in enumerate(dashboard_expressions(dashboard)):
+        for variable, value in variables.items():
+            expression = expression.replace(variable, value)
+        assert "$" not in expression
+        records.append({"record": f"panel:{number}", "expr": expression})
+    assert records
+    file = tmp_path / "rules.yml"
+    file.write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": records}]}))
+    run("promtool", "check", "rules", file)
+
+
+@pytest.mark.parametrize("dashboard", DASHBOARDS, ids=lambda path: path.stem)
+def test_the_dashboards_are_laid_out_without_overlap(dashboard: Path) -> None:
+    taken: set[tuple[int, int]] = set()
+    identities = []
+    for panel in json.loads(dashboard.read_text())["panels"]:
+        identities.append(panel["id"])
+        place = panel["gridPos"]
+        cells = {
+            (x, y)
+            for x in range(place["x"], place["x"] + place["w"])
+            for y in range(place["y"], place["y"] + place["h"])
+        }
+        assert not cells & taken, panel["title"]
+        assert max(x for x, _ in cells) < 24, "Grafana's grid has 24 columns"
+        taken |= cells
+    assert len(set(identities)) == len(identities)
