@@ -1,0 +1,193 @@
+"""The ROS bridge: between the local ROS graph and the data plane.
+
+One thread, `plr-ros`, owns everything of ROS: it waits for requests and answers, takes, serialises and passes them on,
+and it deserialises and sends what the data plane hands over. `handle` only queues an event and wakes that thread.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Protocol
+
+from protos.model import Role
+from sidecar.core.events import ExecuteRequest, RejectReason
+from sidecar.ros import graph
+from sidecar.ros.cloud_side import CloudSide
+from sidecar.ros.graph import sidecar_node_name
+from sidecar.ros.log_limit import LimitedLog
+from sidecar.ros.robot_side import RobotSide
+from sidecar.ros.ros_loop import RosLoop
+from sidecar.ros.stats import BridgeStats
+
+if TYPE_CHECKING:
+    from protos.model import ServiceName
+    from sidecar.core.events import ApplicationEvent, ExecutionId
+    from sidecar.core.rules import ServiceRule
+    from sidecar.ports import Application, DataPlane
+
+MAX_QUEUED_EVENTS = 4096
+"""With so many events unseen by the ROS thread, further requests of robots are refused as OVERLOADED. The other kinds
+are bounded by the requests and executions that the bridge itself has pending."""
+STOP_TIMEOUT_S = 5.0
+"""Destroying some hundred DDS endpoints takes less than a second."""
+_ERROR_PAUSE_S = 0.1
+"""After a failure of the wait itself, so that a broken rmw does not burn a core."""
+
+log = logging.getLogger(__name__)
+
+
+class _Side(Protocol):
+    """What RobotSide and CloudSide have in common."""
+
+    @property
+    def scan_period_s(self) -> float: ...
+    def handle(self, event: ApplicationEvent, now: float) -> None: ...
+    def look(self, now: float) -> None: ...
+    def next_due(self) -> float | None: ...
+    def on_timer(self, now: float) -> None: ...
+    def close(self) -> None: ...
+
+
+class RosBridge:
+    """The application side of a sidecar: proxies services on a robot, runs requests in the cloud."""
+
+    def __init__(self, *, name: str, role: Role, rules: tuple[ServiceRule, ...], domain_id: int | None = None) -> None:
+        """`name` is the sidecar's; `domain_id` None takes ROS_DOMAIN_ID from the environment as every node does."""
+        self.name = name
+        self.role = role
+        self.stats = BridgeStats()
+        self._rules = rules
+        self._domain_id = domain_id
+        self._events: deque[ApplicationEvent] = deque()
+        self._refused_unseen: deque[tuple[ExecutionId, ServiceName]] = deque()
+        self._stopping = False
+        self._loop: RosLoop | None = None
+        self._thread: threading.Thread | None = None
+        self._limited = LimitedLog(log)
+
+    @property
+    def alive(self) -> bool:
+        """True while the ROS thread runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self, data_plane: DataPlane) -> None:
+        """Join the ROS domain and begin; raises rclpy's RCLError when rmw cannot start."""
+        if self._thread is not None:
+            raise RuntimeError("the bridge was started before")
+        loop = RosLoop(sidecar_node_name(self.name), self._domain_id)
+        try:
+            side = self._make_side(loop, data_plane)
+        except BaseException:
+            loop.close()
+            raise
+        self._loop = loop
+        self._thread = threading.Thread(target=self._run, args=(loop, side, data_plane), name="plr-ros", daemon=True)
+        log.info("in ROS domain %d as %s", loop.domain_id, loop.node.get_fully_qualified_name())
+        self._thread.start()
+
+    def stop(self, timeout: float = STOP_TIMEOUT_S) -> bool:
+        """Withdraw everything and leave the domain; True when that was done within `timeout` seconds."""
+        self._stopping = True
+        if self._loop is not None:
+            self._loop.wake()
+        if self._thread is None:
+            return True
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            log.error("the ROS thread did not end within %.1f s", timeout)
+            return False
+        return True
+
+    def handle(self, event: ApplicationEvent) -> None:
+        """Queue an event for the ROS thread; from any thread, never blocks."""
+        if isinstance(event, ExecuteRequest) and len(self._events) >= MAX_QUEUED_EVENTS:
+            # Refused from the ROS thread: the caller may hold the data plane's lock.
+            self._refused_unseen.append((event.execution, event.service))
+        else:
+            self._events.append(event)
+        loop = self._loop
+        if loop is not None and not self._stopping:
+            loop.wake()
+
+    # -- the ROS thread --------------------------------------------------------------------------------------------
+
+    def _make_side(self, loop: RosLoop, data_plane: DataPlane) -> _Side:
+        if self.role is Role.ROBOT:
+            return RobotSide(
+                loop=loop,
+                name=self.name,
+                rules=self._rules,
+                data_plane=data_plane,
+                stats=self.stats,
+                limited_log=self._limited,
+            )
+        return CloudSide(
+            loop=loop, rules=self._rules, data_plane=data_plane, stats=self.stats, limited_log=self._limited
+        )
+
+    def _run(self, loop: RosLoop, side: _Side, data_plane: DataPlane) -> None:
+        look_at = time.monotonic()
+        while not self._stopping:
+            try:
+                now = time.monotonic()
+                if now >= look_at:
+                    look_at = now + graph.SCAN_PERIOD_S
+                    side.look(now)
+                    look_at = now + side.scan_period_s
+                due = side.next_due()
+                until = look_at if due is None else min(look_at, due)
+                ready = loop.wait(until - time.monotonic())
+            # A wait or a look that failed is tried again; requests at the servers and answers stay as they are.
+            except Exception:
+                self._note_error("wait", time.monotonic())
+                time.sleep(_ERROR_PAUSE_S)
+                continue
+            now = time.monotonic()
+            self._drain(side, data_plane, now)
+            for entity in ready:
+                try:
+                    entity.take(now)
+                except Exception:
+                    self._note_error("take", now)
+            try:
+                side.on_timer(now)
+            except Exception:
+                self._note_error("timer", now)
+        try:
+            self._refuse_queued(data_plane)
+            side.close()
+        finally:
+            loop.close()
+
+    def _drain(self, side: _Side, data_plane: DataPlane, now: float) -> None:
+        events = self._events
+        while events:
+            event = events.popleft()
+            try:
+                side.handle(event, now)
+            # Whatever one event does wrong, the others go on.
+            except Exception:
+                self._note_error("event", now)
+        while self._refused_unseen:
+            execution, service = self._refused_unseen.popleft()
+            self.stats.refused[service, "overloaded"] += 1
+            data_plane.refuse(execution, RejectReason.OVERLOADED, "too many requests at once")
+
+    def _refuse_queued(self, data_plane: DataPlane) -> None:
+        while self._events:
+            event = self._events.popleft()
+            if isinstance(event, ExecuteRequest):
+                self.stats.refused[event.service, "draining"] += 1
+                data_plane.refuse(event.execution, RejectReason.DRAINING, "the sidecar is going away")
+
+    def _note_error(self, where: str, now: float) -> None:
+        self.stats.errors[where] += 1
+        self._limited.log(logging.ERROR, ("error", where), now, "error in the ROS thread (%s)", where, exc_info=True)
+
+
+def _assert_protocol(bridge: RosBridge) -> Application:
+    """Lets the type checker compare RosBridge with the seam."""
+    return bridge

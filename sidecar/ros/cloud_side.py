@@ -1,0 +1,274 @@
+"""Cloud: which local services are offered to robots, and their requests at the local servers."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from protos.model import ServiceOffer
+from sidecar.core.events import AbandonExecution, ExecuteRequest, RejectReason
+from sidecar.core.rules import find_rule
+from sidecar.ros import graph
+from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.service_runner import Execution, ServiceRunner
+from sidecar.ros.types import TypeNotInstalledError, deserialize, load_service_type
+
+if TYPE_CHECKING:
+    from protos.model import ServiceName
+    from sidecar.core.events import ApplicationEvent, ExecutionId
+    from sidecar.core.rules import ServiceRule
+    from sidecar.ports import DataPlane
+    from sidecar.ros.log_limit import LimitedLog
+    from sidecar.ros.ros_loop import RosLoop
+    from sidecar.ros.stats import BridgeStats
+
+MAX_EXECUTIONS = 4096
+"""Requests at local servers or waiting for them; more are refused as OVERLOADED, so that another server runs them."""
+MAX_CARRIED_SERVICES = 512
+"""Services of the local graph that are offered; each costs DDS endpoints and a slot in every wait."""
+TYPE_RETRY_S = 30.0
+"""How often a type that is not installed is looked for again: someone may be installing it."""
+
+log = logging.getLogger(__name__)
+
+
+class CloudSide:
+    """Offers local services to robots and runs their requests on the local servers."""
+
+    def __init__(
+        self,
+        *,
+        loop: RosLoop,
+        rules: tuple[ServiceRule, ...],
+        data_plane: DataPlane,
+        stats: BridgeStats,
+        limited_log: LimitedLog,
+    ) -> None:
+        self._loop = loop
+        self._rules = rules
+        self._data_plane = data_plane
+        self._stats = stats
+        self._limited = limited_log
+        self._runners: dict[ServiceName, ServiceRunner] = {}
+        self._executions: dict[ExecutionId, tuple[ServiceRunner, Execution]] = {}
+        self._offers: tuple[ServiceOffer, ...] = ()
+        self._missing_types: dict[ServiceName, str] = {}
+        self._types_retried_at = 0.0
+        self._settling = False
+        self._paced: set[ServiceRunner] = set()
+        """Runners with requests that wait for room at their server."""
+
+    # -- what the data plane says ------------------------------------------------------------------------------
+
+    def handle(self, event: ApplicationEvent, now: float) -> None:
+        """Act on one event of the data plane."""
+        match event:
+            case ExecuteRequest():
+                self._execute(event, now)
+            case AbandonExecution():
+                self._abandon(event)
+            case _:
+                self._stats.dropped["event_for_other_role"] += 1
+
+    def _execute(self, event: ExecuteRequest, now: float) -> None:
+        runner = self._runners.get(event.service)
+        if runner is None:
+            self.refuse(event, RejectReason.NOT_OFFERED, "no local server", now)
+            return
+        if runner.type.name != event.type:
+            self.refuse(event, RejectReason.WRONG_TYPE, f"the type here is {runner.type.name}", now)
+            return
+        if len(self._executions) >= MAX_EXECUTIONS:
+            self.refuse(event, RejectReason.OVERLOADED, f"{MAX_EXECUTIONS} requests are running", now)
+            return
+        try:
+            request = deserialize(event.payload, runner.type.request)
+        except RosBridgeError as error:
+            self.refuse(event, RejectReason.BAD_PAYLOAD, str(error), now)
+            return
+        execution = Execution(event.execution, request, now, now + event.expires_s)
+        self._executions[event.execution] = (runner, execution)
+        self._stats.pending = len(self._executions)
+        if not runner.add(execution, now):
+            self._stats.requests_paced += 1
+            self._paced.add(runner)
+        self._stats.requests_sent[event.service] += 1
+
+    def refuse(self, event: ExecuteRequest, reason: RejectReason, detail: str, now: float) -> None:
+        """Tell the data plane that `event` was not run."""
+        self._stats.refused[event.service, reason.name.lower()] += 1
+        self._limited.log(
+            logging.WARNING,
+            (reason.name, event.service),
+            now,
+            "%s: request of %s refused, %s: %s",
+            event.service,
+            event.robot,
+            reason.name.lower(),
+            detail,
+        )
+        self._data_plane.refuse(event.execution, reason, detail)
+
+    def _abandon(self, event: AbandonExecution) -> None:
+        known = self._executions.pop(event.execution, None)
+        if known is None:
+            self._stats.dropped["abandon_without_execution"] += 1
+            return
+        runner, execution = known
+        runner.abandon(execution)
+        self._stats.abandoned[runner.name] += 1
+        self._stats.pending = len(self._executions)
+
+    # -- what the local servers answer -----------------------------------------------------------------------------
+
+    def _answered(
+        self, runner: ServiceRunner, execution: Execution, payload: bytes | RosBridgeError, now: float
+    ) -> None:
+        self._executions.pop(execution.id, None)
+        self._stats.pending = len(self._executions)
+        self._stats.answers_taken[runner.name] += 1
+        if isinstance(payload, RosBridgeError):
+            self._refuse_executions([execution], runner.name, RejectReason.SERVER_LOST, str(payload))
+            return
+        self._data_plane.complete(execution.id, payload, now - execution.arrived_at)
+
+    def _stray(self, _runner: ServiceRunner) -> None:
+        """An answer to an abandoned request, or a second answer because two nodes serve one name."""
+        self._stats.dropped["answer_without_execution"] += 1
+
+    # -- what the graph shows ------------------------------------------------------------------------------------
+
+    @property
+    def scan_period_s(self) -> float:
+        """Seconds until the graph should be looked at again."""
+        return graph.SETTLING_PERIOD_S if self._settling else graph.SCAN_PERIOD_S
+
+    def look(self, now: float) -> None:
+        """Compare the graph with the clients; tell the data plane what is offered from now on."""
+        served = graph.scan(self._loop.node)
+        self._stats.scans += 1
+        retry_types = now - self._types_retried_at >= TYPE_RETRY_S
+        if retry_types:
+            self._types_retried_at = now
+        wanted = self._wanted(served)
+        for name in [name for name, runner in self._runners.items() if wanted.get(name) != runner.type.name]:
+            self._close_runner(name, "its server is gone")
+        for name in [name for name, kind in self._missing_types.items() if wanted.get(name) != kind]:
+            del self._missing_types[name]
+        for name, type_name in wanted.items():
+            runner = self._runners.get(name)
+            if runner is not None:
+                self._notice_restart(runner)
+            elif retry_types or name not in self._missing_types:
+                self._open_runner(name, type_name)
+        self._publish_state()
+
+    def _wanted(self, served: dict[ServiceName, graph.Served]) -> dict[ServiceName, str]:
+        """Return name -> type of the services that applications serve here and a rule carries."""
+        wanted: dict[ServiceName, str] = {}
+        for name, service in served.items():
+            types = service.applications()
+            if not types or find_rule(self._rules, name) is None:
+                continue
+            runner = self._runners.get(name)
+            # Two types under one name: the one in use stays, else the choice is at least the same every time.
+            wanted[name] = runner.type.name if runner is not None and runner.type.name in types else min(types)
+        return wanted
+
+    def _notice_restart(self, runner: ServiceRunner) -> None:
+        """A server that went and came back between two looks will not answer what the old one was asked."""
+        endpoints = graph.server_endpoints(self._loop.node, runner.name)
+        if endpoints and runner.endpoints and not endpoints & runner.endpoints:
+            log.warning("service %s: its server was replaced by another", runner.name)
+            self._give_up_executions(runner, "the server was replaced")
+        if endpoints:
+            runner.endpoints = endpoints
+
+    def _open_runner(self, name: ServiceName, type_name: str) -> None:
+        if len(self._runners) >= MAX_CARRIED_SERVICES:
+            self._stats.dropped["too_many_services"] += 1
+            return
+        try:
+            runner = ServiceRunner(self._loop.node, name, load_service_type(type_name), self._answered, self._stray)
+        except RosBridgeError as error:
+            if name not in self._missing_types:
+                self._missing_types[name] = type_name
+                kind = "type_not_installed" if isinstance(error, TypeNotInstalledError) else "service_refused"
+                self._stats.errors[kind] += 1
+                log.error("service %s is not offered to robots: %s", name, error)
+            return
+        self._missing_types.pop(name, None)
+        runner.endpoints = graph.server_endpoints(self._loop.node, name)
+        self._runners[name] = runner
+        self._loop.set_clients(tuple(self._runners.values()))
+
+    def _close_runner(self, name: ServiceName, why: str) -> None:
+        runner = self._runners.pop(name)
+        self._loop.set_clients(tuple(self._runners.values()))
+        self._give_up_executions(runner, why)
+        runner.close()
+        log.info("service %s is no longer offered to robots: %s", name, why)
+
+    def _give_up_executions(self, runner: ServiceRunner, why: str) -> None:
+        sent, unsent = runner.take_back()
+        self._paced.discard(runner)
+        self._refuse_executions(sent, runner.name, RejectReason.SERVER_LOST, why)
+        self._refuse_executions(unsent, runner.name, RejectReason.NOT_OFFERED, why)
+
+    def _refuse_executions(
+        self, executions: list[Execution], service: ServiceName, reason: RejectReason, detail: str
+    ) -> None:
+        for execution in executions:
+            self._executions.pop(execution.id, None)
+            self._stats.refused[service, reason.name.lower()] += 1
+            self._data_plane.refuse(execution.id, reason, detail)
+        self._stats.pending = len(self._executions)
+
+    def _publish_state(self) -> None:
+        matched = {name: runner for name, runner in self._runners.items() if runner.is_matched()}
+        self._settling = len(matched) < len(self._runners)
+        self._stats.missing_types = dict(self._missing_types)
+        offers = tuple(
+            ServiceOffer(name, runner.type.name, rule.capacity)
+            for name, runner in sorted(matched.items())
+            if (rule := find_rule(self._rules, name)) is not None
+        )
+        if offers == self._offers:
+            return
+        for offer in set(offers) - set(self._offers):
+            log.info("service %s (%s) is offered to robots", offer.name, offer.type)
+        self._offers = offers
+        self._stats.carried = frozenset(offer.name for offer in offers)
+        self._data_plane.set_offers(offers)
+
+    # -- time ----------------------------------------------------------------------------------------------------
+
+    def next_due(self) -> float | None:
+        """Return when `on_timer` has something to do, or None."""
+        if not self._paced:
+            return None
+        dues = [due for runner in self._paced if (due := runner.window.next_due()) is not None]
+        return min(dues, default=None)
+
+    def on_timer(self, now: float) -> None:
+        """Send the requests that waited long enough for a server that answers nothing."""
+        for runner in tuple(self._paced):
+            due = runner.window.next_due()
+            if due is None:
+                self._paced.discard(runner)
+            elif due <= now:
+                runner.release(now)
+
+    def close(self) -> None:
+        """Offer nothing any more and refuse what is running."""
+        self._offers = ()
+        self._stats.carried = frozenset()
+        self._data_plane.set_offers(())
+        for name in tuple(self._runners):
+            runner = self._runners.pop(name)
+            sent, unsent = runner.take_back()
+            # Those at the server may have run; the rest another server may run.
+            self._refuse_executions(sent, name, RejectReason.SERVER_LOST, "the sidecar is going away")
+            self._refuse_executions(unsent, name, RejectReason.DRAINING, "the sidecar is going away")
+            runner.close()
+        self._loop.set_clients(())

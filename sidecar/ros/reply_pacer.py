@@ -1,0 +1,97 @@
+"""Answers to one client, no faster than an ordinary client can take them.
+
+A ROS client made with the default profile keeps the last 10 answers it has not looked at yet; the 11th pushes the
+first one out, and that call never returns. A network that was dark hands over many answers at once, so each client
+gets a few at once and the rest spaced (docs/adr/ros-bridge.md has the figures). A client that asks one thing at a
+time is never held back: each of its requests earns an answer.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+BURST_ANSWERS = 8
+"""Below rmw's default depth of 10, so that a few answers may still lie unread."""
+SPACING_S = 0.001
+"""Several times what an rclpy client spends on an answer (0.15 to 0.3 ms)."""
+MAX_CLIENTS = 1024
+"""Clients remembered; the one quiet for longest is forgotten, and begins again with a full allowance."""
+
+T = TypeVar("T")
+
+
+@dataclass(slots=True)
+class _Client(Generic[T]):
+    tokens: float
+    updated_at: float
+    waiting: deque[T] = field(default_factory=deque)
+
+
+class ReplyPacer(Generic[T]):
+    """A token bucket per client (writer guid). Holds no more answers than there are requests pending."""
+
+    __slots__ = ("_burst", "_clients", "_spacing_s", "_waiting", "queued")
+
+    def __init__(self, burst: int = BURST_ANSWERS, spacing_s: float = SPACING_S) -> None:
+        self._burst = float(burst)
+        self._spacing_s = spacing_s
+        self._clients: dict[bytes, _Client[T]] = {}
+        self._waiting: dict[bytes, _Client[T]] = {}
+        self.queued = 0
+
+    def request_taken(self, client: bytes, now: float) -> None:
+        """A request of `client` arrived: it may be answered without a wait."""
+        state = self._refreshed(client, now)
+        state.tokens = min(self._burst, state.tokens + 1.0)
+
+    def offer(self, client: bytes, reply: T, now: float) -> bool:
+        """Return True when `reply` may go now; otherwise it is kept for `take_due`."""
+        state = self._refreshed(client, now)
+        if state.waiting or state.tokens < 1.0:
+            state.waiting.append(reply)
+            self._waiting[client] = state
+            self.queued += 1
+            return False
+        state.tokens -= 1.0
+        return True
+
+    def take_due(self, now: float) -> list[T]:
+        """Return the kept answers whose time has come, oldest first for each client."""
+        due: list[T] = []
+        for client in list(self._waiting):
+            state = self._refreshed(client, now)
+            while state.waiting and state.tokens >= 1.0:
+                state.tokens -= 1.0
+                due.append(state.waiting.popleft())
+            if not state.waiting:
+                del self._waiting[client]
+        self.queued -= len(due)
+        return due
+
+    def next_due(self) -> float | None:
+        """Return when `take_due` has something to give, or None."""
+        if not self._waiting:
+            return None
+        return min(
+            state.updated_at + max(0.0, 1.0 - state.tokens) * self._spacing_s for state in self._waiting.values()
+        )
+
+    def _refreshed(self, client: bytes, now: float) -> _Client[T]:
+        state = self._clients.pop(client, None)  # moved to the end: the first is the one quiet for longest
+        if state is None:
+            state = _Client(self._burst, now)
+            if len(self._clients) >= MAX_CLIENTS:
+                self._forget_quietest()
+        self._clients[client] = state
+        if now > state.updated_at:
+            state.tokens = min(self._burst, state.tokens + (now - state.updated_at) / self._spacing_s)
+            state.updated_at = now
+        return state
+
+    def _forget_quietest(self) -> None:
+        for client, state in self._clients.items():
+            if not state.waiting:
+                del self._clients[client]
+                return

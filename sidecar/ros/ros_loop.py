@@ -1,0 +1,124 @@
+"""The sidecar's ROS node and a small loop that waits on its entities: one thread owns everything of ROS.
+
+rclpy's own executors are not used: the standard ones build their lists anew in Python for each event, and the
+experimental EventsExecutor starves the other threads of the process (docs/adr/ros-bridge.md has the figures).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any, Protocol
+
+import rclpy
+from rclpy.context import Context
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, qos_profile_services_default
+from rclpy.signals import SignalHandlerOptions
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+QUEUE_DEPTH = 1024
+"""Requests or answers that rmw keeps until the loop takes them. The default of 10 loses some of 100 sent at once."""
+LONGEST_WAIT_S = 3600.0
+_NANOSECONDS = 1_000_000_000
+
+
+def service_qos() -> Any:
+    """Return the profile of the bridge's own services and clients: the default one, but deep."""
+    return QoSProfile(
+        history=qos_profile_services_default.history,
+        depth=QUEUE_DEPTH,
+        reliability=qos_profile_services_default.reliability,
+        durability=qos_profile_services_default.durability,
+    )
+
+
+class Waited(Protocol):
+    """An entity whose handle the loop waits on."""
+
+    @property
+    def handle(self) -> Any:
+        """rclpy's handle of a service or client."""
+
+    def take(self, now: float) -> None:
+        """Take what has arrived."""
+
+
+class RosLoop:
+    """Context, node and wait set. All methods but `wake` belong to one thread."""
+
+    def __init__(self, node_name: str, domain_id: int | None) -> None:
+        self._context = Context()
+        # Its own context, without rclpy's signal handlers and without the command line: both are the program's.
+        rclpy.init(args=[], context=self._context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node(
+            node_name,
+            context=self._context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+            # The node offers nothing under its own name.
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
+        self._guard = _rclpy.GuardCondition(self._context.handle)
+        self._services: list[Waited] = []
+        self._clients: list[Waited] = []
+        self._by_pointer: dict[int, Waited] = {}
+        self._wait_set: Any = None
+        self._woken = False
+
+    @property
+    def domain_id(self) -> int:
+        """The ROS domain in force."""
+        return int(self._context.get_domain_id())
+
+    def set_services(self, services: Sequence[Waited]) -> None:
+        """Wait on these services from now on."""
+        self._services = list(services)
+        self._wait_set = None
+
+    def set_clients(self, clients: Sequence[Waited]) -> None:
+        """Wait on these clients from now on."""
+        self._clients = list(clients)
+        self._wait_set = None
+
+    def wake(self) -> None:
+        """End the wait. From any thread."""
+        if not self._woken:
+            self._woken = True
+            with contextlib.suppress(_rclpy.RCLError, _rclpy.InvalidHandle):  # closed meanwhile: nobody waits
+                self._guard.trigger_guard_condition()
+
+    def wait(self, timeout_s: float) -> list[Waited]:
+        """Return the entities that have something to take, after at most `timeout_s` seconds."""
+        if self._wait_set is None:
+            self._rebuild()
+        wait_set = self._wait_set
+        wait_set.clear_entities()
+        wait_set.add_guard_condition(self._guard)
+        for service in self._services:
+            wait_set.add_service(service.handle)
+        for client in self._clients:
+            wait_set.add_client(client.handle)
+        wait_set.wait(int(min(max(timeout_s, 0.0), LONGEST_WAIT_S) * _NANOSECONDS))
+        self._woken = False
+        ready = []
+        if self._services:
+            ready += wait_set.get_ready_entities("service")
+        if self._clients:
+            ready += wait_set.get_ready_entities("client")
+        return [self._by_pointer[pointer] for pointer in ready]
+
+    def close(self) -> None:
+        """Destroy the node and everything on it, and leave the domain."""
+        self._wait_set = None
+        self._guard.destroy_when_not_in_use()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def _rebuild(self) -> None:
+        self._by_pointer = {entity.handle.pointer: entity for entity in (*self._services, *self._clients)}
+        self._wait_set = _rclpy.WaitSet(0, 1, 0, len(self._clients), len(self._services), 0, self._context.handle)

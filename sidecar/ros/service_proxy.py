@@ -1,0 +1,79 @@
+"""Robot: one service offered in place of its server in the cloud."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.ros_loop import service_qos
+from sidecar.ros.types import deserialize, serialize
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import ServiceName
+    from sidecar.ros.types import ServiceType
+
+TAKEN_AT_ONCE = 32
+"""Requests taken from one service before the others have their turn."""
+
+
+class ServiceProxy:
+    """A ROS service whose requests go to `on_request` as bytes, with rmw's header to answer them by."""
+
+    def __init__(
+        self,
+        node: Any,
+        name: ServiceName,
+        service_type: ServiceType,
+        on_request: Callable[[ServiceProxy, Any, bytes, float], None],
+        on_bad_request: Callable[[ServiceProxy, RosBridgeError, float], None],
+    ) -> None:
+        self.name = name
+        self.type = service_type
+        self.open = True
+        self._node = node
+        self._on_request = on_request
+        self._on_bad_request = on_bad_request
+        try:
+            self._service = node.create_service(service_type.service, name, _unused, qos_profile=service_qos())
+        # rclpy validates names with exceptions of several unrelated classes.
+        except Exception as error:
+            raise RosBridgeError(f"rmw refuses service {name} of type {service_type.name}: {error}") from error
+
+    @property
+    def handle(self) -> Any:
+        """rclpy's handle."""
+        return self._service.handle
+
+    def take(self, now: float) -> None:
+        """Take the requests that have arrived."""
+        request_type = self.type.request
+        for _ in range(TAKEN_AT_ONCE):
+            request, header = self._service.handle.service_take_request(request_type)
+            if header is None:
+                return
+            try:
+                payload = serialize(request, request_type)
+            except RosBridgeError as error:
+                self._on_bad_request(self, error, now)
+                continue
+            self._on_request(self, header.request_id, payload, now)
+
+    def parse_answer(self, payload: bytes) -> Any:
+        """Return the response in `payload`, or raise RosBridgeError."""
+        return deserialize(payload, self.type.response)
+
+    def answer(self, request_id: Any, response: Any) -> None:
+        """Answer the request with this rmw id; raises rclpy's RCLError when rmw cannot."""
+        self._service.handle.service_send_response(response, request_id)
+
+    def close(self) -> None:
+        """Withdraw the service."""
+        self.open = False
+        self._node.destroy_service(self._service)
+
+
+def _unused(_request: Any, response: Any) -> Any:
+    """rclpy wants a callback; the loop takes requests itself."""
+    return response

@@ -1,0 +1,52 @@
+"""Counters of the ROS bridge. Written by its one thread; a scrape copies (`dict(...)`) before it iterates.
+
+This file imports no rclpy, so that the metrics can be described where no ROS is installed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protos.model import ServiceName
+
+
+@dataclass(slots=True)
+class BridgeStats:
+    """What passed between the local ROS graph and the data plane."""
+
+    requests_taken: Counter[ServiceName] = field(default_factory=Counter)
+    """Robot: requests of local applications."""
+    answers_sent: Counter[ServiceName] = field(default_factory=Counter)
+    """Robot: answers given to local applications, late ones included."""
+    unanswered: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
+    """Robot: (service, reason): requests that will never be answered."""
+    deadlines_missed: Counter[ServiceName] = field(default_factory=Counter)
+    requests_sent: Counter[ServiceName] = field(default_factory=Counter)
+    """Cloud: requests given to local servers."""
+    answers_taken: Counter[ServiceName] = field(default_factory=Counter)
+    """Cloud: answers of local servers, passed on."""
+    refused: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
+    """Cloud: (service, reason: RejectReason's name in lower case)."""
+    abandoned: Counter[ServiceName] = field(default_factory=Counter)
+    """Cloud: requests whose answer nobody waits for any more."""
+    dropped: Counter[str] = field(default_factory=Counter)
+    """Events and messages by the reason they were dropped for."""
+    errors: Counter[str] = field(default_factory=Counter)
+    """Failures of rmw or of the bridge itself, by where they happened."""
+    pending: int = 0
+    """Robot: applications' requests without an answer. Cloud: requests at local servers or waiting for them."""
+    answers_paced: int = 0
+    """Robot: answers held back for a moment so that the client's queue does not overflow."""
+    requests_paced: int = 0
+    """Cloud: requests held back so that the server's queue does not overflow."""
+    scans: int = 0
+    """Looks at the ROS graph."""
+    left_alone: dict[ServiceName, tuple[str, ...]] = field(default_factory=dict)
+    """Robot: offered services that other nodes already serve here, and those nodes. Replaced, never changed."""
+    missing_types: dict[ServiceName, str] = field(default_factory=dict)
+    """Services that are not carried because of their type, and that type. Replaced, never changed."""
+    carried: frozenset[ServiceName] = frozenset()
+    """Robot: proxied services that exist. Cloud: services offered to robots."""
