@@ -1,0 +1,351 @@
+"""Drives the control stream over gRPC: one thread with its own event loop, away from the data plane.
+
+All decisions are ControlSession's. Names are resolved and connections made inside gRPC; nothing here is called by, or
+waited for by, a thread that moves datagrams.
+
+grpc.aio rather than a synchronous stub: at a report each 0.5 s the latter needs two more threads and about twice the
+wake-ups, each of which may take the interpreter from a data-plane thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING, Protocol
+
+import grpc
+
+from protos.convert import control_message_from_proto, sidecar_message_to_proto
+from protos.convert.fields import clean_text
+from protos.errors import DecodeError
+from protos.model import CandidateSet, PeerSet, Report, ResourceKind, ServiceSet, Welcome
+from protos.plr.v1 import control_pb2_grpc
+from sidecar.core.control_session import Apply
+from sidecar.outage_log import OutageLog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import Candidate, MappingSet, ServiceOffer, ServiceUse
+    from protos.plr.v1 import control_pb2
+    from sidecar.core.control_session import ControlSession, ControlStats
+
+    _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
+
+log = logging.getLogger(__name__)
+
+KEEPALIVE_TIME_MS = 10_000
+"""Ping this often: finds out about a silently dead path, and keeps NAT bindings for TCP open."""
+
+KEEPALIVE_TIMEOUT_MS = 5_000
+"""A ping unanswered for this long ends the connection."""
+
+GOODBYE_S = 0.5
+"""How long `stop` waits for the control plane to take the goodbye."""
+
+_CHANNEL_OPTIONS: tuple[tuple[str, int], ...] = (
+    ("grpc.keepalive_time_ms", KEEPALIVE_TIME_MS),
+    ("grpc.keepalive_timeout_ms", KEEPALIVE_TIMEOUT_MS),
+    ("grpc.http2.max_pings_without_data", 0),
+    # The session decides when to try again: no retries and no remembered backoff below it.
+    ("grpc.enable_retries", 0),
+    ("grpc.use_local_subchannel_pool", 1),
+    # Behaviour comes from the configuration, not from the environment.
+    ("grpc.enable_http_proxy", 0),
+)
+
+_REFUSALS = frozenset(
+    {
+        grpc.StatusCode.INVALID_ARGUMENT,
+        grpc.StatusCode.FAILED_PRECONDITION,
+        grpc.StatusCode.ABORTED,
+        grpc.StatusCode.ALREADY_EXISTS,
+        grpc.StatusCode.PERMISSION_DENIED,
+        grpc.StatusCode.UNAUTHENTICATED,
+        grpc.StatusCode.UNIMPLEMENTED,
+        grpc.StatusCode.RESOURCE_EXHAUSTED,
+    }
+)
+"""The control plane decided so, and will decide so again a moment later."""
+
+
+class ControlHooks(Protocol):
+    """What the control client calls, on its own thread; it may wait there for the engine's lock."""
+
+    def welcome(self, welcome: Welcome) -> None:
+        """A stream is accepted; also the place of the STUN servers."""
+
+    def apply_peers(self, peers: PeerSet) -> str | None:
+        """Put the peers in force; returns why not, or None."""
+
+    def apply_mapping(self, mapping: MappingSet) -> str | None:
+        """Put the mapping in force; returns why not, or None."""
+
+    def take_report(self) -> Report:
+        """Return what was measured since the last call."""
+
+    def connection_changed(self, connected: bool, reason: str) -> None:
+        """The control plane came within reach, or went out of it."""
+
+
+class Memory(Protocol):
+    """Keeps what a restart needs (`state_store.StateStore`); must not block."""
+
+    def remember(self, message: Welcome | PeerSet | MappingSet) -> None:
+        """Keep a message that is in force now, in place of the last one of its kind."""
+
+
+class _StreamEndedError(Exception):
+    """The stream is over; `refused`: by a decision of the control plane."""
+
+    def __init__(self, reason: str, *, refused: bool = False) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.refused = refused
+
+
+class ControlClient:
+    """Keeps one sidecar connected to the control plane at `target` (host:port) until `stop`."""
+
+    def __init__(self, target: str, session: ControlSession, hooks: ControlHooks, memory: Memory | None = None) -> None:
+        self._target = target
+        self._session = session
+        self._hooks = hooks
+        self._memory = memory
+        self._connected = False
+        self._stopping = False
+        self._outage = OutageLog(target)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._main_task: asyncio.Task[None] | None = None
+        self._wake = asyncio.Event()
+        self._running = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="plr-control", daemon=True)
+
+    # ── from any thread ──
+
+    @property
+    def connected(self) -> bool:
+        """Whether a stream is accepted."""
+        return self._connected
+
+    @property
+    def stats(self) -> ControlStats:
+        """Counters, to be read only."""
+        return self._session.stats
+
+    def start(self) -> None:
+        """Connect in the background; call once."""
+        self._thread.start()
+        self._running.wait()
+
+    def set_candidates(self, candidates: tuple[Candidate, ...]) -> None:
+        """Tell the control plane under which addresses we are reached now."""
+        self._post(lambda: self._session.set_candidates(CandidateSet(candidates)))
+
+    def set_services(self, offers: tuple[ServiceOffer, ...], uses: tuple[ServiceUse, ...]) -> None:
+        """Tell the control plane what we offer and carry now."""
+        self._post(lambda: self._session.set_services(ServiceSet(offers, uses)))
+
+    def drain(self) -> None:
+        """Say that we are going; what is in flight goes on, and so does the stream."""
+        self._post(self._session.drain)
+
+    def stop(self) -> None:
+        """Say goodbye and end the thread; returns after about GOODBYE_S at most, whatever the control plane does."""
+        self._post(self._begin_stop)
+        if self._thread.is_alive():
+            self._thread.join(4.0 * GOODBYE_S)
+            if self._thread.is_alive():
+                log.warning("the control client does not end; leaving it behind")
+
+    def _post(self, action: Callable[[], None]) -> None:
+        """Run `action` on the control thread; before `start` right here."""
+        if self._loop is None:
+            action()
+            return
+
+        def run() -> None:
+            action()
+            self._wake.set()
+
+        # A loop that has just ended takes no calls: then there is nobody left to tell.
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(run)
+
+    # ── on the control thread ──
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._main())
+        finally:
+            self._running.set()
+            self._note_connection(False, "stopped")
+
+    async def _main(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._main_task = asyncio.current_task()
+        self._running.set()
+        with contextlib.suppress(asyncio.CancelledError):
+            while not self._stopping:
+                await self._wait_until(self._session.retry_at)
+                if not self._stopping:
+                    await self._one_stream()
+
+    def _begin_stop(self) -> None:
+        self._stopping = True
+        self._session.drain()
+        if self._loop is not None and self._main_task is not None:
+            self._loop.call_later(GOODBYE_S, self._main_task.cancel)
+
+    async def _wait_until(self, when: float) -> None:
+        """Wait until `when`, or until stopped."""
+        while not self._stopping and (delay_s := when - time.monotonic()) > 0:
+            self._wake.clear()
+            await self._woken_within(delay_s)
+
+    async def _woken_within(self, delay_s: float) -> None:
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._wake.wait(), max(delay_s, 0.0))
+
+    async def _one_stream(self) -> None:
+        """Open a stream, serve it until it ends, and note why it did."""
+        self._session.opened(time.monotonic())
+        ended = _StreamEndedError("stopped")
+        try:
+            async with grpc.aio.insecure_channel(self._target, options=_CHANNEL_OPTIONS) as channel:
+                call = control_pb2_grpc.ControlPlaneStub(channel).Connect()
+                async with asyncio.TaskGroup() as tasks:
+                    tasks.create_task(self._read(call))
+                    tasks.create_task(self._write(call))
+                    tasks.create_task(self._await_welcome())
+        except* _StreamEndedError as group:
+            ended = _most_telling(group)
+        except* Exception:
+            log.exception("control stream failed")
+            ended = _StreamEndedError("internal error", refused=True)
+        finally:
+            delay_s = self._session.closed(time.monotonic(), refused=ended.refused)
+        was_connected = self._connected
+        self._note_connection(False, "stopped" if self._stopping else ended.reason)
+        if not self._stopping:
+            self._outage.failed(ended.reason, delay_s, time.monotonic(), was_connected=was_connected)
+
+    async def _read(self, call: _Call) -> None:
+        try:
+            async for message in call:
+                self._on_message(message)
+                self._wake.set()
+        except grpc.aio.AioRpcError as error:
+            raise _ended_by(error) from error
+        except asyncio.CancelledError as error:
+            task = asyncio.current_task()
+            if task is None or task.cancelling():
+                raise
+            # Not we were cancelled, but the call.
+            raise _StreamEndedError("cancelled") from error
+        raise _StreamEndedError("closed by the control plane")
+
+    async def _write(self, call: _Call) -> None:
+        while True:
+            self._wake.clear()
+            now = time.monotonic()
+            self._session.handle_timer(now)
+            if self._session.report_due(now):
+                self._session.send_report(self._take_report(), now)
+            try:
+                for message in self._session.messages_to_send(now):
+                    await call.write(sidecar_message_to_proto(message))
+                if self._stopping:
+                    await call.done_writing()
+                    return
+            except (grpc.aio.AioRpcError, asyncio.InvalidStateError):
+                # The stream has ended; why, the reader learns.
+                return
+            await self._woken_within(self._session.next_timer() - time.monotonic())
+
+    async def _await_welcome(self) -> None:
+        """A network that swallows everything lets gRPC try for 20 s: give up sooner."""
+        await asyncio.sleep(max(self._session.next_timer() - time.monotonic(), 0.0))
+        if self._session.welcome_overdue(time.monotonic()):
+            raise _StreamEndedError("no answer to the registration")
+
+    def _on_message(self, message: control_pb2.ControlMessage) -> None:
+        try:
+            value = control_message_from_proto(message)
+        except DecodeError as error:
+            log.warning("refused a message of the control plane: %s", error)
+            self._session.undecodable(*_what_it_was(message), str(error))
+            return
+        match self._session.receive(value, time.monotonic()):
+            case Welcome() as welcome:
+                self._on_welcome(welcome)
+            case Apply() as apply:
+                self._apply(apply)
+
+    def _on_welcome(self, welcome: Welcome) -> None:
+        self._outage.over()
+        self._remember(welcome)
+        try:
+            self._hooks.welcome(welcome)
+        except Exception:
+            log.exception("welcome failed")
+        self._note_connection(True, "registered")
+
+    def _apply(self, apply: Apply) -> None:
+        content = apply.content
+        try:
+            if isinstance(content, PeerSet):
+                error = self._hooks.apply_peers(content)
+            else:
+                error = self._hooks.apply_mapping(content)
+        except Exception as failure:
+            log.exception("applying %s failed", apply.resource.value)
+            error = f"internal error: {failure}"
+        self._session.applied(apply, error)
+        if error is None:
+            self._remember(content)
+        else:
+            log.warning("refused %s version %d: %s", apply.resource.value, content.version, error)
+
+    def _take_report(self) -> Report:
+        try:
+            return self._hooks.take_report()
+        except Exception:
+            log.exception("taking a report failed")
+            return Report()
+
+    def _remember(self, message: Welcome | PeerSet | MappingSet) -> None:
+        if self._memory is not None:
+            self._memory.remember(message)
+
+    def _note_connection(self, connected: bool, reason: str) -> None:
+        if connected == self._connected:
+            return
+        self._connected = connected
+        try:
+            self._hooks.connection_changed(connected, reason)
+        except Exception:
+            log.exception("connection_changed failed")
+
+
+def _most_telling(group: BaseExceptionGroup[_StreamEndedError]) -> _StreamEndedError:
+    endings = [error for error in group.exceptions if isinstance(error, _StreamEndedError)]
+    return next((error for error in endings if error.refused), endings[0])
+
+
+def _ended_by(error: grpc.aio.AioRpcError) -> _StreamEndedError:
+    code = error.code()
+    return _StreamEndedError(clean_text(f"{code.name}: {error.details() or 'no details'}"), refused=code in _REFUSALS)
+
+
+def _what_it_was(message: control_pb2.ControlMessage) -> tuple[ResourceKind | None, int]:
+    match message.WhichOneof("kind"):
+        case "peers":
+            return ResourceKind.PEERS, message.peers.nonce
+        case "mapping":
+            return ResourceKind.MAPPING, message.mapping.nonce
+        case _:
+            return None, 0

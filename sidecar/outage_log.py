@@ -1,0 +1,46 @@
+"""Log lines for the loss of something that is tried for ever."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+log = logging.getLogger(__name__)
+
+REPEATED_FAILURE_LOG_S = 60.0
+"""An outage is logged when it starts or its reason changes, and this often while it lasts."""
+
+
+class OutageLog:
+    """Says when the control plane is lost and found, without a line for every attempt between."""
+
+    def __init__(self, target: str) -> None:
+        self._target = target
+        self._attempts = 0
+        self._logged_at = -math.inf
+        self._reason = ""
+
+    def failed(self, reason: str, delay_s: float, now: float, *, was_connected: bool) -> None:
+        """An attempt failed or a stream ended at `now`; the next attempt comes in `delay_s`."""
+        self._attempts = 1 if was_connected else self._attempts + 1
+        quiet = now - self._logged_at < REPEATED_FAILURE_LOG_S and self._attempts > 1
+        level = logging.DEBUG if quiet and reason == self._reason else logging.WARNING
+        if level == logging.WARNING:
+            self._logged_at = now
+            self._reason = reason
+        what = "lost" if was_connected else "not reached"
+        log.log(
+            level,
+            "control plane %s %s: %s; going on without it, attempt %d in %.1f s",
+            self._target,
+            what,
+            reason,
+            self._attempts + 1,
+            delay_s,
+        )
+
+    def over(self) -> None:
+        """The control plane answered."""
+        log.info("registered with the control plane %s", self._target)
+        self._attempts = 0
+        self._reason = ""
