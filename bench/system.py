@@ -1,0 +1,186 @@
+"""The whole real system in the network lab: control plane, cloud servers, robots, each a process of its own.
+
+Used by the demo, the lab tests and the benchmarks. Nothing here is a stand-in: the processes are the installed
+programs and the unmodified examples.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from bench.netlab import Host, HostProcess, Lab
+
+CONTROL_PORT = 50051
+STUN_PORT = 3478
+METRICS_PORT = 9464
+CONTROL_METRICS_PORT = 9465
+READY_TIMEOUT_S = 60.0
+"""Python with rclpy, numpy and OR-Tools on two shared cores takes seconds to start."""
+
+
+class SystemFailureError(RuntimeError):
+    """A part of the system did not do what it should; the text names its log."""
+
+
+@dataclass(slots=True)
+class Part:
+    """One running program."""
+
+    name: str
+    host: Host
+    process: HostProcess
+    log: Path
+
+    def kill(self) -> None:
+        """SIGKILL, as when the power goes."""
+        self.host.kill(self.process, signal.SIGKILL)
+
+    def terminate(self, timeout_s: float = 20.0) -> int:
+        """SIGTERM; returns the exit code."""
+        return self.host.kill(self.process, signal.SIGTERM, timeout=timeout_s)
+
+    def tail(self, lines: int = 15) -> str:
+        """The end of its log."""
+        return "\n".join(self.log.read_text(errors="replace").splitlines()[-lines:])
+
+
+@dataclass(slots=True)
+class System:
+    """Starts and stops the parts; `folder` takes configurations, state and logs."""
+
+    lab: Lab
+    folder: Path
+    parts: dict[str, Part] = field(default_factory=dict)
+
+    # -- parts ----------------------------------------------------------------------------------------------------
+
+    def start_control_plane(self, **changes: Any) -> Part:
+        """Start plr-controlplane on the host `control`."""
+        host = self.lab.host("control")
+        config = {
+            "listen": f"0.0.0.0:{CONTROL_PORT}",
+            "stun_listen": [f"0.0.0.0:{STUN_PORT}"],
+            "stun_servers": [f"{host.address()}:{STUN_PORT}"],
+            "metrics_listen": f"127.0.0.1:{CONTROL_METRICS_PORT}",
+            **changes,
+        }
+        return self._start("controlplane", host, "controlplane", self._write("controlplane", config))
+
+    def start_cloud(self, name: str, services: Sequence[dict[str, Any]], **changes: Any) -> Part:
+        """Start a cloud's sidecar; `services` as in its configuration."""
+        config = {
+            "name": name.replace("_", "-"),
+            "role": "cloud",
+            "control_plane": f"{self.lab.host('control').address()}:{CONTROL_PORT}",
+            "interfaces": ["eth0"],
+            "state_dir": str(self.folder / f"{name}.state"),
+            "metrics_listen": f"127.0.0.1:{METRICS_PORT}",
+            "services": list(services),
+            **changes,
+        }
+        return self._start(f"{name}.sidecar", self.lab.host(name), "sidecar", self._write(f"{name}.sidecar", config))
+
+    def start_robot(
+        self,
+        services: Sequence[dict[str, Any]],
+        *,
+        name: str = "robot",
+        host: str = "robot",
+        interfaces: Sequence[str] = ("wlan0", "wwan0"),
+        domain: int = 0,
+        metrics_port: int = METRICS_PORT,
+        **changes: Any,
+    ) -> Part:
+        """Start a robot's sidecar in a ROS domain of its host."""
+        config = {
+            "name": name,
+            "role": "robot",
+            "control_plane": f"{self.lab.host('control').address()}:{CONTROL_PORT}",
+            "interfaces": list(interfaces),
+            "state_dir": str(self.folder / f"{name}.state"),
+            "metrics_listen": f"127.0.0.1:{metrics_port}",
+            "services": list(services),
+            **changes,
+        }
+        written = self._write(f"{name}.sidecar", config)
+        return self._start(f"{name}.sidecar", self.lab.host(host), "sidecar", written, domain=domain)
+
+    def start_node(self, name: str, host: str, argv: Sequence[str], *, domain: int = 0) -> Part:
+        """Start a ROS program (`python -m ...`) on a host."""
+        return self._popen(name, self.lab.host(host), [sys.executable, *argv], domain)
+
+    def _start(self, name: str, host: Host, module: str, config: Path, *, domain: int = 0) -> Part:
+        return self._popen(name, host, [sys.executable, "-m", module, "--config", str(config)], domain)
+
+    def _popen(self, name: str, host: Host, argv: Sequence[str], domain: int) -> Part:
+        log = self.folder / f"{name}.log"
+        environment = {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+        process = host.popen(argv, env=environment, log_path=log)
+        part = self.parts[name] = Part(name, host, process, log)
+        return part
+
+    def _write(self, name: str, config: dict[str, Any]) -> Path:
+        path = self.folder / f"{name}.yaml"
+        path.write_text(yaml.safe_dump(config, sort_keys=False))
+        (self.folder / f"{name.removesuffix('.sidecar')}.state").mkdir(exist_ok=True, mode=0o700)
+        return path
+
+    # -- waiting and looking --------------------------------------------------------------------------------------
+
+    def wait(self, what: str, done: Callable[[], bool], timeout_s: float = READY_TIMEOUT_S) -> None:
+        """Wait until `done`; raises SystemFailureError with the logs' ends when a program died or the time is over."""
+        end = time.monotonic() + timeout_s
+        while not done():
+            dead = [part for part in self.parts.values() if part.process.poll() not in (None, 0, -signal.SIGKILL)]
+            if dead or time.monotonic() > end:
+                why = f"{dead[0].name} ended with {dead[0].process.returncode}" if dead else f"not in {timeout_s:g} s"
+                logs = "\n".join(f"--- {part.log}\n{part.tail()}" for part in dead or self.parts.values())
+                raise SystemFailureError(f"waiting for {what}: {why}\n{logs}")
+            time.sleep(0.1)
+
+    def metrics(self, host: str, port: int = METRICS_PORT) -> dict[str, float]:
+        """Scrape a program's metrics: series with labels -> value; empty while it does not answer."""
+        script = (
+            "import sys, urllib.request;"
+            f"sys.stdout.write(urllib.request.urlopen('http://127.0.0.1:{port}/metrics', timeout=2).read().decode())"
+        )
+        done = self.lab.host(host).run([sys.executable, "-S", "-E", "-c", script], timeout=10)
+        found = {}
+        for line in done.stdout.splitlines():
+            if line and not line.startswith("#"):
+                series, _, value = line.rpartition(" ")
+                found[series] = float(value)
+        return found
+
+    def wait_for_offer(self, part: Part, services: int = 1) -> None:
+        """Wait until a robot's sidecar offers this many services (by its log)."""
+        self.wait(
+            f"{part.name} to offer {services} service(s)",
+            lambda: part.log.read_text(errors="replace").count("offering /") >= services,
+        )
+
+    def close(self) -> None:
+        """Ask every program to end, the robots' clients first; kill what does not."""
+        for part in reversed(list(self.parts.values())):
+            if part.process.poll() is None:
+                try:
+                    part.terminate(10.0)
+                except Exception:  # a hung program must not keep the lab up
+                    part.kill()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object."""
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
