@@ -251,6 +251,8 @@ class ControlClient:
     async def _write(self, call: _Call) -> None:
         while True:
             self._wake.clear()
+            # Before the messages are collected: a stop during the writes below still has its goodbye to send.
+            stopping = self._stopping
             now = time.monotonic()
             self._session.handle_timer(now)
             if self._session.report_due(now):
@@ -258,7 +260,7 @@ class ControlClient:
             try:
                 for message in self._session.messages_to_send(now):
                     await call.write(sidecar_message_to_proto(message))
-                if self._stopping:
+                if stopping:
                     await call.done_writing()
                     return
             except (grpc.aio.AioRpcError, asyncio.InvalidStateError):
