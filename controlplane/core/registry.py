@@ -23,7 +23,7 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Candidate, ServiceOffer, ServiceUse
+    from protos.model import Candidate, ServiceOffer, ServiceSet, ServiceUse, SessionId
 
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""
@@ -40,6 +40,7 @@ class Refusal(enum.Enum):
 
     OLDER_INCARNATION = "a newer incarnation of this name is registered"
     NAME_TAKEN = "another sidecar holds this name, and its lease has not ended"
+    SESSION_TAKEN = "another sidecar has this session number: draw a new one"
     FULL = f"{MAX_SIDECARS} sidecars are registered, which is the limit"
 
 
@@ -59,9 +60,10 @@ class Sidecar:
     registration: Registration
     lease_end: float
     stream: StreamId | None
-    candidates: tuple[Candidate, ...] = ()
-    offers: tuple[ServiceOffer, ...] = ()
-    uses: tuple[ServiceUse, ...] = ()
+    candidates: tuple[Candidate, ...] | None = None
+    """None until told."""
+    services: ServiceSet | None = None
+    """None until told."""
     draining: bool = False
 
     @property
@@ -74,6 +76,21 @@ class Sidecar:
         """What it is for."""
         return self.registration.role
 
+    @property
+    def ready(self) -> bool:
+        """Whether it told its addresses and services; before, its peers would learn nothing of use."""
+        return self.candidates is not None and self.services is not None
+
+    @property
+    def offers(self) -> tuple[ServiceOffer, ...]:
+        """Services it can run."""
+        return self.services.offers if self.services is not None else ()
+
+    @property
+    def uses(self) -> tuple[ServiceUse, ...]:
+        """Services it carries."""
+        return self.services.uses if self.services is not None else ()
+
     def as_peer(self) -> Peer:
         """What its peers are told of it."""
         return Peer(
@@ -82,7 +99,7 @@ class Sidecar:
             session=self.registration.session,
             token=self.registration.token,
             incarnation=self.registration.incarnation,
-            candidates=self.candidates,
+            candidates=self.candidates or (),
             offers=self.offers,
             draining=self.draining,
         )
@@ -104,6 +121,7 @@ class Registry:
     def __init__(self, *, lease_s: float) -> None:
         self._lease_s = lease_s
         self._sidecars: dict[NodeName, Sidecar] = {}
+        self._sessions: dict[SessionId, NodeName] = {}
         self._removals: OrderedDict[NodeName, RemovalReason] = OrderedDict()
         # One entry a name, at most as late as its lease ends: renewing a lease does not touch it.
         self._ends: list[tuple[float, NodeName]] = []
@@ -127,12 +145,15 @@ class Registry:
         newest incarnation; the same run that connects again replaces its own older stream.
         """
         name = registration.name
+        if self._sessions.get(registration.session, name) != name:
+            return self._refuse(Refusal.SESSION_TAKEN)
         known = self._sidecars.get(name)
         if known is None:
             if len(self._sidecars) >= MAX_SIDECARS:
                 return self._refuse(Refusal.FULL)
             self._removals.pop(name, None)
             self._sidecars[name] = Sidecar(registration, now + self._lease_s, stream)
+            self._sessions[registration.session] = name
             self._await_end(name)
             return Admission(replaced=None, new_run=True)
         before = known.registration
@@ -143,11 +164,10 @@ class Registry:
         same_run = registration.session == before.session
         if registration.incarnation == before.incarnation and not same_run:
             return self._refuse(Refusal.NAME_TAKEN)
-        if same_run:
-            # Keeps what it said last until it says it anew, so that its peers see no gap.
-            self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False)
-        else:
-            self._sidecars[name] = Sidecar(registration, known.lease_end, stream)
+        # What it said last holds until it says it anew, a moment from now: its peers see no gap.
+        self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False)
+        del self._sessions[before.session]
+        self._sessions[registration.session] = name
         self._renew(name, now)
         return Admission(replaced=known.stream, new_run=not same_run)
 
@@ -176,11 +196,11 @@ class Registry:
         self._sidecars[name] = replace(known, candidates=candidates)
         return candidates != known.candidates
 
-    def set_services(self, name: NodeName, offers: tuple[ServiceOffer, ...], uses: tuple[ServiceUse, ...]) -> bool:
+    def set_services(self, name: NodeName, services: ServiceSet) -> bool:
         """Replace its services; True if they changed."""
         known = self._sidecars[name]
-        self._sidecars[name] = replace(known, offers=offers, uses=uses)
-        return (offers, uses) != (known.offers, known.uses)
+        self._sidecars[name] = replace(known, services=services)
+        return services != known.services
 
     def set_draining(self, name: NodeName) -> bool:
         """It is about to go; True if that is news."""
@@ -230,7 +250,7 @@ class Registry:
         return gone
 
     def _remove(self, name: NodeName, reason: RemovalReason) -> None:
-        del self._sidecars[name]
+        del self._sessions[self._sidecars.pop(name).registration.session]
         self._removals[name] = reason
         self._removals.move_to_end(name)
         if len(self._removals) > MAX_REMEMBERED_REMOVALS:

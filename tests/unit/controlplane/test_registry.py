@@ -6,8 +6,8 @@ import pytest
 
 from controlplane.core import registry as registry_module
 from controlplane.core.registry import Admission, Refusal, Registry
-from protos.model import NodeName, RemovalReason, Role
-from tests.unit.controlplane.samples import interfaces, offer, registration, stream, use
+from protos.model import NodeName, RemovalReason, Role, ServiceSet
+from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 
 ROBOT = NodeName("robot")
 LEASE_S = 5.0
@@ -60,20 +60,40 @@ def test_who_drained_has_left_when_its_stream_ends(registry: Registry) -> None:
     assert registry.removal_reason(ROBOT) is RemovalReason.LEFT
 
 
-def test_a_newer_incarnation_replaces_the_older_stream_and_its_state(registry: Registry) -> None:
+def test_a_newer_incarnation_replaces_the_older_stream(registry: Registry) -> None:
     registry.register(registration("robot", incarnation=1), stream(1), 0.0)
     registry.set_candidates(ROBOT, interfaces("wlan0"))
-    registry.set_services(ROBOT, (), (use(),))
+    registry.set_draining(ROBOT)
     result = registry.register(registration("robot", incarnation=2), stream(2), 1.0)
     assert result == Admission(replaced=stream(1), new_run=True)
     known = registry.get(ROBOT)
     assert known is not None
-    assert known.candidates == ()
-    assert known.uses == ()
+    # Its peers keep its addresses until it tells new ones, but know its new session at once.
+    assert known.candidates == interfaces("wlan0")
+    assert known.as_peer().session == registration("robot", incarnation=2).session
+    assert not known.draining
     assert known.lease_end == 1.0 + LEASE_S
     assert not registry.touch(ROBOT, stream(1), 2.0)
     assert registry.disconnect(ROBOT, stream(1)) is None
     assert known == registry.get(ROBOT)
+
+
+def test_a_session_number_belongs_to_one_sidecar(registry: Registry) -> None:
+    registry.register(registration("one", session=7), stream(1), 0.0)
+    assert registry.register(registration("two", session=7), stream(2), 0.0) is Refusal.SESSION_TAKEN
+    registry.register(registration("one", session=8, incarnation=2), stream(3), 0.0)
+    assert isinstance(registry.register(registration("two", session=7), stream(2), 0.0), Admission)
+    registry.expire(LEASE_S)
+    assert isinstance(registry.register(registration("three", session=8), stream(4), LEASE_S), Admission)
+
+
+def test_a_sidecar_is_ready_when_it_told_addresses_and_services(registry: Registry) -> None:
+    registry.register(registration("robot"), stream(1), 0.0)
+    assert [sidecar.ready for sidecar in registry] == [False]
+    assert registry.set_candidates(ROBOT, ())
+    assert [sidecar.ready for sidecar in registry] == [False]
+    assert registry.set_services(ROBOT, ServiceSet())
+    assert [sidecar.ready for sidecar in registry] == [True]
 
 
 def test_an_older_incarnation_is_refused(registry: Registry) -> None:
@@ -123,8 +143,8 @@ def test_setters_say_whether_anything_changed(registry: Registry) -> None:
     name = NodeName("cloud")
     assert registry.set_candidates(name, interfaces("eth0"))
     assert not registry.set_candidates(name, interfaces("eth0"))
-    assert registry.set_services(name, (offer(),), ())
-    assert not registry.set_services(name, (offer(),), ())
+    assert registry.set_services(name, ServiceSet((offer(),)))
+    assert not registry.set_services(name, ServiceSet((offer(),)))
     known = registry.get(name)
     assert known is not None
     peer = known.as_peer()

@@ -1,0 +1,380 @@
+"""The control plane without IO: messages of sidecars and time in, messages and closings of streams out.
+
+A driver calls `register`, `receive` and `disconnected` as streams come, speak and go, `handle_timer` when
+`next_timer` says so, and `start_solving` / `solved` around the solver, which may run elsewhere meanwhile; after each
+call it drains `next_event`. Times are monotonic seconds.
+
+Warm-up. After a restart the registry is empty, while the robots go on with the peers they hold. A robot that says it
+holds a version is therefore sent nothing until every server that its own reports name is here again, or the warm-up
+is over: a set without a server that merely has not yet come back would cost the robot that server. Robots that hold
+nothing, and clouds (they find their robots by the robots' own probes), are served at once.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter, OrderedDict, deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, assert_never
+
+from controlplane.core import reconcile
+from controlplane.core.assignment import Plan, Problem
+from controlplane.core.debounce import Change, Debounce, settle
+from controlplane.core.estimator import Estimator
+from controlplane.core.picture import Picture, draw
+from controlplane.core.registry import MAX_SIDECARS, Admission, Refusal, Registry, StreamId
+from controlplane.core.snapshots import Snapshots, VersionSource
+from protos.errors import DecodeError
+from protos.model import (
+    Ack,
+    CandidateSet,
+    Drain,
+    Heartbeat,
+    Nack,
+    Registration,
+    Report,
+    ResourceKind,
+    Role,
+    ServiceSet,
+    SidecarStatus,
+    Welcome,
+)
+
+if TYPE_CHECKING:
+    from controlplane.core.registry import Sidecar
+    from protos.model import ControlMessage, NodeName, Peer, ServiceName, SidecarMessage
+
+PUBLISH_DELAY_S = 0.02
+"""From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two
+messages, and these should make one version."""
+
+MAX_GONE_SNAPSHOTS = MAX_SIDECARS
+"""Sidecars that are gone and whose last set is remembered, for the notices when they return; the oldest go."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the configuration decides."""
+
+    lease_s: float = 5.0
+    report_interval_s: float = 0.5
+    warm_up_s: float = 12.0
+    half_life_s: float = 60.0
+    default_capacity_interfaces: int = 1
+    stun_servers: tuple[str, ...] = ()
+
+
+class CloseReason(enum.Enum):
+    """Why the control plane ends a stream."""
+
+    REPLACED = "replaced by a newer stream of this sidecar"
+    LEASE_EXPIRED = "silent for longer than the lease"
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """A message for one stream; a newer one of the same type makes an unsent older one pointless."""
+
+    stream: StreamId
+    message: ControlMessage
+
+
+@dataclass(frozen=True, slots=True)
+class Close:
+    """End this stream."""
+
+    stream: StreamId
+    reason: CloseReason
+
+
+@dataclass(slots=True)
+class Counters:
+    """What happened, for the metrics."""
+
+    nacks: Counter[ResourceKind] = field(default_factory=Counter)
+    acks: Counter[ResourceKind] = field(default_factory=Counter)
+    stale_answers: int = 0
+    """Acks and nacks with a nonce that is not the last one's."""
+    reports: int = 0
+    reports_ignored: int = 0
+    """Reports of clouds, which measure nothing."""
+    old_stream_messages: int = 0
+    """Messages on a stream that is not the sidecar's any more."""
+    solved: int = 0
+    relaxations: int = 0
+    """Plans taken that exceed a capacity."""
+    unproven: int = 0
+    """Groups of blocks whose optimum was not proven in time."""
+
+
+@dataclass(frozen=True, slots=True)
+class NackNotice:
+    """A sidecar refused what it was sent, for the log."""
+
+    sidecar: NodeName
+    nack: Nack
+
+
+Event = Send | Close | NackNotice
+"""What the driver has to do, in this order."""
+
+
+class ControlCore:
+    """Registry, estimator, plan and snapshots, put together."""
+
+    def __init__(self, settings: Settings, *, version_epoch: int, now: float) -> None:
+        self._settings = settings
+        self._warm_until = now + settings.warm_up_s
+        self.registry = Registry(lease_s=settings.lease_s)
+        self.estimator = Estimator(half_life_s=settings.half_life_s)
+        self.counters = Counters()
+        self.plan = Plan({})
+        self._picture = Picture(Problem(()))
+        self._debounce = Debounce()
+        self._versions = VersionSource(version_epoch)
+        self._snapshots: dict[NodeName, Snapshots] = {}
+        self._gone_snapshots: OrderedDict[NodeName, Snapshots] = OrderedDict()
+        self._held_back: dict[NodeName, frozenset[NodeName] | None] = {}
+        self._streams: dict[StreamId, NodeName] = {}
+        self._last_stream = 0
+        self._publish_at: float | None = None
+        self._events: deque[Event] = deque()
+
+    # ── streams ──
+
+    def register(self, registration: Registration, now: float) -> StreamId | Refusal:
+        """A stream begins with this registration; returns its number, or why it may not."""
+        stream = StreamId(self._last_stream + 1)
+        result = self.registry.register(registration, stream, now)
+        if not isinstance(result, Admission):
+            return result
+        self._last_stream = stream
+        name = registration.name
+        if result.replaced is not None:
+            self._streams.pop(result.replaced, None)
+            self._events.append(Close(result.replaced, CloseReason.REPLACED))
+        self._streams[stream] = name
+        if result.new_run:
+            self.estimator.forget_paths(name)
+        snapshots = self._snapshots.get(name) or self._gone_snapshots.pop(name, None) or Snapshots()
+        self._snapshots[name] = snapshots
+        snapshots.peers.begin_stream(registration.peers_version)
+        snapshots.mapping.begin_stream(registration.mapping_version)
+        holds = max(registration.peers_version, registration.mapping_version)
+        if registration.role is Role.ROBOT and holds and now < self._warm_until and not snapshots.known_names:
+            self._held_back[name] = None
+        self._events.append(
+            Send(
+                stream,
+                Welcome(self._settings.lease_s, self._settings.report_interval_s, self._settings.stun_servers),
+            )
+        )
+        self._members_changed(now)
+        return stream
+
+    def receive(self, stream: StreamId, message: SidecarMessage, now: float) -> None:
+        """Take one message of a stream. Raises DecodeError on one that has no place there."""
+        name = self._streams.get(stream)
+        if name is None or not self.registry.touch(name, stream, now):
+            self.counters.old_stream_messages += 1
+            return
+        match message:
+            case Registration():
+                raise DecodeError("a second registration on one stream")
+            case CandidateSet(candidates=candidates):
+                if self.registry.set_candidates(name, candidates):
+                    self._members_changed(now)
+            case ServiceSet():
+                if self.registry.set_services(name, message):
+                    self._members_changed(now)
+            case Report():
+                self._receive_report(name, message, now)
+            case Ack():
+                self._receive_ack(name, message)
+            case Nack():
+                self._receive_nack(name, message)
+            case Drain():
+                if self.registry.set_draining(name):
+                    self._members_changed(now)
+            case Heartbeat():
+                pass
+            case _:
+                assert_never(message)
+
+    def _receive_report(self, name: NodeName, report: Report, now: float) -> None:
+        sidecar = self.registry.get(name)
+        if sidecar is None or sidecar.role is not Role.ROBOT:
+            self.counters.reports_ignored += 1
+            return
+        self.counters.reports += 1
+        changed = self.estimator.merge(name, report, now)
+        self._debounce.note(Change.PATH if changed else Change.REPORT, now)
+        if name in self._held_back:
+            self._held_back[name] = frozenset(path.server for path in report.paths)
+            self._publish_soon(now)
+
+    def _receive_ack(self, name: NodeName, ack: Ack) -> None:
+        snapshots = self._snapshots[name]
+        fresh = snapshots.peers_acked(ack) if ack.resource is ResourceKind.PEERS else snapshots.mapping.ack(ack)
+        if fresh:
+            self.counters.acks[ack.resource] += 1
+        else:
+            self.counters.stale_answers += 1
+
+    def _receive_nack(self, name: NodeName, nack: Nack) -> None:
+        snapshots = self._snapshots[name]
+        track = snapshots.peers if nack.resource is ResourceKind.PEERS else snapshots.mapping
+        if track.nack(nack):
+            self.counters.nacks[nack.resource] += 1
+            self._events.append(NackNotice(name, nack))
+        else:
+            self.counters.stale_answers += 1
+
+    def disconnected(self, stream: StreamId, now: float) -> None:
+        """A stream ended, whoever ended it."""
+        name = self._streams.pop(stream, None)
+        if name is not None and self.registry.disconnect(name, stream) is not None:
+            self._forget(name)
+            self._members_changed(now)
+
+    # ── time ──
+
+    def next_timer(self) -> float | None:
+        """When to call `handle_timer` and `start_solving` next."""
+        warm = self._warm_until if self._held_back else None
+        times = (self.registry.next_expiry(), self._publish_at, self._debounce.next_time(), warm)
+        return min((time for time in times if time is not None), default=None)
+
+    def handle_timer(self, now: float) -> None:
+        """Let leases end, and publish what changed."""
+        for sidecar in self.registry.expire(now):
+            if sidecar.stream is not None:
+                self._streams.pop(sidecar.stream, None)
+                self._events.append(Close(sidecar.stream, CloseReason.LEASE_EXPIRED))
+            self._forget(sidecar.name)
+            self._members_changed(now)
+        if self._held_back and now >= self._warm_until:
+            self._held_back.clear()
+            self._publish_soon(now)
+        if self._publish_at is not None and self._publish_at <= now:
+            self._publish()
+
+    def _forget(self, name: NodeName) -> None:
+        self.estimator.forget_paths(name)
+        self._held_back.pop(name, None)
+        self._gone_snapshots[name] = self._snapshots.pop(name)
+        if len(self._gone_snapshots) > MAX_GONE_SNAPSHOTS:
+            self._gone_snapshots.popitem(last=False)
+
+    def _members_changed(self, now: float) -> None:
+        self._debounce.note(Change.MEMBERS, now)
+        self._publish_soon(now)
+
+    def _publish_soon(self, now: float) -> None:
+        if self._publish_at is None:
+            self._publish_at = now + PUBLISH_DELAY_S
+
+    # ── solving ──
+
+    def start_solving(self, now: float) -> Picture | None:
+        """The problem to solve now, if it is time to; `solved` has to follow."""
+        if not self._debounce.start(now):
+            return None
+        ready = (sidecar for sidecar in self.registry if sidecar.ready)
+        return draw(
+            ready,
+            self.estimator,
+            now,
+            default_capacity_interfaces=self._settings.default_capacity_interfaces,
+        )
+
+    def solved(self, picture: Picture, plan: Plan, now: float) -> None:
+        """The solver's answer to the problem of `start_solving`; what is worth a change is published."""
+        self._debounce.finished(now)
+        settled = settle(picture.problem, plan, self.plan)
+        self.counters.solved += 1
+        self.counters.unproven += plan.unproven
+        if settled.relaxed and settled.relaxed != self.plan.relaxed:
+            self.counters.relaxations += 1
+        self.plan = settled
+        self._picture = picture
+        self._publish()
+
+    def solving_failed(self, now: float) -> None:
+        """The solver raised: the plan in force stays, and it is tried again with the next routine solving."""
+        self._debounce.finished(now)
+        self._debounce.note(Change.REPORT, now)
+
+    # ── publishing ──
+
+    def _publish(self) -> None:
+        self._publish_at = None
+        peers = {role: reconcile.peers_of(role, self.registry) for role in Role}
+        for sidecar in self.registry:
+            if sidecar.stream is not None and not self._is_held_back(sidecar.name):
+                self._publish_to(sidecar, sidecar.stream, peers[sidecar.role])
+
+    def _is_held_back(self, name: NodeName) -> bool:
+        if name not in self._held_back:
+            return False
+        servers = self._held_back[name]
+        if servers is None:
+            return True
+        known = (self.registry.get(server) for server in servers)
+        if all(sidecar is not None and sidecar.ready for sidecar in known):
+            del self._held_back[name]
+            return False
+        return True
+
+    def _publish_to(self, sidecar: Sidecar, stream: StreamId, peers: tuple[Peer, ...]) -> None:
+        snapshots = self._snapshots[sidecar.name]
+        if peers != snapshots.peers.sent:
+            removed = reconcile.removed_peers(snapshots.known_names, peers, self.registry)
+            self._events.append(Send(stream, snapshots.send_peers(peers, removed, self._versions)))
+        if sidecar.role is not Role.ROBOT:
+            return
+        sent = snapshots.mapping.sent
+        mapping = reconcile.mapping_of(sidecar, peers, self.plan, self._picture, sent or ())
+        if sent is None:
+            # Nothing to say yet is no reason to take away what the sidecar holds from before.
+            worth_sending = bool(mapping)
+        else:
+            worth_sending = reconcile.differs(mapping, sent)
+        if worth_sending:
+            self._events.append(Send(stream, snapshots.send_mapping(mapping, self._versions)))
+
+    def next_event(self) -> Event | None:
+        """What the driver has to do next."""
+        return self._events.popleft() if self._events else None
+
+    # ── what the operator sees ──
+
+    def status(self, now: float) -> list[SidecarStatus]:
+        """Every registered sidecar, by name."""
+        found: list[SidecarStatus] = []
+        for sidecar in sorted(self.registry, key=lambda sidecar: sidecar.name):
+            snapshots = self._snapshots[sidecar.name]
+            found.append(
+                SidecarStatus(
+                    peer=sidecar.as_peer(),
+                    connected=sidecar.stream is not None,
+                    lease_left_s=max(0.0, sidecar.lease_end - now),
+                    software_version=sidecar.registration.software_version,
+                    uses=sidecar.uses,
+                    peers=snapshots.peers.status,
+                    mapping=snapshots.mapping.status,
+                    services=snapshots.mapping.sent or (),
+                    paths=tuple(self.estimator.paths(sidecar.name)),
+                )
+            )
+        return found
+
+    def miss_ratios(self, now: float) -> dict[tuple[NodeName, ServiceName], tuple[float, float | None]]:
+        """For every planned (robot, service) the predicted miss probability and the observed ratio."""
+        return {
+            (key.robot, key.service): (
+                block.predicted_miss,
+                self.estimator.observed_miss_ratio(key.robot, key.service, now),
+            )
+            for key, block in self.plan.blocks.items()
+        }

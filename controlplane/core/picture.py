@@ -1,0 +1,115 @@
+"""From who is there and what was measured to the assignment problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from controlplane.core.assignment import Block, BlockKey, FleetKey, Problem
+from protos.model import Role
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from controlplane.core.estimator import Estimator
+    from controlplane.core.registry import Sidecar
+    from protos.model import InterfaceName, NodeName, ServiceName, ServiceUse
+
+
+@dataclass(frozen=True, slots=True)
+class BlockNotes:
+    """What the mapping of a block has to say beside its plan."""
+
+    servers: tuple[NodeName, ...] = ()
+    """All live servers of the service, also those no path is up to."""
+    dark: tuple[InterfaceName, ...] = ()
+    """Interfaces left out of the problem, as no path over them is up."""
+    all_dark: bool = False
+    """No path at all is up, so every pair was let in."""
+    unserved: str = ""
+    """Why there is nothing to assign; then the problem has no such block."""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """The problem as it stands, and notes on every use of every robot."""
+
+    problem: Problem
+    notes: Mapping[BlockKey, BlockNotes] = field(default_factory=dict)
+
+
+def draw(sidecars: Iterable[Sidecar], estimator: Estimator, now: float, *, default_capacity_interfaces: int) -> Picture:
+    """Build the problem. Only paths that are up are candidates, unless none of a robot's is for a service."""
+    robots: list[Sidecar] = []
+    servers: dict[tuple[ServiceName, str], list[NodeName]] = {}
+    fleet_capacity: dict[FleetKey, int] = {}
+    for sidecar in sorted(sidecars, key=lambda sidecar: sidecar.name):
+        if sidecar.role is Role.ROBOT:
+            robots.append(sidecar)
+            continue
+        if sidecar.draining:
+            continue
+        for offer in sidecar.offers:
+            servers.setdefault((offer.name, offer.type), []).append(sidecar.name)
+            if offer.capacity:
+                fleet_capacity[FleetKey(sidecar.name, offer.name)] = offer.capacity
+    blocks: list[Block] = []
+    notes: dict[BlockKey, BlockNotes] = {}
+    for robot in robots:
+        for use in robot.uses:
+            key = BlockKey(robot.name, use.name)
+            found = tuple(servers.get((use.name, use.type), ()))
+            block, notes[key] = _block(robot, use, found, estimator, now, default_capacity_interfaces)
+            if block is not None:
+                blocks.append(block)
+    return Picture(Problem(tuple(blocks), fleet_capacity), notes)
+
+
+def interfaces_of(sidecar: Sidecar) -> tuple[InterfaceName, ...]:
+    """Its interfaces, in the order of their first candidate."""
+    return tuple(dict.fromkeys(candidate.interface for candidate in sidecar.candidates or ()))
+
+
+def _block(
+    robot: Sidecar,
+    use: ServiceUse,
+    servers: tuple[NodeName, ...],
+    estimator: Estimator,
+    now: float,
+    capacity: int,
+) -> tuple[Block | None, BlockNotes]:
+    if not servers:
+        return None, BlockNotes(unserved=f"no live server offers it as {use.type}")
+    interfaces = interfaces_of(robot)
+    if not interfaces:
+        return None, BlockNotes(servers, unserved="the robot has told no address yet")
+    up = {
+        (interface, server)
+        for interface in interfaces
+        for server in servers
+        if estimator.path_up(robot.name, interface, server)
+    }
+    all_dark = not up
+    if all_dark:
+        up = {(interface, server) for interface in interfaces for server in servers}
+    lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
+    reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
+    overhead_s = estimator.overhead(robot.name, use.name, now)
+
+    def epsilon(interface: InterfaceName, server: NodeName) -> float | None:
+        if (interface, server) not in up:
+            return None
+        return estimator.miss_probability(
+            robot.name, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s
+        )
+
+    block = Block(
+        key=BlockKey(robot.name, use.name),
+        interfaces=lit,
+        servers=reached,
+        epsilon=tuple(tuple(epsilon(interface, server) for server in reached) for interface in lit),
+        capacity=capacity,
+        idempotent=use.idempotent,
+    )
+    dark = tuple(interface for interface in interfaces if interface not in lit)
+    return block, BlockNotes(servers, dark, all_dark)

@@ -1,0 +1,137 @@
+"""What each sidecar should hold, from who is there and the plan. Pure functions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from controlplane.core.assignment import BlockKey
+from controlplane.core.picture import interfaces_of
+from protos.model import Assignment, RemovedPeer, ServiceMapping
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from controlplane.core.assignment import BlockPlan, Plan
+    from controlplane.core.picture import BlockNotes, Picture
+    from controlplane.core.registry import Registry, Sidecar
+    from protos.model import InterfaceName, NodeName, Peer, Role
+
+PREDICTION_CHANGE = 2.0
+"""A new predicted miss probability alone is sent when it differs by this factor: it informs, nothing acts on it."""
+
+PREDICTION_FLOOR = 1e-3
+"""Below this, predictions count as equal."""
+
+
+def peers_of(role: Role, registry: Registry) -> tuple[Peer, ...]:
+    """The peers of a sidecar, by name: robots see clouds, clouds see robots, once these told their addresses."""
+    others = sorted((other for other in registry if other.role is not role and other.ready), key=lambda s: s.name)
+    return tuple(other.as_peer() for other in others)
+
+
+def removed_peers(
+    known_names: Collection[NodeName], peers: tuple[Peer, ...], registry: Registry
+) -> tuple[RemovedPeer, ...]:
+    """Notices on those a sidecar may know and should not list any more, with the reason, by name."""
+    present = {peer.name for peer in peers}
+    return tuple(
+        RemovedPeer(name, registry.removal_reason(name)) for name in sorted(known_names) if name not in present
+    )
+
+
+def mapping_of(
+    robot: Sidecar,
+    peers: tuple[Peer, ...],
+    plan: Plan,
+    picture: Picture,
+    previous: tuple[ServiceMapping, ...],
+) -> tuple[ServiceMapping, ...]:
+    """The mapping of a robot, by service; names only its own interfaces and the `peers` it is sent.
+
+    A use that the picture does not know yet is left out until the next solving, which is due then.
+    """
+    servers = {peer.name for peer in peers}
+    interfaces = set(interfaces_of(robot))
+    before = {mapping.service: mapping for mapping in previous}
+    mappings: list[ServiceMapping] = []
+    for use in sorted(robot.uses, key=lambda use: use.name):
+        key = BlockKey(robot.name, use.name)
+        notes = picture.notes.get(key)
+        if notes is None:
+            continue
+        block = plan.blocks.get(key)
+        if block is None:
+            mappings.append(ServiceMapping(use.name, (), 1.0, notes.unserved or "no plan yet"))
+            continue
+        planned = tuple(Assignment(interface, server) for interface, server in block.assignments)
+        standby = _standby(planned, notes, before.get(use.name), single=not use.idempotent)
+        kept = tuple(
+            assignment
+            for assignment in (*planned, *standby)
+            if assignment.interface in interfaces and assignment.server in servers
+        )
+        predicted = block.predicted_miss if set(planned) & set(kept) else 1.0
+        mappings.append(ServiceMapping(use.name, kept, min(1.0, predicted), _reason(block, notes, plan)))
+    return tuple(mappings)
+
+
+def _standby(
+    planned: tuple[Assignment, ...], notes: BlockNotes, before: ServiceMapping | None, *, single: bool
+) -> list[Assignment]:
+    """Give each dark interface a server too, so that it serves the moment it comes back, control plane or not.
+
+    It keeps the server it had, or takes one that no other interface has; with `single`, the one of all others.
+    """
+    if not planned:
+        return []
+    had: Mapping[InterfaceName, NodeName] = (
+        {assignment.interface: assignment.server for assignment in before.assignments} if before else {}
+    )
+    taken = {assignment.server for assignment in planned}
+    standby: list[Assignment] = []
+    for interface in notes.dark:
+        server = had.get(interface)
+        if single:
+            server = planned[0].server
+        elif server not in notes.servers:
+            server = next((name for name in notes.servers if name not in taken), planned[0].server)
+        if server is not None:
+            standby.append(Assignment(interface, server))
+            taken.add(server)
+    return standby
+
+
+def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan) -> str:
+    """One short line; without figures that change with every report, as a new reason is a new version."""
+    parts = ["least sum of miss probabilities"]
+    if notes.all_dark:
+        parts.append("no path is up, so all known pairs were considered")
+    if notes.dark:
+        parts.append(f"no path is up over {', '.join(notes.dark)}: on standby")
+    if block.excess:
+        parts.append(f"too few servers: capacity exceeded by {block.excess}")
+    servers = {server for _, server in block.assignments}
+    fleet = sum(
+        excess
+        for key, excess in plan.fleet_excess.items()
+        if key.service == block.key.service and key.server in servers
+    )
+    if fleet:
+        parts.append(f"too few servers for all robots: capacity exceeded by {fleet}")
+    return "; ".join(parts)
+
+
+def differs(new: tuple[ServiceMapping, ...], old: tuple[ServiceMapping, ...]) -> bool:
+    """Whether a mapping is worth a new version."""
+    if len(new) != len(old):
+        return True
+    return any(
+        (a.service, a.assignments, a.reason) != (b.service, b.assignments, b.reason)
+        or _prediction_differs(a.predicted_miss, b.predicted_miss)
+        for a, b in zip(new, old, strict=True)
+    )
+
+
+def _prediction_differs(new: float, old: float) -> bool:
+    new, old = max(new, PREDICTION_FLOOR), max(old, PREDICTION_FLOOR)
+    return not 1 / PREDICTION_CHANGE <= new / old <= PREDICTION_CHANGE

@@ -1,0 +1,114 @@
+"""What each sidecar was sent, and whether it took it: versions, nonces, acks and nacks, as in xDS."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from protos.model import MappingSet, PeerSet, ResourceStatus, SyncState, Version
+
+if TYPE_CHECKING:
+    from protos.model import Ack, Nack, NodeName, Peer, RemovedPeer, ServiceMapping
+
+C = TypeVar("C")
+
+
+class VersionSource:
+    """Gives out versions that only grow, also over restarts, as `epoch` grows with wall-clock time."""
+
+    def __init__(self, epoch: int) -> None:
+        self._last = epoch
+
+    def above(self, floor: Version) -> Version:
+        """A new version, larger than `floor` and all given out before.
+
+        A floor beyond the epoch (what a sidecar says it holds) lifts this sidecar's version alone, not everybody's.
+        """
+        self._last += 1
+        return Version(max(self._last, floor + 1))
+
+
+class Track(Generic[C]):
+    """One resource of one sidecar: what was sent last, and what became of it."""
+
+    def __init__(self) -> None:
+        self.sent: C | None = None
+        """What was sent last, or None if the sidecar has to be sent everything."""
+        self.nonce = 0
+        self.state = SyncState.NOT_SENT
+        self.version_sent = Version(0)
+        self.version_acked = Version(0)
+        self.error = ""
+        self._floor = Version(0)
+
+    def begin_stream(self, held: Version) -> None:
+        """A new stream: the sidecar says which version it holds; what else was sent may not have arrived."""
+        self._floor = max(self._floor, held, self.version_sent)
+        if self.sent is not None and held == self.version_sent and self.state is not SyncState.REJECTED:
+            self.state = SyncState.SYNCED
+            self.version_acked = held
+            return
+        self.sent = None
+        self.state = SyncState.NOT_SENT
+        self.version_acked = held
+        self.error = ""
+
+    def send(self, content: C, versions: VersionSource) -> Version:
+        """`content` goes out; returns its version. The nonce is the new `nonce`."""
+        self.sent = content
+        self.version_sent = self._floor = versions.above(self._floor)
+        self.nonce += 1
+        self.state = SyncState.STALE
+        self.error = ""
+        return self.version_sent
+
+    def ack(self, ack: Ack) -> bool:
+        """The sidecar applied it; False if that is stale: about something sent earlier, or already refused."""
+        if ack.nonce != self.nonce or ack.version != self.version_sent or self.state is not SyncState.STALE:
+            return False
+        self.state = SyncState.SYNCED
+        self.version_acked = ack.version
+        return True
+
+    def nack(self, nack: Nack) -> bool:
+        """The sidecar refused it; False if that is stale."""
+        if nack.nonce != self.nonce or self.state not in (SyncState.STALE, SyncState.SYNCED):
+            return False
+        self.state = SyncState.REJECTED
+        self.version_acked = nack.version
+        self.error = nack.error
+        return True
+
+    @property
+    def status(self) -> ResourceStatus:
+        """For the operator."""
+        return ResourceStatus(self.version_sent, self.version_acked, self.state, self.error)
+
+
+class Snapshots:
+    """Both resources of one sidecar."""
+
+    __slots__ = ("known_names", "mapping", "peers")
+
+    def __init__(self) -> None:
+        self.peers: Track[tuple[Peer, ...]] = Track()
+        self.mapping: Track[tuple[ServiceMapping, ...]] = Track()
+        self.known_names: set[NodeName] = set()
+        """Peers the sidecar may know: of the set it acknowledged last and of all sent since."""
+
+    def send_peers(self, peers: tuple[Peer, ...], removed: tuple[RemovedPeer, ...], versions: VersionSource) -> PeerSet:
+        """Send the sidecar its peers."""
+        version = self.peers.send(peers, versions)
+        self.known_names.update(peer.name for peer in peers)
+        return PeerSet(version, self.peers.nonce, peers, removed)
+
+    def send_mapping(self, services: tuple[ServiceMapping, ...], versions: VersionSource) -> MappingSet:
+        """Send the sidecar its mapping."""
+        version = self.mapping.send(services, versions)
+        return MappingSet(version, self.mapping.nonce, services)
+
+    def peers_acked(self, ack: Ack) -> bool:
+        """The sidecar applied its peers: it forgot all others."""
+        if not self.peers.ack(ack):
+            return False
+        self.known_names = {peer.name for peer in self.peers.sent or ()}
+        return True

@@ -1,0 +1,126 @@
+"""Which pairs become candidates, and why some uses become no block at all."""
+
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core.assignment import BlockKey, FleetKey
+from controlplane.core.estimator import Estimator
+from controlplane.core.picture import BlockNotes, Picture, draw
+from controlplane.core.registry import Sidecar
+from protos.model import Candidate, NodeName, PathReport, Report, Role, ServiceOffer, ServiceSet, ServiceUse
+from tests.unit.controlplane.samples import (
+    PLAN,
+    candidate,
+    histogram,
+    interfaces,
+    offer,
+    path,
+    registration,
+    stream,
+    use,
+)
+
+KEY = BlockKey(NodeName("robot"), PLAN)
+
+
+def robot(*uses: ServiceUse, candidates: tuple[Candidate, ...] = interfaces("wlan0", "wwan0")) -> Sidecar:
+    return Sidecar(registration("robot"), 9.0, stream(1), candidates, ServiceSet((), uses or (use(),)))
+
+
+def cloud(name: str, *offers: ServiceOffer, draining: bool = False) -> Sidecar:
+    services = ServiceSet(offers or (offer(),))
+    return Sidecar(registration(name, Role.CLOUD), 9.0, stream(2), interfaces("eth0"), services, draining)
+
+
+def picture(*sidecars: Sidecar, paths: tuple[PathReport, ...] = (), capacity: int = 1) -> Picture:
+    estimator = Estimator(half_life_s=60.0)
+    if paths:
+        estimator.merge(NodeName("robot"), Report(paths=paths), 0.0)
+    return draw(sidecars, estimator, 0.0, default_capacity_interfaces=capacity)
+
+
+def test_only_paths_that_are_up_are_candidates() -> None:
+    drawn = picture(
+        robot(),
+        cloud("a"),
+        cloud("b"),
+        paths=(
+            path("wlan0", "a", rtt=histogram(0.02, times=50)),
+            path("wlan0", "b"),
+            path("wwan0", "a", up=False),
+            path("wwan0", "b", rtt=histogram(0.2, times=50)),
+        ),
+    )
+    (block,) = drawn.problem.blocks
+    assert block.key == KEY
+    assert (block.interfaces, block.servers) == (("wlan0", "wwan0"), ("a", "b"))
+    assert block.epsilon[0][0] is not None
+    assert block.epsilon[0][0] < 0.05
+    assert block.epsilon[0][1] == pytest.approx(0.5)
+    assert block.epsilon[1][0] is None
+    assert block.epsilon[1][1] is not None
+    assert block.epsilon[1][1] > 0.9
+    assert drawn.notes[KEY] == BlockNotes(servers=(NodeName("a"), NodeName("b")))
+
+
+def test_a_dark_interface_and_an_unreached_server_are_left_out() -> None:
+    drawn = picture(robot(), cloud("a"), cloud("b"), paths=(path("wlan0", "a"), path("wwan0", "a", up=False)))
+    (block,) = drawn.problem.blocks
+    assert (block.interfaces, block.servers) == (("wlan0",), ("a",))
+    assert drawn.notes[KEY].dark == ("wwan0",)
+    assert drawn.notes[KEY].servers == ("a", "b")
+    assert not drawn.notes[KEY].all_dark
+
+
+def test_with_nothing_up_every_pair_is_let_in() -> None:
+    drawn = picture(robot(), cloud("a"), cloud("b"), paths=(path("wlan0", "a", up=False),))
+    (block,) = drawn.problem.blocks
+    assert (block.interfaces, block.servers) == (("wlan0", "wwan0"), ("a", "b"))
+    assert all(epsilon is not None for row in block.epsilon for epsilon in row)
+    assert drawn.notes[KEY].all_dark
+
+
+@pytest.mark.parametrize(
+    "server",
+    [
+        cloud("a", offer("/other")),
+        cloud("a", offer(type_="std_srvs/srv/Trigger")),
+        cloud("a", draining=True),
+    ],
+)
+def test_a_use_that_no_live_server_offers_is_no_block(server: Sidecar) -> None:
+    drawn = picture(robot(), server)
+    assert drawn.problem.blocks == ()
+    assert "no live server" in drawn.notes[KEY].unserved
+
+
+def test_a_robot_without_addresses_is_no_block() -> None:
+    drawn = picture(robot(candidates=()), cloud("a"))
+    assert drawn.problem.blocks == ()
+    assert "address" in drawn.notes[KEY].unserved
+
+
+def test_several_addresses_of_an_interface_are_one_interface() -> None:
+    twice = (candidate("wlan0", ip="10.0.0.1"), candidate("wlan0", ip="10.0.0.2"))
+    (block,) = picture(robot(candidates=twice), cloud("a")).problem.blocks
+    assert block.interfaces == ("wlan0",)
+
+
+def test_capacities_come_from_the_configuration_and_from_the_offers() -> None:
+    drawn = picture(
+        robot(use(idempotent=False)), cloud("a", offer(capacity=3)), cloud("b", offer(capacity=0)), capacity=2
+    )
+    (block,) = drawn.problem.blocks
+    assert block.capacity == 2
+    assert not block.idempotent
+    assert drawn.problem.fleet_capacity == {FleetKey(NodeName("a"), PLAN): 3}
+
+
+def test_each_use_has_its_own_deadline() -> None:
+    estimator_paths = (path("wlan0", "a", rtt=histogram(0.05, times=100)),)
+    slow, fast = use("/slow", deadline_s=1.0), use("/fast", deadline_s=0.02)
+    drawn = picture(robot(slow, fast), cloud("a", offer("/slow"), offer("/fast")), paths=estimator_paths)
+    epsilon = {block.key.service: block.epsilon[0][0] for block in drawn.problem.blocks}
+    assert epsilon[slow.name] == pytest.approx(0.005, abs=0.002)
+    assert epsilon[fast.name] == pytest.approx(0.995, abs=0.002)

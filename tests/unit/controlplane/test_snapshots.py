@@ -1,0 +1,136 @@
+"""Versions, nonces, acks and nacks of one resource."""
+
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core.snapshots import Snapshots, Track, VersionSource
+from protos.model import Ack, Nack, NodeName, Peer, ResourceKind, Role, SessionId, SyncState, Version
+
+EPOCH = 1000
+
+
+def state(track: Track[str]) -> SyncState:
+    return track.status.state
+
+
+def ack(track: Track[str], *, nonce: int | None = None, version: int | None = None) -> bool:
+    return track.ack(
+        Ack(
+            ResourceKind.PEERS,
+            Version(version if version is not None else track.version_sent),
+            nonce if nonce is not None else track.nonce,
+        )
+    )
+
+
+def nack(track: Track[str], *, nonce: int | None = None, in_force: int = 0) -> bool:
+    answer = Nack(ResourceKind.PEERS, Version(in_force), nonce if nonce is not None else track.nonce, "no such peer")
+    return track.nack(answer)
+
+
+@pytest.fixture
+def versions() -> VersionSource:
+    return VersionSource(EPOCH)
+
+
+def test_versions_only_grow_and_start_above_the_epoch(versions: VersionSource) -> None:
+    first = versions.above(Version(0))
+    assert first > EPOCH
+    assert versions.above(Version(0)) > first
+
+
+def test_a_sidecar_that_holds_more_than_the_epoch_gets_still_more(versions: VersionSource) -> None:
+    high = Version(EPOCH * 1000)
+    assert versions.above(high) == high + 1
+    # Its claim does not carry everybody else along.
+    assert versions.above(Version(0)) < high
+
+
+def test_from_sent_to_synced(versions: VersionSource) -> None:
+    track: Track[str] = Track()
+    assert state(track) is SyncState.NOT_SENT
+    version = track.send("a", versions)
+    assert state(track) is SyncState.STALE
+    assert ack(track)
+    assert state(track) is SyncState.SYNCED
+    assert track.status.version_acked == version
+
+
+def test_a_nack_is_never_shown_as_synced(versions: VersionSource) -> None:
+    track: Track[str] = Track()
+    track.send("a", versions)
+    assert nack(track)
+    assert state(track) is SyncState.REJECTED
+    assert track.status.error == "no such peer"
+    assert not ack(track)
+    assert state(track) is SyncState.REJECTED
+    track.send("b", versions)
+    assert state(track) is SyncState.STALE
+    assert track.error == ""
+    assert ack(track)
+
+
+def test_a_nack_after_the_ack_wins(versions: VersionSource) -> None:
+    track: Track[str] = Track()
+    track.send("a", versions)
+    ack(track)
+    assert nack(track, in_force=3)
+    assert state(track) is SyncState.REJECTED
+    assert track.version_acked == 3
+
+
+def test_stale_nonces_are_ignored(versions: VersionSource) -> None:
+    track: Track[str] = Track()
+    old_version = track.send("a", versions)
+    old_nonce = track.nonce
+    track.send("b", versions)
+    assert not ack(track, nonce=old_nonce, version=old_version)
+    assert not nack(track, nonce=old_nonce)
+    assert not ack(track, version=old_version)
+    assert state(track) is SyncState.STALE
+    assert ack(track)
+
+
+def test_who_reconnects_with_the_version_sent_last_needs_nothing(versions: VersionSource) -> None:
+    track: Track[str] = Track()
+    version = track.send("a", versions)
+    track.begin_stream(version)
+    assert state(track) is SyncState.SYNCED
+    assert track.sent == "a"
+
+
+def test_who_reconnects_with_another_version_is_sent_everything_anew(versions: VersionSource) -> None:
+    track: Track[str] = Track()
+    track.send("a", versions)
+    ack(track)
+    second = track.send("b", versions)
+    track.begin_stream(Version(0))
+    assert state(track) is SyncState.NOT_SENT
+    assert track.sent is None
+    assert track.send("b", versions) > second
+
+
+def test_a_refused_version_is_sent_anew_on_the_next_stream(versions: VersionSource) -> None:
+    track: Track[str] = Track()
+    version = track.send("a", versions)
+    nack(track)
+    track.begin_stream(version)
+    assert state(track) is SyncState.NOT_SENT
+    assert track.sent is None
+
+
+def peer(name: str) -> Peer:
+    return Peer(NodeName(name), Role.CLOUD, SessionId(1), bytes(16), 1)
+
+
+def test_names_a_sidecar_may_know_grow_until_it_acknowledges(versions: VersionSource) -> None:
+    snapshots = Snapshots()
+    snapshots.send_peers((peer("a"), peer("b")), (), versions)
+    snapshots.send_peers((peer("b"), peer("c")), (), versions)
+    assert snapshots.known_names == {"a", "b", "c"}
+    stale = Ack(ResourceKind.PEERS, snapshots.peers.version_sent, snapshots.peers.nonce - 1)
+    assert not snapshots.peers_acked(stale)
+    assert snapshots.known_names == {"a", "b", "c"}
+    assert snapshots.peers_acked(Ack(ResourceKind.PEERS, snapshots.peers.version_sent, snapshots.peers.nonce))
+    assert snapshots.known_names == {"b", "c"}
