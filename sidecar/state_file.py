@@ -1,0 +1,141 @@
+"""Layout of the sidecar's files on disk, and their codec; no IO.
+
+    offset  size
+         0     8  magic: "plr-id\\0\\0" identity, "plr-last" last good messages of the control plane
+         8     2  format version, 1
+        10     4  length of the body
+        14    32  SHA-256 of the body
+        46        body
+
+    identity     token (16), incarnation (8)
+    last good    owner: length (1), name of the sidecar; then ControlMessages that hold a Welcome, a PeerSet, a
+                 MappingSet (the last of a kind counts): length (4), protobuf
+
+Numbers are big-endian. The checksum finds torn writes and bad sectors, not an attacker: the folder is the sidecar's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from protos.convert import control_message_to_proto, parse_control_message
+from protos.errors import DecodeError
+from protos.model import TOKEN_BYTES, MappingSet, NodeName, PeerSet, Welcome
+
+if TYPE_CHECKING:
+    from protos.model import ControlMessage
+
+FORMAT_VERSION = 1
+"""Of both files; an unknown one is refused."""
+
+MAX_FILE_BYTES = 64 << 20
+"""Well above the largest peer set and mapping that the control stream can carry."""
+
+_IDENTITY_MAGIC = b"plr-id\0\0"
+_LAST_GOOD_MAGIC = b"plr-last"
+_HEADER = struct.Struct("!8sHI32s")
+_IDENTITY = struct.Struct(f"!{TOKEN_BYTES}sQ")
+_LENGTH = struct.Struct("!I")
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What makes the sidecar the same one after a restart."""
+
+    token: bytes = field(repr=False)
+    """`TOKEN_BYTES` random bytes, drawn once."""
+    incarnation: int
+    """Grows with every start."""
+
+
+@dataclass(frozen=True, slots=True)
+class LastGood:
+    """What the control plane said last and the sidecar put in force."""
+
+    owner: NodeName
+    welcome: Welcome | None = None
+    peers: PeerSet | None = None
+    mapping: MappingSet | None = None
+
+    def with_message(self, message: ControlMessage) -> LastGood:
+        """Return this with `message` in place of the last one of its kind."""
+        match message:
+            case Welcome():
+                return replace(self, welcome=message)
+            case PeerSet():
+                return replace(self, peers=message)
+            case MappingSet():
+                return replace(self, mapping=message)
+
+
+def encode_identity(identity: Identity) -> bytes:
+    """Return the file's content."""
+    return _seal(_IDENTITY_MAGIC, _IDENTITY.pack(identity.token, identity.incarnation))
+
+
+def decode_identity(data: bytes) -> Identity:
+    """Read the file's content; raises DecodeError."""
+    body = _open(_IDENTITY_MAGIC, data)
+    if len(body) != _IDENTITY.size:
+        raise DecodeError(f"identity of {len(body)} bytes, not {_IDENTITY.size}")
+    return Identity(*_IDENTITY.unpack(body))
+
+
+def encode_last_good(last: LastGood) -> bytes:
+    """Return the file's content."""
+    owner = last.owner.encode()
+    parts = [bytes([len(owner)]), owner]
+    for message in (last.welcome, last.peers, last.mapping):
+        if message is not None:
+            data = control_message_to_proto(message).SerializeToString(deterministic=True)
+            parts += [_LENGTH.pack(len(data)), data]
+    return _seal(_LAST_GOOD_MAGIC, b"".join(parts))
+
+
+def decode_last_good(data: bytes, owner: NodeName) -> LastGood:
+    """Read the file's content; raises DecodeError, also when another sidecar wrote it."""
+    body = _open(_LAST_GOOD_MAGIC, data)
+    if not body:
+        raise DecodeError("no owner")
+    end = 1 + body[0]
+    if body[1:end] != owner.encode():
+        raise DecodeError(f"written by the sidecar {body[1:end]!r}")
+    last = LastGood(owner)
+    while end < len(body):
+        message, end = _pull_message(body, end)
+        last = last.with_message(message)
+    return last
+
+
+def _pull_message(body: bytes, start: int) -> tuple[ControlMessage, int]:
+    begin = start + _LENGTH.size
+    if begin > len(body):
+        raise DecodeError("message length cut off")
+    (length,) = _LENGTH.unpack_from(body, start)
+    end = begin + length
+    if end > len(body):
+        raise DecodeError("message cut off")
+    return parse_control_message(body[begin:end]), end
+
+
+def _seal(magic: bytes, body: bytes) -> bytes:
+    return _HEADER.pack(magic, FORMAT_VERSION, len(body), hashlib.sha256(body).digest()) + body
+
+
+def _open(magic: bytes, data: bytes) -> bytes:
+    if len(data) < _HEADER.size:
+        raise DecodeError(f"{len(data)} bytes are no header")
+    found, version, length, digest = _HEADER.unpack_from(data)
+    if found != magic:
+        raise DecodeError("not a file of this kind")
+    if version != FORMAT_VERSION:
+        raise DecodeError(f"format version {version}, not {FORMAT_VERSION}")
+    body = data[_HEADER.size :]
+    if len(body) != length:
+        raise DecodeError(f"body of {len(body)} bytes, not {length}")
+    if hashlib.sha256(body).digest() != digest:
+        raise DecodeError("wrong checksum")
+    return body

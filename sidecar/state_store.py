@@ -1,0 +1,185 @@
+"""What a restart needs, kept on disk: who the sidecar is, and what the control plane said last.
+
+Files are replaced whole (written aside, synced, renamed), so that a power cut leaves the old one or the new one. What
+cannot be read is set aside and counted, what cannot be written is logged: neither keeps the sidecar from running.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import secrets
+import threading
+import time
+from collections import Counter
+from typing import TYPE_CHECKING, TypeVar
+
+from protos.errors import DecodeError
+from protos.model import TOKEN_BYTES
+from sidecar.state_file import (
+    MAX_FILE_BYTES,
+    Identity,
+    LastGood,
+    decode_identity,
+    decode_last_good,
+    encode_identity,
+    encode_last_good,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from protos.model import ControlMessage, NodeName
+
+log = logging.getLogger(__name__)
+
+IDENTITY_FILE = "identity"
+LAST_GOOD_FILE = "last-good"
+LOCK_FILE = "lock"
+SET_ASIDE_SUFFIX = ".refused"
+
+CLOSE_TIMEOUT_S = 2.0
+"""How long `close` waits for the last write: a slow card must not hold up a shutdown."""
+
+MIN_WRITE_INTERVAL_S = 1.0
+"""Between two writes of what the control plane said: mappings may change several times a second, flash wears out."""
+
+T = TypeVar("T")
+
+
+class StateDirError(OSError):
+    """The folder cannot be used at all; the text says why."""
+
+
+class StateStore:
+    """One sidecar's folder, locked while open. Raises StateDirError when it cannot be used.
+
+    `identity` is new in every run: same token, larger incarnation.
+    """
+
+    def __init__(self, folder: Path, owner: NodeName) -> None:
+        self._folder = folder
+        self._owner = owner
+        self.failures: Counter[str] = Counter()
+        """Files not read or not written, by what failed: identity_refused, last_good_refused, write_failed."""
+        self._lock = _lock(folder)
+        self.identity = self._next_identity()
+        self._current = self._read(LAST_GOOD_FILE, lambda data: decode_last_good(data, owner)) or LastGood(owner)
+        self.last_good = self._current
+        """As found on disk when opened."""
+        self._condition = threading.Condition()
+        self._dirty = False
+        self._closing = False
+        self._writer = threading.Thread(target=self._write_when_changed, name="plr-state", daemon=True)
+        self._writer.start()
+
+    def remember(self, message: ControlMessage) -> None:
+        """Keep a message that is in force now, in place of the last one of its kind; returns at once."""
+        with self._condition:
+            changed = self._current.with_message(message)
+            if changed != self._current:
+                self._current = changed
+                self._dirty = True
+                self._condition.notify()
+
+    def close(self) -> None:
+        """Write what is not written yet, and let the folder go."""
+        with self._condition:
+            self._closing = True
+            self._condition.notify()
+        self._writer.join(CLOSE_TIMEOUT_S)
+        if self._writer.is_alive():
+            log.warning("%s: the last state is still being written", self._folder)
+        else:
+            os.close(self._lock)
+
+    def _next_identity(self) -> Identity:
+        known = self._read(IDENTITY_FILE, decode_identity)
+        # Milliseconds since 1970 let the number grow even where the last one could not be read or written.
+        incarnation = max(known.incarnation + 1 if known else 1, int(time.time() * 1000.0))
+        identity = Identity(known.token if known else secrets.token_bytes(TOKEN_BYTES), incarnation)
+        self._write(IDENTITY_FILE, encode_identity(identity))
+        return identity
+
+    def _write_when_changed(self) -> None:
+        while True:
+            with self._condition:
+                self._condition.wait_for(lambda: self._dirty or self._closing)
+                if not self._dirty:
+                    return
+                self._dirty = False
+                current = self._current
+            self._write(LAST_GOOD_FILE, encode_last_good(current))
+            with self._condition:
+                self._condition.wait_for(lambda: self._closing, MIN_WRITE_INTERVAL_S)
+
+    def _read(self, name: str, decode: Callable[[bytes], T]) -> T | None:
+        path = self._folder / name
+        try:
+            with path.open("rb") as file:
+                data = file.read(MAX_FILE_BYTES + 1)
+            if len(data) > MAX_FILE_BYTES:
+                raise DecodeError(f"more than {MAX_FILE_BYTES} bytes")
+            return decode(data)
+        except FileNotFoundError:
+            return None
+        except (OSError, DecodeError) as error:
+            self.failures[f"{name.replace('-', '_')}_refused"] += 1
+            aside = path.with_name(name + SET_ASIDE_SUFFIX)
+            log.error("%s refused (%s), set aside as %s", path, error, aside.name)
+            self._set_aside(path, aside)
+            return None
+
+    def _set_aside(self, path: Path, aside: Path) -> None:
+        try:
+            path.replace(aside)
+        except OSError as error:
+            log.error("%s cannot be set aside: %s", path, error)
+
+    def _write(self, name: str, data: bytes) -> None:
+        path = self._folder / name
+        temporary = path.with_name(name + ".new")
+        try:
+            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+            with open(descriptor, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(descriptor)
+            temporary.replace(path)
+            _sync_folder(self._folder)
+        except OSError as error:
+            self.failures["write_failed"] += 1
+            log.error("%s not written: %s; a restart will not know it", path, error)
+
+
+def _lock(folder: Path) -> int:
+    """Create the folder, and keep a second sidecar out of it for as long as the returned descriptor is open."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = _open_lock(folder / LOCK_FILE)
+    except OSError as error:
+        raise StateDirError(f"expected a folder that can be written: {error.strerror or error}") from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        raise StateDirError("expected a folder of its own: another sidecar is using it") from error
+    return descriptor
+
+
+def _open_lock(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError:
+        # A card that has gone read-only still holds the last mapping: the lock of an earlier run will do.
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

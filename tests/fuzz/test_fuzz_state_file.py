@@ -1,0 +1,48 @@
+"""State files decode to a value or raise DecodeError, also where the checksum is right."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protos.errors import DecodeError
+from protos.model import MappingSet, NodeName, PeerSet, Version, Welcome
+from sidecar.state_file import LastGood, decode_identity, decode_last_good, encode_last_good
+
+OWNER = NodeName("robot-1")
+GOOD = encode_last_good(LastGood(OWNER, Welcome(3.0, 0.5, ("s:1",)), PeerSet(Version(1), 2), MappingSet(Version(3), 4)))
+
+
+def sealed(magic: bytes, body: bytes) -> bytes:
+    return struct.pack("!8sHI32s", magic, 1, len(body), hashlib.sha256(body).digest()) + body
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes(data: bytes) -> None:
+    with pytest.raises(DecodeError):
+        decode_identity(data)
+    with pytest.raises(DecodeError):
+        decode_last_good(data, OWNER)
+
+
+@given(st.binary(max_size=200))
+def test_any_body_under_a_right_checksum(body: bytes) -> None:
+    with contextlib.suppress(DecodeError):
+        decode_identity(sealed(b"plr-id\0\0", body))
+    with contextlib.suppress(DecodeError):
+        decode_last_good(sealed(b"plr-last", body), OWNER)
+    with contextlib.suppress(DecodeError):
+        decode_last_good(sealed(b"plr-last", b"\x07robot-1" + body), OWNER)
+
+
+@given(st.integers(0, len(GOOD) - 1), st.integers(1, 255))
+def test_any_flipped_byte_is_noticed(position: int, flip: int) -> None:
+    spoilt = bytearray(GOOD)
+    spoilt[position] ^= flip
+    with pytest.raises(DecodeError):
+        decode_last_good(bytes(spoilt), OWNER)
