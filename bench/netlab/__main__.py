@@ -44,6 +44,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             robots=arguments.robots,
         )
         first_commands = [parse_command(text) for text in arguments.link]
+        if arguments.action == "exec":
+            arguments.command = [word for place, word in enumerate(arguments.command) if place or word != "--"]
+            if not arguments.command:
+                raise LabConfigError("exec: expected a command after --")
         trace = load_trace(arguments.trace) if arguments.trace else None
         paths = _parse_paths(arguments.paths)
         with Lab(config, seed=arguments.seed) as lab:
@@ -69,9 +73,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "--interfaces", default="wlan0,wwan0", metavar="A,B", help="the robot's (%(default)s)"
-    )
+    parser.add_argument("--interfaces", default="wlan0,wwan0", metavar="A,B", help="the robot's (%(default)s)")
     parser.add_argument("--clouds", type=int, default=2, metavar="N", help="cloud hosts (%(default)s)")
     parser.add_argument("--robots", type=int, default=1, metavar="N", help="robots (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of loss and jitter (%(default)s)")
@@ -114,10 +116,7 @@ def _run(lab: Lab, arguments: argparse.Namespace) -> int:
             print(lab.drawing())
             return _foreground(lab, arguments.host, [os.environ.get("SHELL", "/bin/sh")])
         case "exec":
-            command = [word for index, word in enumerate(arguments.command) if index or word != "--"]
-            if not command:
-                raise LabConfigError("exec: expected a command after --")
-            return _foreground(lab, arguments.host, command)
+            return _foreground(lab, arguments.host, arguments.command)
         case "calibrate":
             result = calibrate(lab, lab.config.robots[0].interfaces[0].name)
             print(

@@ -41,7 +41,7 @@ def parse_command(line: str) -> Command:
     """Parse one line.
 
     Raises:
-        LabConfigError: not such a line; says what was expected.
+        LabConfigError: not such a line, or a value out of range; says what was expected.
     """
     target, *words = line.replace(":", " ", 1).replace(",", " ").split() or [""]
     host, slash, interface = target.rpartition("/")
@@ -53,7 +53,9 @@ def parse_command(line: str) -> Command:
         if direction:
             raise LabConfigError(f"{words[0]}: always for both directions")
         return replace(named, verb=words[0])
-    return replace(named, changes=tuple(_parse_change(word) for word in words))
+    changes = tuple(_parse_change(word) for word in words)
+    LinkProfile.from_json(dict(changes))  # for its checks
+    return replace(named, changes=changes)
 
 
 def apply_command(lab: Lab, command: Command) -> None:
@@ -84,9 +86,7 @@ def apply_command(lab: Lab, command: Command) -> None:
 def _parse_change(word: str) -> tuple[str, float | int | None]:
     name, equals, value = word.partition("=")
     if not equals or name not in _PROFILE_FIELDS:
-        raise LabConfigError(
-            f"expected one of {', '.join(_VERBS)}, or {'=, '.join(_PROFILE_FIELDS)}=; got {word!r}"
-        )
+        raise LabConfigError(f"expected one of {', '.join(_VERBS)}, or {'=, '.join(_PROFILE_FIELDS)}=; got {word!r}")
     if name == "rate_kbps" and value == "none":
         return name, None
     try:

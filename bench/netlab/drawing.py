@@ -29,7 +29,5 @@ def draw(config: LabConfig, plan: Plan) -> str:
     for position, (name, where, path) in enumerate(rows):
         end = "┐" if position == 0 else "┘" if position == len(rows) - 1 else "┤"
         label = f" {CORE}" if position == len(rows) // 2 else ""
-        lines.append(
-            f"{name:<{widths[0]}}  {where:<{widths[1]}}  {path + '─' * (widths[2] - len(path))}──{end}{label}"
-        )
+        lines.append(f"{name:<{widths[0]}}  {where:<{widths[1]}}  {path + '─' * (widths[2] - len(path))}──{end}{label}")
     return "\n".join(lines)

@@ -1,6 +1,6 @@
 """PID 1 of the lab: builds the plan inside its own namespaces, then holds them until told, or orphaned.
 
-Runs as `python -S -m bench.netlab.holder LIFELINE_FD LINK_FD...` in fresh PID, mount, network, IPC and
+Runs as `python -S -m bench.netlab.holder LIFELINE_FD` in fresh PID, mount, network, IPC and
 UTS namespaces. As PID 1 its end is the end of every process of the lab, by the kernel's own rule, and
 with the processes go their namespaces, interfaces and rules. It ends when the lifeline closes.
 
@@ -46,13 +46,16 @@ class _End:
 
 def main(argv: list[str]) -> None:
     """Build the lab and hold it."""
-    lifeline_fd, *link_fds = map(int, argv)
+    lifeline_fd = int(argv[0])
     lifeline = LineSocket(socket.socket(fileno=lifeline_fd))
     kernel.set_process_name("netlab")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    plan = lifeline.receive()
-    if plan is None:
+    hello, plan = lifeline.receive(), lifeline.receive()
+    if hello is None or plan is None:
         return
+    # Handed over here and not inherited, as unshare would inherit them too and keep them open: the
+    # death of an emulator must show as the end of its control socket.
+    link_fds = [lifeline.take_descriptor() for _ in range(hello["links"])]
     holder = _Holder(plan, link_fds, lifeline_fd)
     try:
         pids = holder.build()
@@ -77,7 +80,7 @@ def _serve(message: dict[str, Any], lifeline: LineSocket) -> None:
             with socket.socket(message["family"], message["kind"]) as made:
                 if message["device"] is not None:
                     made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, message["device"].encode())
-                lifeline.send_with_descriptor({}, made.fileno())
+                lifeline.send_with_descriptors({}, [made.fileno()])
 
 
 class _Holder:
@@ -103,6 +106,8 @@ class _Holder:
                 for interface_lines in namespace["interface_lines"].values():
                     lines += interface_lines
                 _ip_batch(lines)
+                if namespace["ip6_rules"]:
+                    _feed(["ip", "-6", "-batch", "-"], "\n".join(namespace["ip6_rules"]) + "\n")
                 if namespace["nft_rules"]:
                     _feed(["nft", "-f", "-"], namespace["nft_rules"])
         return self._anchors

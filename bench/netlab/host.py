@@ -15,9 +15,12 @@ from bench.netlab.errors import LabError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+    from concurrent.futures import Executor
 
 # nsenter needs a few ms to fork; far more means that the machine is overloaded or the lab is gone.
 _START_TIMEOUT_S = 10.0
+# Ends the program that follows when the thread that started it ends, however that comes about.
+DIE_WITH_PARENT = ("setpriv", "--pdeathsig", "KILL")
 
 
 class HostProcess(subprocess.Popen[bytes]):
@@ -67,6 +70,7 @@ class Host:
         addresses: Mapping[str, Mapping[int, str]],
         interface_lines: Mapping[str, Sequence[str]],
         environment: Mapping[str, str],
+        spawner: Executor,
         open_socket: Callable[[int, int, str | None], socket.socket],
     ) -> None:
         self.name = name
@@ -77,6 +81,7 @@ class Host:
         self._user_namespace = user_namespace
         self._addresses = addresses
         self._interface_lines = interface_lines
+        self._spawner = spawner
         self._open_socket = open_socket
         self._processes: list[HostProcess] = []
 
@@ -133,7 +138,7 @@ class Host:
                 merged.pop(key, None)
             else:
                 merged[key] = value
-        command = [*self.enter_command(cwd), *(os.fspath(word) for word in argv)]
+        command = [*DIE_WITH_PARENT, *self.enter_command(cwd), *(os.fspath(word) for word in argv)]
         log = None
         if log_path is not None:
             if stdout is not None or stderr is not None:
@@ -141,14 +146,15 @@ class Host:
             log = stdout = Path(log_path).open("ab")
             stderr = subprocess.STDOUT
         try:
-            process = HostProcess(
+            process = self._spawner.submit(
+                HostProcess,
                 command,
                 env=merged,
                 stdin=stdin,
                 stdout=stdout,
                 stderr=stderr,
                 start_new_session=new_session,
-            )
+            ).result()
         finally:
             if log is not None:
                 log.close()
@@ -239,11 +245,15 @@ class Host:
         if done.returncode:
             raise LabError(f"{self.name}: {done.stderr.strip()}")
 
-    def reap(self) -> None:
-        """Wait for every program that was started; for `Lab.close`, after the lab's end."""
+    def wake(self) -> None:
+        """Let the waiting nsenters of stopped programs see the end that comes; for `Lab.close`."""
         for process in self._processes:
             if process.poll() is None:
                 process.wake()
+
+    def reap(self) -> None:
+        """Wait for every program that was started; for `Lab.close`, after the lab's end."""
+        for process in self._processes:
             process.wait()
             for pipe in (process.stdin, process.stdout, process.stderr):
                 if pipe is not None:

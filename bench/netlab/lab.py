@@ -12,6 +12,7 @@ import sys
 import tempfile
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self, TypeVar
@@ -19,7 +20,7 @@ from typing import IO, TYPE_CHECKING, Any, Self, TypeVar
 from bench.netlab import kernel
 from bench.netlab.drawing import draw
 from bench.netlab.errors import LabError
-from bench.netlab.host import Host, children_of
+from bench.netlab.host import DIE_WITH_PARENT, Host, children_of
 from bench.netlab.link import Link
 from bench.netlab.plan import Plan, make_plan
 from bench.netlab.profile import LinkProfile
@@ -90,6 +91,9 @@ class Lab:
         self._holder: subprocess.Popen[bytes] | None = None
         self._inner_pids: dict[str, int] = {}
         self._lifeline: LineSocket | None = None
+        # The kernel sends the parent-death signal when the *thread* that started a process ends: all are
+        # started from one thread that lives as long as the lab.
+        self._spawner = ThreadPoolExecutor(1, "netlab-spawner")
         self._log: IO[bytes] | None = None
         self._lifeline_lock = threading.Lock()
         self.port_kind = ""
@@ -164,6 +168,8 @@ class Lab:
         if self._lifeline is not None:
             self._lifeline.close()
             self._lifeline = None
+        for machine in self._machines.values():
+            machine.wake()
         if self._holder is not None:
             # unshare ends as its child does, which the kernel reports only when all the lab is dead.
             try:
@@ -179,6 +185,7 @@ class Lab:
         if self._log is not None:
             self._log.close()
             self._log = None
+        self._spawner.shutdown()
 
     def _start(self) -> None:
         missing = [program for program in _NEEDED_PROGRAMS if shutil.which(program) is None]
@@ -202,10 +209,11 @@ class Lab:
             )
             self._links[link.host, link.interface] = handle
         self._log = tempfile.TemporaryFile()
-        self._holder = _start_holder([theirs, *link_ends], self._log, user_namespace=user_namespace)
-        for end in (theirs, *link_ends):
+        self._holder = self._spawner.submit(_start_holder, theirs, self._log, user_namespace=user_namespace).result()
+        theirs.close()
+        ready = self._build(self._plan, link_ends)
+        for end in link_ends:
             end.close()
-        ready = self._build(self._plan)
         if "ready" not in ready:
             why = ready.get("error", "its holder died")
             raise LabError(f"the lab could not be built: {why}\n{self._read_log()}")
@@ -220,6 +228,7 @@ class Lab:
                 addresses=self._plan.addresses[name],
                 interface_lines=namespace.interface_lines,
                 open_socket=partial(self._socket, name),
+                spawner=self._spawner,
                 environment={"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "NETLAB_HOST": name},
             )
         for spec in self.config.hosts:
@@ -228,10 +237,12 @@ class Lab:
                     router = self._machines[self._plan.gateways[spec.name][interface.name]]
                     self._nats[spec.name, interface.name] = Nat(interface.nat, router, self)
 
-    def _build(self, plan: Plan) -> dict[str, Any]:
+    def _build(self, plan: Plan, link_ends: list[socket.socket]) -> dict[str, Any]:
         assert self._lifeline is not None
         self._lifeline.settimeout(_BUILD_TIMEOUT_S)
         try:
+            descriptors = [end.fileno() for end in link_ends]
+            self._lifeline.send_with_descriptors({"links": len(descriptors)}, descriptors)
             self._lifeline.send(plan.to_json())
             return self._lifeline.receive() or {}
         except OSError as error:
@@ -262,9 +273,7 @@ class Lab:
             return socket.socket(fileno=self._lifeline.take_descriptor())
 
 
-def _start_holder(
-    ends: list[socket.socket], log: IO[bytes], *, user_namespace: bool
-) -> subprocess.Popen[bytes]:
+def _start_holder(end: socket.socket, log: IO[bytes], *, user_namespace: bool) -> subprocess.Popen[bytes]:
     command = [
         "unshare",
         "--pid",
@@ -278,14 +287,10 @@ def _start_holder(
     ]
     if user_namespace:
         command += ["--user", "--map-root-user"]
-    if threading.current_thread() is threading.main_thread():
-        # The signal comes when the thread that started the lab ends; the lifeline alone serves others.
-        command = ["setpriv", "--pdeathsig", "KILL", *command]
-    descriptors = [end.fileno() for end in ends]
     return subprocess.Popen(
         # -S: the standard library is all it needs, and a venv's start-up hooks may be slow.
-        [*command, sys.executable, "-S", "-m", "bench.netlab.holder", *map(str, descriptors)],
-        pass_fds=descriptors,
+        [*DIE_WITH_PARENT, *command, sys.executable, "-S", "-m", "bench.netlab.holder", str(end.fileno())],
+        pass_fds=[end.fileno()],
         env={**os.environ, "PYTHONPATH": str(_REPOSITORY)},
         stdin=subprocess.DEVNULL,
         stdout=log,

@@ -68,6 +68,8 @@ class Namespace:
     is_host: bool
     sysctls: dict[str, str]
     ip_lines: list[str] = field(default_factory=list)
+    ip6_rules: list[str] = field(default_factory=list)
+    """Commands of `ip -6 -batch`: a rule does not tell its family."""
     interface_lines: dict[str, list[str]] = field(default_factory=dict)
     """Interface -> the commands that address and route it, to be given again after it was down."""
     nft_rules: str = ""
@@ -154,9 +156,7 @@ def _plan_interface(
     else:
         router_name = f"{host.name}-{interface.name}-nat"
         sysctls = {**_COMMON_SYSCTLS, **_FORWARDING_SYSCTLS, **router_sysctls(interface.nat)}
-        router = Namespace(
-            router_name, False, sysctls, list(_LOOPBACK), nft_rules=router_rules(interface.nat)
-        )
+        router = Namespace(router_name, False, sysctls, list(_LOOPBACK), nft_rules=router_rules(interface.nat))
         plan.namespaces[router_name] = router
         plan.gateways.setdefault(host.name, {})[interface.name] = router_name
         wan = End(router_name, "wan0", _mac(number, 1))
@@ -180,7 +180,8 @@ def _plan_interface(
         table = _FIRST_SOURCE_TABLE + position
         for family in (4, 6):
             lines.append(f"route replace default via {gateway[family]} dev {interface.name} table {table}")
-            plan.namespaces[host.name].ip_lines.append(f"rule add from {own[family]} lookup {table}")
+            rules = plan.namespaces[host.name].ip_lines if family == 4 else plan.namespaces[host.name].ip6_rules
+            rules.append(f"rule add from {own[family]} lookup {table}")
 
 
 def _address(plan: Plan, end: End, peer: End, addresses: dict[int, str], own_number: int) -> None:

@@ -27,9 +27,7 @@ class Replay:
         if not steps:
             raise LabConfigError("trace: no steps")
         if repeat_s is not None and repeat_s <= steps[-1].at_s:
-            raise LabConfigError(
-                f"repeat_s: {repeat_s} does not lie beyond the last step at {steps[-1].at_s}"
-            )
+            raise LabConfigError(f"repeat_s: {repeat_s} does not lie beyond the last step at {steps[-1].at_s}")
         self._steps = steps
         self._repeat_s = repeat_s
         self._start = start

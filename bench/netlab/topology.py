@@ -64,9 +64,7 @@ class HostSpec:
 
     def __post_init__(self) -> None:
         if not _HOST_NAME.fullmatch(self.name):
-            raise LabConfigError(
-                f"host name: expected a letter, then letters, digits, _ -, got {self.name!r}"
-            )
+            raise LabConfigError(f"host name: expected a letter, then letters, digits, _ -, got {self.name!r}")
         names = [interface.name for interface in self.interfaces]
         if not names or len(set(names)) != len(names):
             raise LabConfigError(f"{self.name}: expected at least one interface, each name once, got {names}")
@@ -115,15 +113,11 @@ class LabConfig:
         return (*self.robots, *self.clouds, self.control)
 
     @classmethod
-    def of(
-        cls, *, interfaces: tuple[str, ...] = ("wlan0", "wwan0"), clouds: int = 2, robots: int = 1
-    ) -> LabConfig:
+    def of(cls, *, interfaces: tuple[str, ...] = ("wlan0", "wwan0"), clouds: int = 2, robots: int = 1) -> LabConfig:
         """Robots named robot, robot_2, ...; clouds named cloud_a, cloud_b, ...; one control host."""
         if not 1 <= clouds <= 26:
             raise LabConfigError(f"clouds: expected 1..26, got {clouds}")
         return cls(
-            robots=tuple(
-                robot("robot" if n == 1 else f"robot_{n}", interfaces) for n in range(1, robots + 1)
-            ),
+            robots=tuple(robot("robot" if n == 1 else f"robot_{n}", interfaces) for n in range(1, robots + 1)),
             clouds=tuple(server(f"cloud_{chr(ord('a') + n)}") for n in range(clouds)),
         )

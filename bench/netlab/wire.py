@@ -8,6 +8,9 @@ from typing import Any
 
 from bench.netlab.errors import LabError
 
+# SCM_MAX_FD of the kernel.
+_MAX_DESCRIPTORS = 253
+
 
 class LineSocket:
     """JSON lines over a connected stream socket, blocking or polled."""
@@ -29,12 +32,12 @@ class LineSocket:
         """Send one message. Raises OSError."""
         self._socket.sendall(json.dumps(message).encode() + b"\n")
 
-    def send_with_descriptor(self, message: dict[str, Any], descriptor: int) -> None:
-        """Send one message and, with it, an open file. Raises OSError."""
-        socket.send_fds(self._socket, [json.dumps(message).encode() + b"\n"], [descriptor])
+    def send_with_descriptors(self, message: dict[str, Any], descriptors: list[int]) -> None:
+        """Send one short message and, with it, open files. Raises OSError."""
+        socket.send_fds(self._socket, [json.dumps(message).encode() + b"\n"], descriptors)
 
     def take_descriptor(self) -> int:
-        """The open file that came with a message. Raises LabError if there was none."""
+        """The next of the open files that came with messages. Raises LabError if there was none."""
         if not self._descriptors:
             raise LabError("the lab's control socket: no open file came along")
         return self._descriptors.pop(0)
@@ -61,7 +64,7 @@ class LineSocket:
 
     def _fill(self) -> bool:
         try:
-            data, descriptors, _, _ = socket.recv_fds(self._socket, 1 << 16, 4, socket.MSG_CMSG_CLOEXEC)
+            data, descriptors, _, _ = socket.recv_fds(self._socket, 1 << 16, _MAX_DESCRIPTORS, socket.MSG_CMSG_CLOEXEC)
         except ConnectionError:
             return False
         self._received += data
