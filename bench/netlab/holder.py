@@ -90,7 +90,8 @@ class _Holder:
         self._lifeline_fd = lifeline_fd
         self._anchors: dict[str, int] = {}
         self.link_kinds: list[str] = []
-        self._use_tap = os.access("/dev/net/tun", os.R_OK | os.W_OK)
+        may_open_tun = os.access("/dev/net/tun", os.R_OK | os.W_OK)
+        self._use_tap = plan["ports"] == "tap" or (plan["ports"] == "auto" and may_open_tun)
 
     def build(self) -> dict[str, int]:
         """Everything of the plan; returns machine name -> anchor's PID, as seen in here."""

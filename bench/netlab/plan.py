@@ -98,6 +98,7 @@ class Plan:
     gateways: dict[str, dict[str, str]] = field(default_factory=dict)
     """Host -> interface -> its NAT router's namespace."""
     hosts_file: str = ""
+    ports: str = "auto"
 
     def to_json(self) -> dict[str, Any]:
         """Ready for JSON."""
@@ -106,12 +107,13 @@ class Plan:
             "segments": [asdict(segment) for segment in self.segments],
             "links": [asdict(link) for link in self.links],
             "hosts_file": self.hosts_file,
+            "ports": self.ports,
         }
 
 
 def make_plan(config: LabConfig, seed: int) -> Plan:
     """Lay out the whole lab; pure."""
-    plan = Plan()
+    plan = Plan(ports=config.ports)
     core = Namespace(CORE, False, {**_COMMON_SYSCTLS, **_FORWARDING_SYSCTLS}, list(_LOOPBACK))
     plan.namespaces[CORE] = core
     number = 0

@@ -70,9 +70,10 @@ class HostSpec:
             raise LabConfigError(f"{self.name}: expected at least one interface, each name once, got {names}")
 
 
-def server(name: str) -> HostSpec:
-    """A host on the internet: one public `eth0`, plain cable."""
-    return HostSpec(name, (InterfaceSpec("eth0", emulated=False, nat=None),))
+def server(name: str, *, delay_ms: float = 0.0) -> HostSpec:
+    """A host on the internet: one public `eth0` on a plain cable, or `delay_ms` away (each way, emulated)."""
+    far = LinkProfile(delay_ms=delay_ms)
+    return HostSpec(name, (InterfaceSpec("eth0", emulated=delay_ms > 0, nat=None, up=far, down=far),))
 
 
 def robot(name: str = "robot", interfaces: tuple[str, ...] = ("wlan0", "wwan0")) -> HostSpec:
@@ -94,6 +95,8 @@ class LabConfig:
     source_routing: bool = False
     """Also route by source address, so that a socket bound to an interface's address alone leaves through
     that interface. A robot out of the box does not; sockets bound to the device work either way."""
+    ports: Literal["auto", "tap", "packet"] = "auto"
+    """How the emulator gets its frames: TAP devices, packet sockets on veth pairs, or what is to be had."""
 
     def __post_init__(self) -> None:
         names = [host.name for host in self.hosts]

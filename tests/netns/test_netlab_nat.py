@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.netlab import HostSpec, InterfaceSpec, Lab, LabConfig, NatSpec
+from bench.netlab import HostSpec, InterfaceSpec, Lab, LabConfig, NatSpec, server
 from tests.netns.netlab_traffic import ping_times_ms, silent, udp, unreachable
 
 pytestmark = pytest.mark.netns
@@ -124,3 +124,18 @@ def test_interfaces_of_four_kinds_and_two_robots_work_together() -> None:
         lab.link("usb0", host="robot_2").blackhole()
         assert unreachable(lab.host("robot_2"), target, device="usb0")
         assert len(ping_times_ms(lab.host("robot"), target, device="usb0", count=1)) == 1
+
+
+def test_server_can_be_far_away() -> None:
+    robot = HostSpec("robot", (InterfaceSpec("eth0", emulated=False),))
+    config = LabConfig(robots=(robot,), clouds=(server("near"), server("far", delay_ms=20)))
+    with Lab(config) as lab:
+        for family in (4, 6):
+            near, far = (
+                ping_times_ms(lab.host("robot"), lab.host(name).address(family=family), device="eth0", family=family)
+                for name in ("near", "far")
+            )
+            assert len(near) == len(far) == 5
+            assert min(near) < 40 <= min(far)
+        lab.link("eth0", host="far").blackhole()
+        assert unreachable(lab.host("robot"), lab.host("far").address(), device="eth0")
