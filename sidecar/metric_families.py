@@ -1,0 +1,67 @@
+"""From plain values to Prometheus' metric families."""
+
+from __future__ import annotations
+
+import functools
+from bisect import bisect_left
+from typing import TYPE_CHECKING, TypeVar
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+from protos.histogram import MIDS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from protos.histogram import Histogram
+
+DURATION_BOUNDS_S = (
+    0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.075, 0.1, 0.125, 0.15, 0.2, 0.25, 0.3,
+    0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0, 60.0,
+)  # fmt: skip
+"""Upper bounds of the exported buckets, seconds: dense where deadlines of robots lie."""
+
+K = TypeVar("K", bound=tuple[str, ...])
+S = TypeVar("S", bound=str)
+
+
+def counter(name: str, text: str, labels: tuple[str, ...], values: Mapping[K, float]) -> CounterMetricFamily:
+    """Return a counter, `values` by the values of its labels; its name gets _total."""
+    family = CounterMetricFamily(name, text, labels=labels)
+    for key, value in dict(values).items():
+        family.add_metric(key, value)
+    return family
+
+
+def gauge(name: str, text: str, labels: tuple[str, ...], values: Mapping[K, float]) -> GaugeMetricFamily:
+    """Return a gauge, `values` by the values of its labels."""
+    family = GaugeMetricFamily(name, text, labels=labels)
+    for key, value in dict(values).items():
+        family.add_metric(key, float(value))
+    return family
+
+
+def by_one(values: Mapping[S, float]) -> dict[tuple[str, ...], float]:
+    """Return the values under keys of one label."""
+    return {(key,): count for key, count in dict(values).items()}
+
+
+def cumulative(histogram: Histogram) -> tuple[list[tuple[str, float]], float]:
+    """Return (upper bound, count up to it) and the sum of seconds, each bucket counted whole by its middle (2 %)."""
+    counts = histogram.counts
+    below = [0] * (len(DURATION_BOUNDS_S) + 1)
+    for position, count in zip(_bucket_positions(), counts, strict=True):
+        below[position] += count
+    buckets = []
+    so_far = 0
+    for bound, count in zip((*map(str, DURATION_BOUNDS_S), "+Inf"), below, strict=True):
+        so_far += count
+        buckets.append((bound, float(so_far)))
+    return buckets, sum(count * middle for count, middle in zip(counts, MIDS, strict=True) if count)
+
+
+@functools.cache
+def _bucket_positions() -> tuple[int, ...]:
+    """For each bucket of the histogram, which exported bucket it belongs to; the overflow to +Inf."""
+    inside = (bisect_left(DURATION_BOUNDS_S, middle) for middle in MIDS[:-1])
+    return (*inside, len(DURATION_BOUNDS_S))

@@ -1,0 +1,244 @@
+"""The sidecar's metrics for Prometheus, built at scrape time from the plain counters that the cores keep.
+
+No code of prometheus_client runs where datagrams move: a scrape reads, on its own thread, what is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
+from prometheus_client.core import HistogramMetricFamily, InfoMetricFamily
+from prometheus_client.registry import Collector
+
+from sidecar.config_fields import split_host_port
+from sidecar.metric_families import by_one, counter, cumulative, gauge
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from prometheus_client import Metric
+
+    from sidecar.core.control_session import ControlStats
+    from sidecar.core.stats import EngineStats, LinkStats
+    from sidecar.ros.stats import BridgeStats
+
+_STOP_TIMEOUT_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class MetricSources:
+    """Where the counters are; each is asked at every scrape, on the scrape's thread, and must not block."""
+
+    name: str
+    role: str
+    version: str
+    engine: Callable[[], EngineStats]
+    links: Callable[[], Iterable[LinkStats]]
+    control: Callable[[], ControlStats]
+    connected: Callable[[], bool]
+    """Whether the control plane is within reach."""
+    bridge: Callable[[], BridgeStats] | None
+    state_failures: Callable[[], Mapping[str, int]]
+    """Files of the state folder that could not be read or written, by what failed."""
+
+
+class SidecarCollector(Collector):
+    """Turns the counters into metric families."""
+
+    def __init__(self, sources: MetricSources) -> None:
+        self._sources = sources
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield all metrics of the sidecar."""
+        sources = self._sources
+        info = InfoMetricFamily("plr_sidecar", "What this sidecar is.")
+        info.add_metric((), {"name": sources.name, "role": sources.role, "version": sources.version})
+        yield info
+        yield from _requests(sources.engine())
+        yield from _links(list(sources.links()))
+        yield from _control(sources.control(), sources.connected(), sources.engine())
+        if sources.bridge is not None:
+            yield from _bridge(sources.bridge())
+        yield counter(
+            "plr_state_failures",
+            "Files of the state folder that could not be read or written.",
+            ("reason",),
+            {(reason,): count for reason, count in dict(sources.state_failures()).items()},
+        )
+
+
+class MetricsServer:
+    """Serves /metrics on `listen` (address:port) from a thread of its own; raises OSError when it cannot listen."""
+
+    def __init__(self, listen: str, sources: MetricSources) -> None:
+        registry = CollectorRegistry()
+        registry.register(SidecarCollector(sources))
+        ProcessCollector(registry=registry)
+        host, port = split_host_port(listen)
+        self._server, self._thread = start_http_server(port, addr=host, registry=registry)
+
+    @property
+    def port(self) -> int:
+        """The port listened on, also where the configuration leaves it open."""
+        return self._server.server_port
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(_STOP_TIMEOUT_S)
+
+
+def _requests(stats: EngineStats) -> Iterator[Metric]:
+    yield counter(
+        "plr_requests", "Requests of local applications by what became of them.", ("service", "outcome"), stats.requests
+    )
+    durations = HistogramMetricFamily(
+        "plr_request_duration_seconds", "From a request to its first response.", labels=("service",)
+    )
+    for service, histogram in dict(stats.durations).items():
+        buckets, total_s = cumulative(histogram)
+        durations.add_metric((service,), buckets, total_s)
+    yield durations
+    yield gauge("plr_requests_in_flight", "Requests without a response yet.", (), {(): stats.in_flight})
+    yield counter(
+        "plr_path_wins",
+        "First responses by the path that brought them.",
+        ("interface", "peer", "service"),
+        stats.wins,
+    )
+    yield counter(
+        "plr_duplicate_responses",
+        "Responses to requests that another copy had answered.",
+        (),
+        {(): stats.duplicate_responses},
+    )
+    yield counter(
+        "plr_late_responses_dropped",
+        "Responses after the deadline that drop_late kept from the application.",
+        ("service",),
+        by_one(stats.late_dropped),
+    )
+    yield counter(
+        "plr_executions",
+        "Requests from robots by what the cloud sidecar did with them.",
+        ("service", "result"),
+        stats.executions,
+    )
+    yield counter(
+        "plr_messages_dropped",
+        "Messages and table entries dropped above the datagram layer.",
+        ("reason",),
+        by_one(stats.dropped),
+    )
+
+
+def _links(links: list[LinkStats]) -> Iterator[Metric]:
+    datagrams: dict[tuple[str, ...], float] = {}
+    dropped: dict[tuple[str, ...], float] = {}
+    transferred: dict[tuple[str, ...], float] = {}
+    up: dict[tuple[str, ...], float] = {}
+    rtt: dict[tuple[str, ...], float] = {}
+    sent: dict[tuple[str, ...], float] = {}
+    lost: dict[tuple[str, ...], float] = {}
+    path_bytes: dict[tuple[str, ...], float] = {}
+    for link in links:
+        datagrams |= {(link.interface, *key): count for key, count in dict(link.datagrams).items()}
+        dropped |= {(link.interface, key): count for key, count in dict(link.dropped).items()}
+        transferred |= {(link.interface, key): count for key, count in dict(link.bytes).items()}
+        for peer, path in dict(link.paths).items():
+            labels = (link.interface, peer)
+            up[labels] = path.up
+            if path.srtt_s > 0.0:
+                rtt[labels] = path.srtt_s
+            sent[labels] = path.datagrams_sent
+            lost[labels] = path.datagrams_lost
+            path_bytes[labels] = path.bytes_sent
+    of_path = ("interface", "peer")
+    yield counter("plr_datagrams", "UDP datagrams.", ("interface", "direction", "kind"), datagrams)
+    yield counter("plr_datagrams_dropped", "Datagrams not believed or not sendable.", ("interface", "reason"), dropped)
+    yield counter("plr_bytes", "UDP payload bytes.", ("interface", "direction"), transferred)
+    yield gauge("plr_path_up", "Whether the best path to the peer is alive.", of_path, up)
+    yield gauge("plr_path_rtt_seconds", "Smoothed round-trip time of the best path to the peer.", of_path, rtt)
+    yield counter("plr_path_datagrams_sent", "Numbered datagrams sent over the best path.", of_path, sent)
+    yield counter("plr_path_datagrams_lost", "Those of them found lost.", of_path, lost)
+    yield counter("plr_path_bytes_sent", "UDP payload bytes sent over the best path.", of_path, path_bytes)
+
+
+def _control(stats: ControlStats, connected: bool, engine: EngineStats) -> Iterator[Metric]:
+    yield gauge("plr_mapping_version", "Version of the mapping in force, 0 for none.", (), {(): engine.mapping_version})
+    yield gauge("plr_peers_version", "Version of the peers in force, 0 for none.", (), {(): engine.peers_version})
+    yield counter(
+        "plr_nacks",
+        "Pushed peers and mappings that were refused.",
+        ("resource",),
+        {(resource.value,): count for resource, count in dict(stats.nacks).items()},
+    )
+    yield counter(
+        "plr_acks",
+        "Pushed peers and mappings that are in force or were.",
+        ("resource",),
+        {(resource.value,): count for resource, count in dict(stats.acks).items()},
+    )
+    yield gauge("plr_control_plane_connected", "Whether the control plane is within reach.", (), {(): connected})
+    yield counter("plr_control_attempts", "Attempts to reach the control plane.", (), {(): stats.attempts})
+    yield counter("plr_control_streams", "Streams that the control plane accepted.", (), {(): stats.streams})
+    yield counter(
+        "plr_control_reports",
+        "Reports to the control plane.",
+        ("result",),
+        {("sent",): stats.reports, ("dropped",): stats.reports_dropped},
+    )
+    yield counter(
+        "plr_control_messages_ignored",
+        "Messages of the control plane not acted on.",
+        ("reason",),
+        by_one(stats.ignored),
+    )
+
+
+def _bridge(stats: BridgeStats) -> Iterator[Metric]:
+    passed = {
+        (direction, service): count
+        for direction, passed_on in (
+            ("request_from_application", stats.requests_taken),
+            ("answer_to_application", stats.answers_sent),
+            ("request_to_server", stats.requests_sent),
+            ("answer_from_server", stats.answers_taken),
+        )
+        for service, count in dict(passed_on).items()
+    }
+    yield counter(
+        "plr_bridge_messages", "Messages exchanged with the local ROS graph.", ("direction", "service"), passed
+    )
+    yield counter(
+        "plr_bridge_unanswered",
+        "Requests of local applications that will never be answered.",
+        ("service", "reason"),
+        stats.unanswered,
+    )
+    yield counter("plr_bridge_refused", "Requests of robots that were not run.", ("service", "reason"), stats.refused)
+    yield counter(
+        "plr_bridge_abandoned",
+        "Requests at local servers whose answer nobody waits for any more.",
+        ("service",),
+        by_one(stats.abandoned),
+    )
+    yield counter("plr_bridge_dropped", "Events and messages the bridge dropped.", ("reason",), by_one(stats.dropped))
+    yield counter("plr_bridge_errors", "Failures of rmw or the bridge.", ("where",), by_one(stats.errors))
+    yield gauge("plr_bridge_pending", "Requests between the bridge and an answer.", (), {(): stats.pending})
+    yield gauge("plr_services_carried", "Services offered here right now.", (), {(): len(stats.carried)})
+    yield gauge(
+        "plr_services_left_alone",
+        "Services offered by live servers that a local node already serves.",
+        (),
+        {(): len(stats.left_alone)},
+    )
+    yield gauge(
+        "plr_services_without_type",
+        "Services not carried because their type is not installed.",
+        (),
+        {(): len(stats.missing_types)},
+    )
