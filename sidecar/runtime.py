@@ -1,0 +1,214 @@
+"""Puts one sidecar together: state on disk, data plane, interfaces, ROS bridge, control client, metrics."""
+
+from __future__ import annotations
+
+import logging
+import random
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import sdnotify
+
+from protos.errors import ConfigError
+from protos.model import PROTOCOL_VERSION, Registration, SessionId, Version
+from sidecar.config_fields import split_host_port
+from sidecar.control_client import ControlClient
+from sidecar.core.control_session import ControlSession
+from sidecar.core.engine import EngineConfig
+from sidecar.metrics import MetricSources, MetricsServer
+from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from sidecar.net.interface_manager import Identity, InterfaceManager
+from sidecar.ros.bridge import RosBridge
+from sidecar.state_store import StateDirError, StateStore
+
+if TYPE_CHECKING:
+    from protos.model import InterfaceName, MappingSet, PeerSet, Report, Welcome
+    from sidecar.config import SidecarConfig
+    from sidecar.core.stun_events import StunEvent
+
+log = logging.getLogger(__name__)
+
+SWITCH_INTERVAL_S = 0.0005
+"""A computing thread gives the interpreter up after this (CPython's default is 5 ms): what another interface waits."""
+DRAIN_S = 5.0
+"""On SIGTERM, requests in flight get this long."""
+DRAIN_POLL_S = 0.02
+DEFAULT_STUN_PORT = 3478
+"""RFC 8489 section 8; used on the control plane's host when nobody names a STUN server."""
+
+
+class Sidecar:
+    """All parts of one sidecar; also what the control client calls (`ControlHooks`)."""
+
+    def __init__(self, config: SidecarConfig, version: str) -> None:
+        self._config = config
+        self._store = _open_store(config)
+        session = SessionId(random.SystemRandom().getrandbits(64) or 1)
+        rules = config.service_rules()
+        self._bridge = RosBridge(name=config.node_name, role=config.role, rules=rules)
+        self._data_plane = ThreadedDataPlane(
+            EngineConfig(config.role, rules),
+            session,
+            DataPlaneHooks(self._bridge, self._on_stun, self._on_services_changed),
+        )
+        last = self._store.last_good
+        identity = self._store.identity
+        self._control_session = ControlSession(
+            Registration(
+                protocol_version=PROTOCOL_VERSION,
+                name=config.node_name,
+                role=config.role,
+                session=session,
+                token=identity.token,
+                incarnation=identity.incarnation,
+                software_version=version,
+                peers_version=last.peers.version if last.peers else Version(0),
+                mapping_version=last.mapping.version if last.mapping else Version(0),
+            ),
+            random.SystemRandom(),
+        )
+        self._control = ControlClient(config.control_plane, self._control_session, self)
+        self._interfaces = InterfaceManager(
+            config,
+            Identity(session, identity.token, identity.incarnation),
+            self._data_plane,
+            self._control.set_candidates,
+        )
+        self._metrics: MetricsServer | None = None
+        self._version = version
+
+    def start(self) -> None:
+        """Start every part; what the disk remembers is in force before the control plane is asked.
+
+        Raises:
+            ConfigError: the configuration does not fit this machine.
+            OSError: a socket or the metrics' port is refused.
+        """
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        self._open_metrics()
+        self._data_plane.start()
+        last = self._store.last_good
+        self._interfaces.set_stun_servers(self._stun_servers(last.welcome))
+        self._interfaces.start()
+        if last.peers is not None:
+            self._restore("peers", self._data_plane.apply_peers(last.peers))
+        if last.mapping is not None:
+            self._restore("mapping", self._data_plane.apply_mapping(last.mapping))
+        self._bridge.start(self._data_plane)
+        self._control.start()
+
+    def stop(self) -> None:
+        """Finish what is in flight, say goodbye, end every thread."""
+        self._data_plane.drain()
+        self._control.drain()
+        end = time.monotonic() + DRAIN_S
+        while self._data_plane.busy and time.monotonic() < end:
+            time.sleep(DRAIN_POLL_S)
+        if self._data_plane.busy:
+            log.warning("%d requests or messages were still in flight after %.0f s", self._data_plane.busy, DRAIN_S)
+        self._bridge.stop()
+        self._control.stop()
+        self._data_plane.stop()
+        self._interfaces.stop()
+        self._store.close()
+        if self._metrics is not None:
+            self._metrics.close()
+
+    def _open_metrics(self) -> None:
+        listen = self._config.metrics_listen
+        if listen is None:
+            return
+        sources = MetricSources(
+            name=self._config.name,
+            role=self._config.role.value,
+            version=self._version,
+            engine=lambda: self._data_plane.engine_stats,
+            links=self._data_plane.link_stats,
+            control=lambda: self._control.stats,
+            connected=lambda: self._control.connected,
+            bridge=lambda: self._bridge.stats,
+            state_failures=lambda: self._store.failures,
+        )
+        try:
+            self._metrics = MetricsServer(listen, sources)
+        except OSError as error:
+            problem = f"expected an address and port to listen on, got '{listen}': {error.strerror or error}"
+            raise ConfigError("the configuration", "metrics_listen", problem) from error
+
+    def _restore(self, what: str, error: str | None) -> None:
+        if error:
+            log.warning("the %s kept on disk do not fit any more: %s", what, error)
+        else:
+            log.info("started from the %s kept on disk", what)
+
+    def _stun_servers(self, welcome: Welcome | None) -> tuple[str, ...]:
+        if welcome is not None and welcome.stun_servers:
+            return welcome.stun_servers
+        host, _ = split_host_port(self._config.control_plane)
+        shown = f"[{host}]" if ":" in host else host
+        return (f"{shown}:{DEFAULT_STUN_PORT}",)
+
+    def _on_stun(self, interface: InterfaceName, event: StunEvent) -> None:
+        self._interfaces.on_stun_event(interface, event)
+
+    def _on_services_changed(self) -> None:
+        self._control.set_services(*self._data_plane.services())
+
+    # -- ControlHooks, on the control client's thread -------------------------------------------------------------
+
+    def welcome(self, welcome: Welcome) -> None:
+        """A stream is accepted."""
+        self._store.remember(welcome)
+        self._interfaces.set_stun_servers(self._stun_servers(welcome))
+
+    def apply_peers(self, peers: PeerSet) -> str | None:
+        """Put the peers in force; returns why not, or None."""
+        error = self._data_plane.apply_peers(peers)
+        if error is None:
+            self._store.remember(peers)
+        return error
+
+    def apply_mapping(self, mapping: MappingSet) -> str | None:
+        """Put the mapping in force; returns why not, or None."""
+        error = self._data_plane.apply_mapping(mapping)
+        if error is None:
+            self._store.remember(mapping)
+            for service in mapping.services:
+                pairs = ", ".join(f"{pair.interface} to {pair.server}" for pair in service.assignments)
+                log.info("mapping %d: %s goes %s: %s", mapping.version, service.service, pairs, service.reason)
+        return error
+
+    def take_report(self) -> Report:
+        """Return what was measured since the last call."""
+        return self._data_plane.take_report()
+
+    def connection_changed(self, connected: bool, reason: str) -> None:
+        """The control plane came within reach, or went out of it."""
+        if not connected:
+            log.debug("without control plane (%s): going on with the last peers and mapping", reason)
+
+
+def _open_store(config: SidecarConfig) -> StateStore:
+    try:
+        return StateStore(config.state_dir, config.node_name)
+    except StateDirError as error:
+        raise ConfigError("the configuration", "state_dir", f"{error} ({config.state_dir})") from error
+
+
+def run(config: SidecarConfig, version: str, stopping: threading.Event) -> int:
+    """Run a sidecar until `stopping` is set; returns the exit code.
+
+    Raises:
+        ConfigError: the configuration does not fit this machine.
+    """
+    sidecar = Sidecar(config, version)
+    notifier = sdnotify.SystemdNotifier()
+    sidecar.start()
+    notifier.notify("READY=1")
+    stopping.wait()
+    log.info("stopping: no new requests, finishing those in flight")
+    notifier.notify("STOPPING=1")
+    sidecar.stop()
+    return 0
