@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import random
 import sys
-import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -24,6 +23,8 @@ from sidecar.ros.bridge import RosBridge
 from sidecar.state_store import StateDirError, StateStore
 
 if TYPE_CHECKING:
+    import threading
+
     from protos.model import InterfaceName, MappingSet, PeerSet, Report, Welcome
     from sidecar.config import SidecarConfig
     from sidecar.core.stun_events import StunEvent
