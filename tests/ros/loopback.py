@@ -1,4 +1,4 @@
-"""A data plane without a network: joins one robot bridge and one cloud bridge in this process, with faults on demand."""
+"""A data plane without a network: joins a robot bridge and a cloud bridge in this process, with faults."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import ServiceOffer
-    from sidecar.core.events import ApplicationEvent, RejectReason, RequestId
+    from sidecar.core.events import RejectReason, RequestId
     from sidecar.ports import Application
 
 log = logging.getLogger(__name__)

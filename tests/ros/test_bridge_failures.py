@@ -1,0 +1,195 @@
+"""What the bridge does when servers, messages and deadlines go wrong: each costs its own request only."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from protos.model import ServiceName
+from sidecar.core.events import RejectReason
+from tests.ros.mesh import wait_until
+from tests.ros.notice_listener import NoticeListener
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.ros.mesh import Mesh
+
+pytestmark = pytest.mark.ros
+
+PLAN = ServiceName("/plan")
+
+SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8" ?>
+<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <participant profile_name="short_lease" is_default_profile="true">
+    <rtps><builtin><discovery_config>
+      <leaseDuration><sec>2</sec></leaseDuration>
+      <leaseAnnouncement><sec>0</sec><nanosec>500000000</nanosec></leaseAnnouncement>
+    </discovery_config></builtin></rtps>
+  </participant>
+</profiles>
+"""
+
+
+def test_a_request_that_is_never_answered_costs_itself_only(mesh: Mesh) -> None:
+    mesh.faults.lifetime_s = 2.0
+    mesh.start()
+    mesh.serve("--plan", "/plan", "--deep")
+    mesh.wait_carried("/plan")
+    # Every second request is ignored by the server; far more than fit in its window.
+    result = mesh.result(mesh.call("/plan", "--count", "120", "--tolerance", "0", "-1", "--timeout-s", "6"))
+    assert (result["answered"], result["wrong"], result["twice"]) == (60, 0, 0)
+    wait_until(lambda: not mesh.robot.stats.pending and not mesh.cloud.stats.pending, "empty tables")
+    assert mesh.robot.stats.unanswered == {("/plan", "failed"): 60}
+    assert mesh.cloud.stats.abandoned[PLAN] == 60
+    assert mesh.result(mesh.call("/plan", "--count", "20"))["answered"] == 20
+
+
+def test_a_server_that_answers_nothing_at_first(mesh: Mesh) -> None:
+    """More requests than the window are ignored one after another; those behind them are answered all the same."""
+    mesh.start()
+    mesh.serve("--plan", "/plan", "--deep")
+    mesh.wait_carried("/plan")
+    ignored = ["-1"] * 12
+    result = mesh.result(mesh.call("/plan", "--count", "24", "--tolerance", *ignored, *["0"] * 12, "--timeout-s", "8"))
+    assert sorted(result["order"]) == list(range(12, 24))
+    assert mesh.cloud.stats.requests_paced > 0
+
+
+def test_the_server_ends_with_requests_pending(mesh: Mesh) -> None:
+    mesh.start()
+    server = mesh.serve("--plan", "/plan")
+    mesh.wait_carried("/plan")
+    app = mesh.call("/plan", "--count", "30", "--tolerance", "-1", "--timeout-s", "5")
+    wait_until(lambda: mesh.cloud.stats.pending == 30, "30 requests in the cloud")
+    server.stop(signal.SIGTERM)
+    wait_until(lambda: len(mesh.link.refusals) == 30, "30 refusals")
+    reasons = [reason for reason, _ in mesh.link.refusals]
+    # Those that had been given to the server may have run; the others certainly have not.
+    assert set(reasons) == {RejectReason.SERVER_LOST, RejectReason.NOT_OFFERED}
+    assert mesh.result(app)["answered"] == 0
+    mesh.wait_carried()
+    assert mesh.robot.stats.pending == mesh.cloud.stats.pending == 0
+
+
+def test_a_killed_server_is_noticed_when_its_lease_ends(
+    mesh: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    profile = tmp_path / "short-lease.xml"
+    profile.write_text(SHORT_LEASE)
+    mesh.start()
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
+    server = mesh.serve("--plan", "/plan")
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE")
+    mesh.wait_carried("/plan")
+    mesh.call("/plan", "--count", "3", "--tolerance", "-1", "--timeout-s", "1")
+    wait_until(lambda: mesh.cloud.stats.pending == 3, "3 requests at the server")
+    server.stop(signal.SIGKILL)
+    wait_until(lambda: len(mesh.link.refusals) == 3, "refusals")
+    assert {reason for reason, _ in mesh.link.refusals} == {RejectReason.SERVER_LOST}
+    mesh.wait_carried()
+
+
+def test_a_service_comes_goes_and_comes_back(mesh: Mesh) -> None:
+    mesh.start()
+    for round_number in range(3):
+        server = mesh.serve("--plan", "/plan", "--negate", "/negate")
+        mesh.wait_carried("/plan", "/negate")
+        assert mesh.result(mesh.call("/plan", "--count", "5"))["answered"] == 5, f"round {round_number}"
+        server.stop(signal.SIGTERM)
+        mesh.wait_carried()
+    assert mesh.robot.stats.answers_sent[PLAN] == 15
+
+
+def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The name never leaves the graph: only the server's endpoint tells that the old requests are lost."""
+    monkeypatch.setattr("sidecar.ros.graph.SCAN_PERIOD_S", 4.0)
+    mesh.start()
+    old = mesh.serve("--plan", "/plan")
+    mesh.wait_carried("/plan")
+    scans = mesh.cloud.stats.scans
+    wait_until(lambda: mesh.cloud.stats.scans > scans, "a look at the graph")
+    mesh.call("/plan", "--count", "4", "--tolerance", "-1", "--timeout-s", "1")
+    wait_until(lambda: mesh.cloud.stats.pending == 4, "4 requests at the server")
+    scans = mesh.cloud.stats.scans
+    wait_until(lambda: mesh.cloud.stats.scans > scans, "a look at the graph")
+    old.stop(signal.SIGTERM)
+    mesh.serve("--plan", "/plan")
+    wait_until(lambda: len(mesh.link.refusals) == 4, "refusals")
+    assert mesh.link.refusals[0][0] is RejectReason.SERVER_LOST
+    assert mesh.result(mesh.call("/plan"))["answered"] == 1
+
+
+def test_bytes_that_are_no_request(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
+    mesh.start()
+    mesh.serve("--plan", "/plan")
+    mesh.wait_carried("/plan")
+    mesh.faults.mangle_request = lambda payload: payload[:9]
+    assert mesh.result(mesh.call("/plan", "--count", "50", "--timeout-s", "3"))["answered"] == 0
+    assert [reason for reason, _ in mesh.link.refusals] == [RejectReason.BAD_PAYLOAD] * 50
+    assert mesh.cloud.stats.refused == {("/plan", "bad_payload"): 50}
+    assert len([record for record in caplog.records if "bad_payload" in record.getMessage()]) < 5
+    mesh.faults.mangle_request = lambda payload: payload
+    assert mesh.result(mesh.call("/plan"))["answered"] == 1
+
+
+def test_bytes_that_are_no_response(mesh: Mesh) -> None:
+    mesh.start()
+    mesh.serve("--plan", "/plan")
+    mesh.wait_carried("/plan")
+    mesh.faults.mangle_response = lambda payload: os.urandom(7)
+    assert mesh.result(mesh.call("/plan", "--count", "5", "--timeout-s", "2"))["answered"] == 0
+    assert mesh.robot.stats.unanswered == {("/plan", "bad_response"): 5}
+    assert mesh.robot.stats.pending == 0
+
+
+def test_withdrawn_with_requests_in_flight(mesh: Mesh) -> None:
+    """Late responses to a withdrawn service are counted, and the service can come back meanwhile."""
+    mesh.faults.delay_s = lambda: 0.5
+    mesh.start()
+    mesh.serve("--plan", "/plan", "--deep")
+    mesh.wait_carried("/plan")
+    app = mesh.call("/plan", "--count", "10", "--timeout-s", "4")
+    wait_until(lambda: mesh.robot.stats.pending == 10, "10 requests on their way")
+    offers = mesh.link.offers
+    mesh.link.offered(())
+    mesh.wait_carried()
+    mesh.link.offered(offers)
+    mesh.wait_carried("/plan")
+    assert mesh.result(app)["answered"] == 0
+    assert mesh.robot.stats.unanswered == {("/plan", "withdrawn"): 10}
+    assert mesh.robot.stats.dropped == {"response_without_request": 10}
+    assert mesh.result(mesh.call("/plan"))["answered"] == 1
+
+
+def test_missed_deadlines_and_failures_are_published(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, "sidecar")
+    mesh.faults.deadline_s = 0.2
+    mesh.faults.lifetime_s = 1.0
+    mesh.start()
+    mesh.serve("--plan", "/plan")
+    mesh.wait_carried("/plan")
+    with NoticeListener(mesh.robot_domain) as listener:
+        wait_until(listener.is_matched, "the notices' publisher")
+        time.sleep(0.5)  # matched on this side is not yet matched on the other
+        app = mesh.call("/plan", "--count", "2", "--tolerance", "-1", "0", "--timeout-s", "2")
+        assert mesh.result(app)["answered"] == 1
+        wait_until(lambda: listener.failures, "a failure")
+        (missed,) = listener.deadlines
+        (failed,) = listener.failures
+    assert missed.header.stamp.sec > 0
+    (status,) = missed.status
+    values = {pair.key: pair.value for pair in status.values}
+    assert (status.name, status.hardware_id) == ("/plan", "robot-1")
+    assert "200 ms" in status.message
+    assert values["deadline_s"] == "0.2"
+    assert values["copy_0"] == "lo-test -> cloud"
+    assert len(bytes.fromhex(values["request_id"])) == 16
+    assert {pair.key: pair.value for pair in failed.status[0].values}["outcome"] == "failed"
+    assert mesh.robot.stats.deadlines_missed == {"/plan": 1}
+    assert any("deadline of 200 ms missed" in record.getMessage() for record in caplog.records)
