@@ -41,8 +41,10 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from controlplane.core.registry import Sidecar
-    from protos.model import ControlMessage, NodeName, Peer, ServiceName, SidecarMessage
+    from protos.model import ControlMessage, NodeName, Peer, ServiceName, SidecarMessage, SyncState
 
 PUBLISH_DELAY_S = 0.02
 """From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two
@@ -69,6 +71,7 @@ class CloseReason(enum.Enum):
 
     REPLACED = "replaced by a newer stream of this sidecar"
     LEASE_EXPIRED = "silent for longer than the lease"
+    STOPPING = "the control plane is stopping"
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,6 +371,14 @@ class ControlCore:
                 )
             )
         return found
+
+    def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
+        """How far every registered sidecar follows; clouds get no mapping."""
+        for sidecar in self.registry:
+            snapshots = self._snapshots[sidecar.name]
+            yield sidecar.name, ResourceKind.PEERS, snapshots.peers.state
+            if sidecar.role is Role.ROBOT:
+                yield sidecar.name, ResourceKind.MAPPING, snapshots.mapping.state
 
     def miss_ratios(self, now: float) -> dict[tuple[NodeName, ServiceName], tuple[float, float | None]]:
         """For every planned (robot, service) the predicted miss probability and the observed ratio."""

@@ -1,0 +1,119 @@
+"""plr-controlplane: discovers the sidecars, gathers what they measure, and tells robots where to send requests.
+
+examples:
+  plr-controlplane --config /etc/plr/controlplane.yaml
+  plr-controlplane --config /etc/plr/controlplane.yaml --check-config
+
+exit codes: 0 stopped cleanly, 1 failed while running, 2 bad usage or configuration
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import sdnotify
+
+from controlplane import version
+from controlplane.config import load_config
+from controlplane.server import StartError, serve
+from protos.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from controlplane.config import ControlPlaneConfig
+    from controlplane.server import Addresses
+
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+
+log = logging.getLogger("controlplane")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program; returns its exit code."""
+    arguments = _parser().parse_args(argv)
+    try:
+        config = load_config(arguments.config)
+    except ConfigError as error:
+        sys.stderr.write(f"plr-controlplane: {error}\n")
+        return EXIT_USAGE
+    if arguments.check_config:
+        sys.stdout.write(f"{arguments.config}: ok\n")
+        return EXIT_OK
+    _start_logging(config.log_level)
+    try:
+        asyncio.run(_run(config))
+    except StartError as error:
+        log.critical("%s: %s", arguments.config, error)
+        return EXIT_FAILED
+    except Exception:
+        log.critical("the control plane failed", exc_info=True)
+        return EXIT_FAILED
+    log.info("stopped")
+    return EXIT_OK
+
+
+def _parser() -> argparse.ArgumentParser:
+    summary, _, epilog = (__doc__ or "").partition("\n\n")
+    parser = argparse.ArgumentParser(
+        prog="plr-controlplane",
+        description=summary,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="YAML configuration")
+    parser.add_argument("--check-config", action="store_true", help="check the configuration, then exit")
+    parser.add_argument("--version", action="version", version=version.describe("plr-controlplane"))
+    return parser
+
+
+def _start_logging(level: str) -> None:
+    logging.Formatter.converter = time.gmtime
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=level.upper(),
+        format="%(asctime)s.%(msecs)03dZ %(levelname)s %(name)s: %(message)s",
+        datefmt="%Y-%m-%dT%H:%M:%S",
+    )
+
+
+async def _run(config: ControlPlaneConfig) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    systemd = sdnotify.SystemdNotifier()
+
+    def ready(addresses: Addresses) -> None:
+        log.info(
+            "%s listens: gRPC %s, STUN %s, metrics %s",
+            version.describe("plr-controlplane"),
+            addresses.grpc,
+            ", ".join(addresses.stun) or "off",
+            addresses.metrics or "off",
+        )
+        if addresses.stun and not config.stun_servers:
+            log.warning(
+                "stun_servers is empty: sidecars are told no STUN server, and robots behind a NAT stay unreachable "
+                "unless their own configuration names one"
+            )
+        systemd.notify("READY=1")
+
+    def stopping() -> None:
+        log.info("stopping")
+        systemd.notify("STOPPING=1")
+
+    await serve(config, stop, ready, stopping)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

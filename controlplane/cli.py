@@ -1,0 +1,107 @@
+"""plr: ask a running control plane, and look up configuration keys.
+
+examples:
+  plr status
+  plr status --address control.example.org:50051 --json
+  plr config schema controlplane
+  plr config schema sidecar
+
+exit codes: 0 ok, 1 the control plane cannot be reached or is not in order, 2 bad usage
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import grpc
+from google.protobuf import json_format
+
+from controlplane import status_table, version
+from controlplane.config import ControlPlaneConfig, check_target
+from protos.convert import status_from_proto
+from protos.errors import DecodeError
+from protos.plr.v1 import admin_pb2, admin_pb2_grpc
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+EXIT_OK = 0
+EXIT_FAILED = 1
+
+DEFAULT_ADDRESS = "127.0.0.1:50051"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program; returns its exit code."""
+    arguments = _parser().parse_args(argv)
+    code: int = arguments.run(arguments)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    summary, _, epilog = (__doc__ or "").partition("\n\n")
+    parser = argparse.ArgumentParser(
+        prog="plr",
+        description=summary,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=version.describe("plr"))
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    status = commands.add_parser("status", help="who is connected, and how far each follows")
+    status.add_argument("--address", type=_address, default=DEFAULT_ADDRESS, metavar="HOST:PORT")
+    status.add_argument("--timeout-s", type=float, default=5.0, metavar="SECONDS")
+    status.add_argument("--json", action="store_true", help="print the answer as JSON")
+    status.set_defaults(run=_status)
+
+    config = commands.add_parser("config", help="about configuration files")
+    about = config.add_subparsers(required=True, metavar="COMMAND")
+    schema = about.add_parser("schema", help="print the JSON Schema of a program's configuration")
+    schema.add_argument("program", choices=["controlplane", "sidecar"])
+    schema.set_defaults(run=_schema)
+    return parser
+
+
+def _address(text: str) -> str:
+    try:
+        return check_target(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    try:
+        with grpc.insecure_channel(arguments.address) as channel:
+            stub = admin_pb2_grpc.AdminStub(channel)
+            answer = stub.GetStatus(admin_pb2.GetStatusRequest(), timeout=arguments.timeout_s)
+        sidecars = status_from_proto(answer)
+    except grpc.RpcError as error:
+        # The error of a call is the call itself, which the stubs do not say.
+        detail = getattr(error, "details", error.__str__)()
+        sys.stderr.write(f"plr: {arguments.address}: {' '.join(str(detail).split())}\n")
+        return EXIT_FAILED
+    except DecodeError as error:
+        sys.stderr.write(f"plr: {arguments.address}: answers what it must not: {error}\n")
+        return EXIT_FAILED
+    if arguments.json:
+        print(json_format.MessageToJson(answer, preserving_proto_field_name=True))
+    else:
+        print(status_table.render(sidecars))
+    return EXIT_OK
+
+
+def _schema(arguments: argparse.Namespace) -> int:
+    if arguments.program == "sidecar":
+        # The planes do not import each other: the program that has these keys is asked.
+        return subprocess.run([sys.executable, "-m", "sidecar", "--print-schema"], check=False).returncode
+    print(json.dumps(ControlPlaneConfig.model_json_schema(), indent=2))
+    return EXIT_OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,170 @@
+"""Drives the core: its timers, the solver in a thread, and what goes to the streams. No protocol decisions here."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import logging
+import time
+from typing import TYPE_CHECKING
+
+from controlplane.core.control import Close, CloseReason, ControlCore, NackNotice, Send
+from controlplane.core.registry import Refusal
+from controlplane.mailbox import Mailbox
+from controlplane.solver import solve
+
+if TYPE_CHECKING:
+    from controlplane.config import ControlPlaneConfig
+    from controlplane.core.picture import Picture
+    from controlplane.core.registry import StreamId
+    from controlplane.metrics import Metrics
+    from controlplane.stun_server import StunServer
+    from protos.model import Registration, SidecarMessage, SidecarStatus
+
+log = logging.getLogger(__name__)
+
+METRICS_INTERVAL_S = 1.0
+"""How old what is scraped may be: Prometheus scrapes every few seconds at most."""
+
+
+def wall_clock_epoch() -> int:
+    """Where versions start: milliseconds since 1970, with 2^20 versions left for each."""
+    return time.time_ns() // 1_000_000 << 20
+
+
+class ControlLoop:
+    """The core with its clock, its solver and the mailboxes of its streams."""
+
+    def __init__(self, config: ControlPlaneConfig, metrics: Metrics) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._config = config
+        self._metrics = metrics
+        self._core = ControlCore(config.settings(), version_epoch=wall_clock_epoch(), now=self._loop.time())
+        self._mailboxes: dict[StreamId, Mailbox] = {}
+        self._superseded = 0
+        self._wake = asyncio.Event()
+        self._stopping = False
+        self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
+        self.stun_servers: list[StunServer] = []
+
+    # ── for the streams ──
+
+    def register(self, registration: Registration) -> tuple[StreamId, Mailbox] | Refusal:
+        """Begin a stream; returns what to write to it, or why it is refused."""
+        result = self._core.register(registration, self._loop.time())
+        if isinstance(result, Refusal):
+            log.warning("%s refused: %s", registration.name, result.value)
+            return result
+        log.info(
+            "%s (%s, incarnation %d, software %s) connected",
+            registration.name,
+            registration.role.value,
+            registration.incarnation,
+            registration.software_version or "unknown",
+        )
+        mailbox = self._mailboxes[result] = Mailbox()
+        self._dispatch()
+        return result, mailbox
+
+    def receive(self, stream: StreamId, message: SidecarMessage) -> None:
+        """One message of a stream; raises DecodeError if it has no place there."""
+        self._core.receive(stream, message, self._loop.time())
+        self._dispatch()
+
+    def disconnected(self, stream: StreamId) -> None:
+        """A stream ended."""
+        mailbox = self._mailboxes.pop(stream, None)
+        if mailbox is not None:
+            self._superseded += mailbox.superseded
+        self._core.disconnected(stream, self._loop.time())
+        self._dispatch()
+
+    def status(self) -> list[SidecarStatus]:
+        """Every registered sidecar."""
+        return self._core.status(self._loop.time())
+
+    def _dispatch(self) -> None:
+        while (event := self._core.next_event()) is not None:
+            match event:
+                case Send(stream=stream, message=message):
+                    if stream in self._mailboxes:
+                        self._mailboxes[stream].put(message)
+                case Close(stream=stream, reason=reason):
+                    if stream in self._mailboxes:
+                        self._mailboxes[stream].close(reason)
+                case NackNotice(sidecar=name, nack=nack):
+                    log.warning(
+                        "%s refuses its %s, keeps version %d: %s",
+                        name,
+                        nack.resource.value,
+                        nack.version,
+                        nack.error,
+                    )
+        self._wake.set()
+
+    # ── the loop ──
+
+    async def run(self) -> None:
+        """Run until `stop`."""
+        metrics_at = self._loop.time()
+        async with asyncio.TaskGroup() as solving:
+            while not self._stopping:
+                now = self._loop.time()
+                self._wake.clear()
+                self._core.handle_timer(now)
+                picture = self._core.start_solving(now)
+                if picture is not None:
+                    solving.create_task(self._solve(picture))
+                if now >= metrics_at:
+                    self._update_metrics(now)
+                    metrics_at = now + METRICS_INTERVAL_S
+                self._dispatch_quietly()
+                await self._sleep_until(min(metrics_at, self._core.next_timer() or metrics_at))
+        self._executor.shutdown()
+
+    def _dispatch_quietly(self) -> None:
+        """Dispatch what the loop itself caused, without waking it for that."""
+        self._dispatch()
+        self._wake.clear()
+
+    async def _sleep_until(self, when: float) -> None:
+        try:
+            async with asyncio.timeout_at(when):
+                await self._wake.wait()
+        except TimeoutError:
+            return
+
+    async def _solve(self, picture: Picture) -> None:
+        began = time.monotonic()
+        limit_s = self._config.solver_time_limit_ms / 1000
+        hint = self._core.plan
+
+        try:
+            plan = await self._loop.run_in_executor(
+                self._executor, lambda: solve(picture.problem, time_limit_s=limit_s, hint=hint)
+            )
+        except Exception:
+            # The plan in force goes on; one failed solving must not take the streams down.
+            log.exception("solving failed; the plan in force stays")
+            self._core.solving_failed(self._loop.time())
+            return
+        self._metrics.solve_duration.observe(time.monotonic() - began)
+        relaxed = self._core.plan.relaxed
+        self._core.solved(picture, plan, self._loop.time())
+        if self._core.plan.relaxed != relaxed:
+            log.warning("capacities are exceeded by %d interfaces in all", self._core.plan.relaxed)
+        self._dispatch()
+
+    def _update_metrics(self, now: float) -> None:
+        superseded = self._superseded + sum(mailbox.superseded for mailbox in self._mailboxes.values())
+        self._metrics.update(self._core, self.stun_servers, superseded, now)
+
+    def close_streams(self) -> None:
+        """Tell every stream that the control plane stops."""
+        for mailbox in self._mailboxes.values():
+            mailbox.close(CloseReason.STOPPING)
+
+    def stop(self) -> None:
+        """End `run`."""
+        self._stopping = True
+        self._wake.set()

@@ -1,0 +1,49 @@
+"""What waits to be written to one stream: bounded, as a newer resource takes the place of an unsent older one."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from protos.model import MappingSet, PeerSet, Welcome
+
+if TYPE_CHECKING:
+    from controlplane.core.control import CloseReason
+    from protos.model import ControlMessage
+
+_ORDER = (Welcome, PeerSet, MappingSet)
+"""A mapping goes after the peers it names."""
+
+
+class Mailbox:
+    """At most one message of each type, and at last the reason to close; for one event loop."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[type[ControlMessage], ControlMessage] = {}
+        self._changed = asyncio.Event()
+        self._close_reason: CloseReason | None = None
+        self.superseded = 0
+        """Messages that a newer one replaced before they were written: the stream is slower than the changes."""
+
+    def put(self, message: ControlMessage) -> None:
+        """Send this, instead of an unsent older message of its type."""
+        self.superseded += type(message) in self._waiting
+        self._waiting[type(message)] = message
+        self._changed.set()
+
+    def close(self, reason: CloseReason) -> None:
+        """End the stream; what is unsent does not matter any more."""
+        self._close_reason = reason
+        self._changed.set()
+
+    async def get(self) -> ControlMessage | CloseReason:
+        """Wait for the next message to write, or the reason to close."""
+        while True:
+            if self._close_reason is not None:
+                return self._close_reason
+            for kind in _ORDER:
+                message = self._waiting.pop(kind, None)
+                if message is not None:
+                    return message
+            self._changed.clear()
+            await self._changed.wait()

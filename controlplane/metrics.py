@@ -1,0 +1,186 @@
+"""Prometheus metrics of the control plane (contract names in the architecture page).
+
+The exporter serves from a thread of its own: the loop leaves finished values for it, and it never looks into the
+core. The registry is our own, without the interpreter's collectors and `_created` series, which are no base units
+and which `promtool check metrics` complains of.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import prometheus_client
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+from protos.model import ResourceKind, Role, SyncState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from prometheus_client import Metric
+
+    from controlplane.core.control import ControlCore
+    from controlplane.stun_server import StunServer
+
+SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+"""A robot alone takes milliseconds, a hundred a quarter of a second, a thousand some seconds."""
+
+
+class _Values:
+    """Hands the values of the last `update` to the exporter's thread."""
+
+    def __init__(self) -> None:
+        self.families: Sequence[Metric] = ()
+
+    def collect(self) -> Iterable[Metric]:
+        return self.families
+
+
+class Metrics:
+    """All metrics of one control plane."""
+
+    def __init__(self) -> None:
+        prometheus_client.disable_created_metrics()  # type: ignore[no-untyped-call]
+        self.registry = prometheus_client.CollectorRegistry()
+        self._values = _Values()
+        self.solve_duration = prometheus_client.Histogram(
+            "plr_solve_duration_seconds",
+            "Time one solving of the assignment took.",
+            registry=self.registry,
+            buckets=SOLVE_BUCKETS_S,
+        )
+        self.registry.register(self._values)
+
+    def start(self, host: str, port: int) -> tuple[str, int]:
+        """Serve them over HTTP; returns where. Raises OSError if the address cannot be had."""
+        server, _ = prometheus_client.start_http_server(port, host, self.registry)
+        return host, server.server_port
+
+    def update(self, core: ControlCore, stun_servers: Sequence[StunServer], superseded: int, now: float) -> None:
+        """Take the values of this moment."""
+        self._values.families = (
+            *_members(core),
+            *_sync(core),
+            *_plan(core, now),
+            *_drops(core, superseded),
+            *_stun(stun_servers),
+        )
+
+
+def _gauge(name: str, text: str, labels: Sequence[str], values: Mapping[tuple[str, ...], float]) -> Metric:
+    family = GaugeMetricFamily(name, text, labels=labels)
+    for key, value in values.items():
+        family.add_metric(key, value)
+    return family
+
+
+def _counter(name: str, text: str, labels: Sequence[str], values: Mapping[tuple[str, ...], float]) -> Metric:
+    family = CounterMetricFamily(name, text, labels=labels)
+    for key, value in values.items():
+        family.add_metric(key, value)
+    return family
+
+
+def _members(core: ControlCore) -> Iterable[Metric]:
+    registered: Counter[tuple[str, ...]] = Counter({(role.value,): 0 for role in Role})
+    connected = registered.copy()
+    for sidecar in core.registry:
+        registered[sidecar.role.value,] += 1
+        connected[sidecar.role.value,] += sidecar.stream is not None
+    counters = core.registry.counters
+    yield _gauge("plr_connected_sidecars", "Sidecars with an open control stream.", ["role"], connected)
+    yield _gauge("plr_registered_sidecars", "Sidecars whose lease has not ended.", ["role"], registered)
+    yield _counter(
+        "plr_registrations_refused_total",
+        "Registrations refused, by reason.",
+        ["reason"],
+        {(refusal.name.lower(),): count for refusal, count in counters.refused.items()},
+    )
+    yield _counter(
+        "plr_departures_total",
+        "Sidecars that left the registry, by reason.",
+        ["reason"],
+        {("lease_expired",): counters.expired, ("left",): counters.left},
+    )
+
+
+def _sync(core: ControlCore) -> Iterable[Metric]:
+    states: Counter[tuple[str, ...]] = Counter(
+        {(kind.value, state.name.lower()): 0 for kind in ResourceKind for state in SyncState}
+    )
+    for _, kind, state in core.sync_states():
+        states[kind.value, state.name.lower()] += 1
+    yield _gauge("plr_resource_sync", "Sidecars by how far they follow what was pushed.", ["resource", "state"], states)
+    yield _counter(
+        "plr_nacks_total",
+        "Pushed resources that a sidecar refused.",
+        ["resource"],
+        {(kind.value,): core.counters.nacks[kind] for kind in ResourceKind},
+    )
+    yield _counter(
+        "plr_acks_total",
+        "Pushed resources that a sidecar applied.",
+        ["resource"],
+        {(kind.value,): core.counters.acks[kind] for kind in ResourceKind},
+    )
+
+
+def _plan(core: ControlCore, now: float) -> Iterable[Metric]:
+    ratios = core.miss_ratios(now)
+    yield _gauge(
+        "plr_predicted_miss_probability",
+        "Predicted probability that all copies of a request miss its deadline.",
+        ["robot", "service"],
+        {key: predicted for key, (predicted, _) in ratios.items()},
+    )
+    yield _gauge(
+        "plr_observed_miss_ratio",
+        "Share of recent requests that missed their deadline or failed.",
+        ["robot", "service"],
+        {key: observed for key, (_, observed) in ratios.items() if observed is not None},
+    )
+    yield _gauge(
+        "plr_plan_excess_interfaces",
+        "Interfaces by which the running plan exceeds capacities.",
+        [],
+        {(): core.plan.relaxed},
+    )
+    yield _counter(
+        "plr_relaxations_total",
+        "Plans taken that exceed capacities by another number of interfaces than the one before.",
+        [],
+        {(): core.counters.relaxations},
+    )
+    yield _counter(
+        "plr_solves_unproven_total",
+        "Groups of assignments whose optimum was not proven within the time limit.",
+        [],
+        {(): core.counters.unproven},
+    )
+    yield _counter("plr_reports_total", "Reports merged.", [], {(): core.counters.reports})
+
+
+def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
+    yield _counter(
+        "plr_control_dropped_total",
+        "What was dropped, by reason.",
+        ["reason"],
+        {
+            ("histogram_evicted",): core.estimator.dropped,
+            ("removal_forgotten",): core.registry.counters.removals_forgotten,
+            ("stale_answer",): core.counters.stale_answers,
+            ("old_stream",): core.counters.old_stream_messages,
+            ("report_of_cloud",): core.counters.reports_ignored,
+            ("superseded_before_sent",): superseded,
+        },
+    )
+
+
+def _stun(servers: Sequence[StunServer]) -> Iterable[Metric]:
+    outcomes: Counter[tuple[str, ...]] = Counter()
+    for server in servers:
+        outcomes.update({(outcome.value,): count for outcome, count in server.outcomes.items()})
+        outcomes["send_failed",] += server.send_failures
+        outcomes["receive_failed",] += server.receive_failures
+    yield _counter("plr_stun_datagrams_total", "Datagrams on the STUN port, by outcome.", ["outcome"], outcomes)

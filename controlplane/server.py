@@ -1,0 +1,135 @@
+"""The whole control plane in one event loop: gRPC, STUN, metrics, and an orderly end."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from controlplane import admin, service
+from controlplane.config import split_host_port
+from controlplane.core.registry import MAX_SIDECARS
+from controlplane.loop import ControlLoop
+from controlplane.metrics import Metrics
+from controlplane.stun_server import start_stun_server
+from protos.plr.v1 import admin_pb2_grpc
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from controlplane.config import ControlPlaneConfig
+
+log = logging.getLogger(__name__)
+
+STOP_GRACE_S = 1.0
+"""For streams to take their last message; what then still hangs is cut."""
+
+GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
+    # Sidecars behind cellular NATs ping to keep their binding, also with no call open, but not faster than this.
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
+    # Ours find connections that died silently; the lease has removed their sidecar by then.
+    ("grpc.keepalive_time_ms", 20_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+    # A second control plane on the same port is a mistake to be told, not to be shared the streams with.
+    ("grpc.so_reuseport", 0),
+)
+
+MAX_CALLS = 2 * MAX_SIDECARS
+"""Calls served at once: a stream for each sidecar, and room for those that replace one and for the operator."""
+
+
+class StartError(Exception):
+    """An address cannot be had; the text names the key."""
+
+
+@dataclass(frozen=True, slots=True)
+class Addresses:
+    """Where the control plane listens, with the ports really taken."""
+
+    grpc: str
+    stun: tuple[str, ...]
+    metrics: str | None
+
+
+async def serve(
+    config: ControlPlaneConfig, stop: asyncio.Event, ready: Callable[[Addresses], None], stopping: Callable[[], None]
+) -> None:
+    """Serve until `stop`; calls `ready` when everything listens, `stopping` when the end begins.
+
+    Raises StartError if an address cannot be had.
+    """
+    metrics = Metrics()
+    loop = ControlLoop(config, metrics)
+    server = grpc.aio.server(options=GRPC_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
+    health_service = health.aio.HealthServicer()
+    names = (service.SERVICE_NAME, admin.SERVICE_NAME)
+    service.ControlPlaneService(loop).add_to(server)
+    admin_pb2_grpc.add_AdminServicer_to_server(admin.AdminService(loop), server)
+    health_pb2_grpc.add_HealthServicer_to_server(health_service, server)
+    reflection.enable_server_reflection((*names, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
+    async with contextlib.AsyncExitStack() as cleanup:
+        stun = await _start_stun(config, loop, cleanup)
+        metrics_address = _start_metrics(config, metrics)
+        grpc_address = _add_port(config, server)
+        await server.start()
+        cleanup.push_async_callback(server.stop, 0.0)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(loop.run())
+            for name in ("", *names):
+                await health_service.set(name, health_pb2.HealthCheckResponse.SERVING)
+            ready(Addresses(grpc_address, stun, metrics_address))
+            await stop.wait()
+            stopping()
+            await health_service.enter_graceful_shutdown()
+            loop.close_streams()
+            await server.stop(STOP_GRACE_S)
+            loop.stop()
+
+
+async def _start_stun(
+    config: ControlPlaneConfig, loop: ControlLoop, cleanup: contextlib.AsyncExitStack
+) -> tuple[str, ...]:
+    addresses: list[str] = []
+    for listen in config.stun_listen:
+        host, port = split_host_port(listen)
+        try:
+            # "" is all addresses of both families, and IPv6 may be missing.
+            stun = await start_stun_server("" if host == "::" else host, port)
+        except OSError as error:
+            raise StartError(f"stun_listen: cannot listen on {listen}: {error.strerror or error}") from error
+        cleanup.callback(stun.close)
+        loop.stun_servers.append(stun)
+        addresses.extend(_join(*address) for address in stun.addresses)
+    return tuple(addresses)
+
+
+def _start_metrics(config: ControlPlaneConfig, metrics: Metrics) -> str | None:
+    if config.metrics_listen is None:
+        return None
+    host, port = split_host_port(config.metrics_listen)
+    try:
+        return _join(*metrics.start(host, port))
+    except OSError as error:
+        raise StartError(
+            f"metrics_listen: cannot listen on {config.metrics_listen}: {error.strerror or error}"
+        ) from error
+
+
+def _add_port(config: ControlPlaneConfig, server: grpc.aio.Server) -> str:
+    host, _ = split_host_port(config.listen)
+    try:
+        port = server.add_insecure_port(config.listen)
+    except RuntimeError as error:
+        raise StartError(f"listen: cannot listen on {config.listen}") from error
+    return _join(host, port)
+
+
+def _join(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
