@@ -21,7 +21,7 @@ from sidecar.config_fields import (
     refuse_duplicates,
 )
 from sidecar.config_file import key_path, parse_yaml, read_text, validate
-from sidecar.core.rules import ServiceRule, find_rule
+from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,9 +31,6 @@ DEFAULT_CLOUD_UDP_PORT = 24700
 
 MAX_DEADLINE_MS = 60_000
 """Where the latency histogram ends: a miss of a longer deadline could not be predicted."""
-
-MAX_LIFETIME_MS = 3_600_000
-"""An hour: a request that waits longer is a job, not a call."""
 
 MIN_DEFAULT_LIFETIME_MS = 10_000.0
 """A request outlives its deadline at least until a dead path is noticed and another one has tried."""
@@ -46,6 +43,7 @@ CLOUD_LIFETIME_MS = 60_000.0
 
 _UNLIMITED = 0
 _MS_PER_S = 1000.0
+_MAX_LIFETIME_MS = MAX_LIFETIME_S * _MS_PER_S
 
 # A YAML list becomes a tuple, a word an enum: strictness would refuse both. What the list holds stays strict.
 _converted = Field(strict=False)
@@ -97,10 +95,10 @@ class ServiceConfig(_Section):
     """Full name such as /plan_path, or a glob such as /arm/*."""
     deadline_ms: Annotated[float, Field(gt=0, le=MAX_DEADLINE_MS)] | None = None
     """Robot, required: an answer is in time within this many milliseconds."""
-    lifetime_ms: Annotated[float, Field(gt=0, le=MAX_LIFETIME_MS)] | None = None
+    lifetime_ms: Annotated[float, Field(gt=0, le=_MAX_LIFETIME_MS)] | None = None
     """Milliseconds after which an unanswered request is given up; more than deadline_ms.
 
-    Robot: by default 10 deadlines, at least 10000. Cloud: how long a local server is waited for, by default
+    Robot: by default 10 deadlines, between 10000 and 300000. Cloud: how long a local server is waited for, by default
     60000."""
     idempotent: bool | None = None
     """Robot: copies of one request may run on several servers. Default false."""
@@ -178,7 +176,8 @@ def _rule(role: Role, service: ServiceConfig) -> ServiceRule:
         deadline_ms = lifetime_ms
     else:
         deadline_ms = service.deadline_ms or MAX_DEADLINE_MS
-        lifetime_ms = service.lifetime_ms or max(LIFETIME_PER_DEADLINE * deadline_ms, MIN_DEFAULT_LIFETIME_MS)
+        default_ms = min(max(LIFETIME_PER_DEADLINE * deadline_ms, MIN_DEFAULT_LIFETIME_MS), _MAX_LIFETIME_MS)
+        lifetime_ms = service.lifetime_ms or default_ms
     return ServiceRule(
         pattern=service.name,
         deadline_s=deadline_ms / _MS_PER_S,

@@ -1,20 +1,24 @@
 """Cloud side: every request runs at most once here, however many copies arrive (architecture: Semantics).
 
 A request is running (copies wait for its result), answered (copies get the cached answer) or forgotten: its id is
-kept as a tombstone after the answer had to go, so that a very late copy is refused and not run again.
+kept as a tombstone after the answer had to go, so that a very late copy is refused and not run again. An id is let go
+only when no copy can come any more: its sender gives a request up when its lifetime is over.
 """
 
 from __future__ import annotations
 
 import heapq
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from sidecar.core.events import AbandonExecution, ExecuteRequest, ExecutionId, RejectReason, RequestId
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
+from sidecar.core.rules import MAX_LIFETIME_S
+from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
-    from protos.model import ServiceName
+    from protos.model import NodeName, ServiceName
     from sidecar.core.link_events import PathId
     from sidecar.core.messages import RequestMessage
     from sidecar.core.stats import EngineStats
@@ -25,12 +29,15 @@ MAX_WAITERS = 16
 """Copies that wait for one result; a robot sends one for each of its interfaces."""
 MAX_CACHED_BYTES = 64 * 1024 * 1024
 """Answers kept for late copies."""
-MAX_REMEMBERED = 200_000
-"""Ids remembered; at 1000 requests a second more than three minutes of them."""
-REMEMBER_S = 120.0
-"""A copy can not arrive later than this: twice the longest lifetime that a sender may ask for."""
-MAX_LIFETIME_S = 60.0
-"""Lifetimes from the wire are cut to this."""
+MAX_REMEMBERED = 262_144
+"""Ids remembered; one robot may fill half: 2000 requests a second for MIN_REMEMBER_S."""
+REMEMBER_LIFETIMES = 2.0
+"""An id is remembered for this many of its request's lifetimes after the answer ..."""
+MIN_REMEMBER_S = 60.0
+"""... but at least this long: what a datagram may spend in the queues of the network."""
+
+TIMER_SLACK = 1024
+"""Timers of answered requests that may lie around before they are swept out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +61,12 @@ class Reply:
 class _Execution:
     id: ExecutionId
     request_id: RequestId
+    robot: NodeName
     service: ServiceName
     expires: float
+    lifetime_s: float
+    """The longest that a copy asked for."""
     waiters: list[Waiter] = field(default_factory=list)
-    finished_at: float | None = None
     payload: bytes | None = None
     processing_s: float = 0.0
     refusal: tuple[RejectReason, str] | None = None
@@ -71,9 +80,13 @@ class ExecutionTable:
         self._by_request: dict[RequestId, _Execution] = {}
         """Running."""
         self._finished: dict[RequestId, _Execution] = {}
-        """In the order they finished."""
+        self._forget_at: list[tuple[float, RequestId]] = []
+        """When each finished one is forgotten: a heap."""
         self._running: dict[ExecutionId, _Execution] = {}
-        self._cached: dict[RequestId, int] = {}
+        self._running_shares = Shares(MAX_RUNNING)
+        self._finished_shares = Shares(MAX_REMEMBERED)
+        # Ordered for cheap removal of the oldest: a dict walks over the holes at its front.
+        self._cached: OrderedDict[RequestId, int] = OrderedDict()
         self._cached_bytes = 0
         self._timers: list[tuple[float, ExecutionId]] = []
         self._next_id = 0
@@ -90,35 +103,50 @@ class ExecutionTable:
     def on_request(self, path: PathId, message: RequestMessage, now: float) -> ExecuteRequest | Reply | None:
         """Take one copy: run the request, answer from the cache, refuse, or (None) let it wait for the result."""
         waiter = Waiter(path, message.copy)
-        execution = self._by_request.get(message.request_id) or self._finished.get(message.request_id)
+        running = self._by_request.get(message.request_id)
+        execution = running or self._finished.get(message.request_id)
         lifetime = min(message.lifetime_left_s, MAX_LIFETIME_S)
         count = self._stats.executions
         if execution is not None:
-            if execution.service != message.service:
+            if execution.service != message.service or execution.robot != path.peer:
                 self._stats.dropped["request_id_mismatch"] += 1
                 return None
-            if execution.finished_at is None:
+            if running is not None:
                 if len(execution.waiters) < MAX_WAITERS and waiter not in execution.waiters:
                     execution.waiters.append(waiter)
                     execution.expires = max(execution.expires, now + lifetime)
+                    execution.lifetime_s = max(execution.lifetime_s, lifetime)
                 count[message.service, "coalesced"] += 1
                 return None
             count[message.service, "cached"] += 1
             return self._reply(execution, waiter, now + lifetime)
         self._forget_old(now)
-        if len(self._running) >= MAX_RUNNING or len(self._finished) >= MAX_REMEMBERED:
+        if not (self._running_shares.fits(path.peer) and self._finished_shares.fits(path.peer)):
             self._stats.dropped["executions_full"] += 1
             return self.refuse_unseen(waiter, message, RejectReason.OVERLOADED, "too many requests", now)
         execution = _Execution(
-            ExecutionId(self._next_id), message.request_id, message.service, now + lifetime, [waiter]
+            ExecutionId(self._next_id),
+            message.request_id,
+            path.peer,
+            message.service,
+            now + lifetime,
+            lifetime,
+            [waiter],
         )
         self._next_id += 1
+        self._running_shares.take(path.peer)
         self._by_request[message.request_id] = execution
         self._running[execution.id] = execution
-        heapq.heappush(self._timers, (execution.expires, execution.id))
+        self._arm(execution)
         count[message.service, "run"] += 1
         # bytes(): the buffer is the reassembler's and rmw wants bytes.
         return ExecuteRequest(execution.id, message.service, message.type, bytes(message.payload), path.peer, lifetime)
+
+    def _arm(self, execution: _Execution) -> None:
+        heapq.heappush(self._timers, (execution.expires, execution.id))
+        if len(self._timers) > 2 * len(self._running) + TIMER_SLACK:
+            self._timers = [timer for timer in self._timers if timer[1] in self._running]
+            heapq.heapify(self._timers)
 
     def refuse_unseen(
         self, waiter: Waiter, message: RequestMessage, reason: RejectReason, text: str, now: float
@@ -133,9 +161,10 @@ class ExecutionTable:
         if len(payload) > MAX_PAYLOAD_BYTES:
             text = f"the answer has {len(payload)} bytes, the limit is {MAX_PAYLOAD_BYTES}"
             return self.refuse(execution_id, RejectReason.TOO_LARGE, text, now)
-        execution = self._finish(execution_id, now)
+        execution = self._finish(execution_id)
         if execution is None:
             return []
+        self._remember(execution, now)
         execution.payload = payload
         execution.processing_s = processing_s
         self._cache(execution)
@@ -143,17 +172,19 @@ class ExecutionTable:
 
     def refuse(self, execution_id: ExecutionId, reason: RejectReason, text: str, now: float) -> list[Reply]:
         """The local server did not answer."""
-        execution = self._finish(execution_id, now)
+        execution = self._finish(execution_id)
         if execution is None:
             return []
+        if not reason.certainly_not_run:
+            self._remember(execution, now)
         self._stats.executions[execution.service, "refused"] += 1
         execution.refusal = (reason, text)
-        if reason.certainly_not_run:
-            del self._finished[execution.request_id]
         return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
+        while self._timers and self._timers[0][1] not in self._running:
+            heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
     def handle_timer(self, now: float) -> list[AbandonExecution]:
@@ -167,21 +198,29 @@ class ExecutionTable:
             if execution.expires > now:
                 heapq.heappush(self._timers, (execution.expires, execution_id))
                 continue
-            self._finish(execution_id, now)
+            self._finish(execution_id)
+            self._remember(execution, now)
             execution.refusal = (RejectReason.SERVER_LOST, "the server gave no answer in time")
             self._stats.executions[execution.service, "abandoned"] += 1
             abandoned.append(AbandonExecution(execution_id))
         return abandoned
 
-    def _finish(self, execution_id: ExecutionId, now: float) -> _Execution | None:
+    def _finish(self, execution_id: ExecutionId) -> _Execution | None:
+        """Take an execution out of the running ones; None when it is not one of them (any more)."""
         execution = self._running.pop(execution_id, None)
         if execution is None:
             self._stats.dropped["answer_to_unknown_execution"] += 1
             return None
-        execution.finished_at = now
         del self._by_request[execution.request_id]
-        self._finished[execution.request_id] = execution
+        self._running_shares.give_back(execution.robot)
         return execution
+
+    def _remember(self, execution: _Execution, now: float) -> None:
+        """It ran or may have run: never again."""
+        self._finished[execution.request_id] = execution
+        self._finished_shares.take(execution.robot)
+        forget_at = now + max(REMEMBER_LIFETIMES * execution.lifetime_s, MIN_REMEMBER_S)
+        heapq.heappush(self._forget_at, (forget_at, execution.request_id))
 
     def _reply(self, execution: _Execution, waiter: Waiter, expires: float) -> Reply:
         request_id = execution.request_id
@@ -196,19 +235,16 @@ class ExecutionTable:
         self._cached[execution.request_id] = size
         self._cached_bytes += size
         while self._cached_bytes > MAX_CACHED_BYTES:
-            oldest = next(iter(self._cached))
-            self._cached_bytes -= self._cached.pop(oldest)
+            oldest, its_size = self._cached.popitem(last=False)
+            self._cached_bytes -= its_size
             self._finished[oldest].payload = None
             self._stats.dropped["cached_answer_evicted"] += 1
 
     def _forget_old(self, now: float) -> None:
         """Drop ids that no copy can ask for any more."""
-        finished = self._finished
-        while finished:
-            request_id, execution = next(iter(finished.items()))
-            if execution.finished_at is None or execution.finished_at + REMEMBER_S > now:
-                return
-            del finished[request_id]
+        while self._forget_at and self._forget_at[0][0] <= now:
+            request_id = heapq.heappop(self._forget_at)[1]
+            self._finished_shares.give_back(self._finished.pop(request_id).robot)
             size = self._cached.pop(request_id, None)
             if size is not None:
                 self._cached_bytes -= size

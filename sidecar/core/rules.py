@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
 
+MAX_LIFETIME_S = 300.0
+"""A request that may wait longer is a job, not a call; a server remembers every request for longer than this."""
+
 _NODE_INTERNAL_SUFFIXES = frozenset(
     {
         # rclcpp and rclpy parameter services
@@ -42,7 +45,7 @@ class ServiceRule:
     pattern: str
     deadline_s: float
     lifetime_s: float
-    """A request without a response is given up after this long."""
+    """A request without a response is given up after this long, at most MAX_LIFETIME_S."""
     idempotent: bool = False
     """Copies of one request may run on several servers."""
     drop_late: bool = False

@@ -98,6 +98,8 @@ def test_config_is_frozen() -> None:
         ({"deadline_ms": 100}, 0.1, 10.0),
         ({"deadline_ms": 5000}, 5.0, 50.0),
         ({"deadline_ms": 0.5, "lifetime_ms": 1}, 0.0005, 0.001),
+        ({"deadline_ms": 60_000}, 60.0, 300.0),
+        ({"deadline_ms": 60_000, "lifetime_ms": 300_000}, 60.0, 300.0),
     ],
 )
 def test_rules_of_a_robot(keys: dict[str, float], deadline_s: float, lifetime_s: float) -> None:
@@ -127,6 +129,8 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(ROBOT, deadline_ms=float("nan")), "services[0].deadline_ms", "finite"),
     (with_service(ROBOT, deadline_ms=60_001), "services[0].deadline_ms", "60000"),
     (with_service(ROBOT, lifetime_ms=100), "services[0].lifetime_ms", "more than deadline_ms (100), got 100"),
+    (with_service(ROBOT, lifetime_ms=300_001), "services[0].lifetime_ms", "300000"),
+    (with_service(CLOUD, lifetime_ms=300_001), "services[0].lifetime_ms", "300000"),
     (with_service(ROBOT, capacity_interfaces=1), "services[0].capacity_interfaces", "on a cloud only"),
     (ROBOT | {"services": [{"name": "/a"}]}, "services[0].deadline_ms", "expected milliseconds"),
     (with_service(CLOUD, deadline_ms=100), "services[0].deadline_ms", "on a robot only"),

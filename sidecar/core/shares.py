@@ -1,0 +1,45 @@
+"""Dividing a capped table among peers, so that one that fills it cannot lock the others out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+
+
+class Shares:
+    """What each peer holds of `capacity` units.
+
+    A peer may never hold more than what it leaves free for all others (dynamic threshold with alpha 1, Choudhury and
+    Hahne 1998): alone it gets half, and beside any number of greedy ones there is always something left for the next.
+    """
+
+    __slots__ = ("_held", "capacity", "used")
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.used = 0
+        self._held: dict[NodeName, int] = {}
+
+    def held(self, peer: NodeName) -> int:
+        """Units that this peer holds."""
+        return self._held.get(peer, 0)
+
+    def fits(self, peer: NodeName, units: int = 1) -> bool:
+        """Whether the peer may take this many more."""
+        return self.held(peer) + units <= self.capacity - self.used
+
+    def take(self, peer: NodeName, units: int = 1) -> None:
+        """The peer takes these units; asking `fits` before is the caller's."""
+        self._held[peer] = self.held(peer) + units
+        self.used += units
+
+    def give_back(self, peer: NodeName, units: int = 1) -> None:
+        """The peer returns units that it took."""
+        left = self._held[peer] - units
+        if left:
+            self._held[peer] = left
+        else:
+            del self._held[peer]
+        self.used -= units
