@@ -95,18 +95,19 @@ class Recovery:
         sent = self.sent
         newly: list[Sent] = []
         newest: Sent | None = sent.get(largest)
+        oldest = next(iter(sent), self._next_number)
         for low, high in ack.ranges:
-            if high - low >= len(sent):
-                numbers = [number for number in sent if low <= number <= high]
-            else:
-                numbers = [number for number in range(low, high + 1) if number in sent]
-            for number in numbers:
-                datagram = sent.pop(number)
-                self.in_flight -= datagram.size
-                self.acked_bytes += datagram.size
-                newly.append(datagram)
+            if high < oldest:
+                break
+            # From the oldest in flight on: what a peer repeats or makes up below it costs nothing.
+            for number in range(max(low, oldest), high + 1):
+                datagram = sent.pop(number, None)
+                if datagram is not None:
+                    self.in_flight -= datagram.size
+                    self.acked_bytes += datagram.size
+                    newly.append(datagram)
         if newest is not None:
-            self.rtt.sample(now - newest.at - min(ack.delay_s, MAX_ACK_DELAY_S * 4))
+            self.rtt.sample(now - newest.at, ack.delay_s)
         if newly:
             self._pto_count = 0
             self.largest_acked = max(self.largest_acked, largest)

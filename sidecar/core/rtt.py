@@ -26,16 +26,21 @@ class RttEstimator:
         """Whether anything was measured."""
         return self.latest > 0
 
-    def sample(self, rtt_s: float) -> None:
-        """Take one measured round trip, the peer's own delay already subtracted."""
+    def sample(self, rtt_s: float, peer_delay_s: float = 0.0) -> None:
+        """Take one measured round trip, of which the peer says that `peer_delay_s` is its own.
+
+        The peer is believed only as far as its word leaves a possible round trip (RFC 9002 section 5.3).
+        """
         rtt_s = max(rtt_s, 1e-6)
         if not self.has_sample:
-            self.smoothed = self.minimum = rtt_s
+            self.latest = self.smoothed = self.minimum = rtt_s
             self.variation = rtt_s / 2
-        else:
-            self.variation += (abs(self.smoothed - rtt_s) - self.variation) / 4
-            self.smoothed += (rtt_s - self.smoothed) / 8
-            self.minimum = min(self.minimum, rtt_s)
+            return
+        self.minimum = min(self.minimum, rtt_s)
+        if rtt_s - peer_delay_s >= self.minimum:
+            rtt_s -= peer_delay_s
+        self.variation += (abs(self.smoothed - rtt_s) - self.variation) / 4
+        self.smoothed += (rtt_s - self.smoothed) / 8
         self.latest = rtt_s
 
     def probe_timeout(self, peer_delay_s: float) -> float:
