@@ -230,7 +230,7 @@ class Link:
                     pass
         self.stats.datagrams["received", kind] += 1
         if eliciting:
-            path.received.owe_ack(now, at_once=False)
+            path.received.owe_ack(now)
 
     def _receive_ack(self, path: Path, ack: frame.AckFrame, now: float) -> None:
         recovery = path.recovery
@@ -370,8 +370,8 @@ class Link:
         path.state = PathState.DOWN
         self._events.append(PathChanged(path.id, PathState.DOWN, reason))
         self._report_lost(path, path.recovery.give_up_all())
-        for message in path.queue.clear():
-            self._events.append(FragmentsLost(path.id, message, message.missing()))
+        for message, indices in path.queue.clear():
+            self._events.append(FragmentsLost(path.id, message, indices))
 
     def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
         by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}

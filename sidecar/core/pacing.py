@@ -76,6 +76,10 @@ class _Entry:
                 return index
         return None
 
+    def remaining(self) -> tuple[int, ...]:
+        message = self.message
+        return tuple(filter(message.needs, (*self.resend, *range(self.next, message.count))))
+
 
 class SendQueue:
     """Symbols that wait for one path, earliest deadline first."""
@@ -123,9 +127,9 @@ class SendQueue:
             del self._entries[message.number]
         return None
 
-    def clear(self) -> list[OutboundMessage]:
-        """Empty the queue and return the messages that still had something to send."""
-        messages = [entry.message for entry in self._entries.values() if not entry.message.over]
+    def clear(self) -> list[tuple[OutboundMessage, tuple[int, ...]]]:
+        """Empty the queue and return each message with its symbols that did not leave."""
+        left = [(entry.message, entry.remaining()) for entry in self._entries.values()]
         self._heap.clear()
         self._entries.clear()
-        return messages
+        return [(message, indices) for message, indices in left if indices]

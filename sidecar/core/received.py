@@ -15,10 +15,12 @@ STALE_PACKETS = 1024
 class ReceivedPackets:
     """Which packet numbers came, as at most MAX_ACK_RANGES inclusive ranges, highest first."""
 
-    __slots__ = ("_ack_at", "_gap", "_largest_at", "_ranges", "_unacked")
+    __slots__ = ("_ack_at", "_floor", "_gap", "_largest_at", "_ranges", "_unacked")
 
     def __init__(self) -> None:
         self._ranges: list[list[int]] = []
+        self._floor = -1
+        """Everything up to here counts as received before: it may have been, and its range is forgotten."""
         self._largest_at = 0.0
         self._ack_at: float | None = None
         self._unacked = 0
@@ -33,13 +35,14 @@ class ReceivedPackets:
             else:
                 self._gap = bool(ranges)
                 ranges.insert(0, [number, number])
-                del ranges[MAX_ACK_RANGES:]
-                while ranges[-1][1] < number - STALE_PACKETS:
-                    ranges.pop()
+                while len(ranges) > MAX_ACK_RANGES or ranges[-1][1] < number - STALE_PACKETS:
+                    self._floor = ranges.pop()[1]
             self._largest_at = now
             return True
+        if number <= self._floor or not self._fill(number):
+            return False
         self._gap = True
-        return self._fill(number)
+        return True
 
     def _fill(self, number: int) -> bool:
         ranges = self._ranges
@@ -58,20 +61,21 @@ class ReceivedPackets:
                     ranges[position][1] = number
                 else:
                     ranges.insert(position, [number, number])
-                    del ranges[MAX_ACK_RANGES:]
+                    if len(ranges) > MAX_ACK_RANGES:
+                        self._floor = ranges.pop()[1]
                 return True
         if ranges[-1][0] == number + 1:
             ranges[-1][0] = number
-            return True
-        if len(ranges) < MAX_ACK_RANGES:
+        elif len(ranges) < MAX_ACK_RANGES:
             ranges.append([number, number])
-            return True
-        return False
+        else:
+            return False
+        return True
 
-    def owe_ack(self, now: float, *, at_once: bool) -> None:
-        """An ack-eliciting datagram came: acknowledge it now or soon."""
+    def owe_ack(self, now: float) -> None:
+        """An ack-eliciting datagram came: acknowledge it soon, or now when it shows a gap or is the second one."""
         self._unacked += 1
-        if at_once or self._unacked >= ACK_EVERY or self._gap:
+        if self._unacked >= ACK_EVERY or self._gap:
             self._ack_at = now
         elif self._ack_at is None:
             self._ack_at = now + MAX_ACK_DELAY_S
@@ -80,11 +84,6 @@ class ReceivedPackets:
     def ack_at(self) -> float | None:
         """When the acknowledgement is due; None when nothing is owed."""
         return self._ack_at
-
-    @property
-    def ack_owed(self) -> bool:
-        """Whether a datagram that leaves now should carry an acknowledgement."""
-        return self._ack_at is not None
 
     def take_ack(self, now: float) -> tuple[list[tuple[int, int]], float]:
         """Return the ranges and the delay since the largest came, and owe nothing any more."""
