@@ -17,5 +17,8 @@ compile() {
 compile --all-extras pyproject.toml --output-file requirements/dev.txt "$@"
 # The runtime alone, for a deployment whose rclpy comes from the system; the same versions as above.
 compile --constraint requirements/dev.txt pyproject.toml --output-file requirements/runtime.txt "$@"
-# The installer itself, for pip to fetch.
-grep '^uv==' requirements/constraints.txt | compile - --output-file requirements/uv.txt
+# What installs the above: the installer, for pip to fetch, and what builds the packages that have no wheel.
+{
+  grep '^uv==' requirements/constraints.txt
+  echo setuptools
+} | compile --constraint requirements/dev.txt - --output-file requirements/bootstrap.txt "$@"

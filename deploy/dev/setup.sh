@@ -88,7 +88,7 @@ install_packages() {
 
 fingerprint() {
   {
-    sha256sum requirements/dev.txt requirements/uv.txt pyproject.toml deploy/dev/setup.sh
+    sha256sum requirements/dev.txt requirements/bootstrap.txt pyproject.toml deploy/dev/setup.sh
     "$venv/bin/python" -VV
   } | sha256sum | cut -d' ' -f1
 }
@@ -127,10 +127,11 @@ fi
 
 if [[ ! -f $stamp || $(<"$stamp") != "$(fingerprint)" ]]; then
   say "installing the locked dependencies"
-  "$venv/bin/python" -m pip --quiet --disable-pip-version-check install --require-hashes -r requirements/uv.txt
-  "$venv/bin/uv" pip install --quiet --python "$venv/bin/python" --require-hashes -r requirements/dev.txt
-  # setuptools is locked above: no second, unlocked one in an isolated build.
-  "$venv/bin/uv" pip install --quiet --python "$venv/bin/python" --no-deps --no-build-isolation --editable .
+  "$venv/bin/python" -m pip --quiet --disable-pip-version-check install --require-hashes -r requirements/bootstrap.txt
+  # No isolated builds: they would fetch a setuptools that is not locked.
+  install=("$venv/bin/uv" pip install --quiet --python "$venv/bin/python" --no-build-isolation)
+  "${install[@]}" --require-hashes -r requirements/dev.txt
+  "${install[@]}" --no-deps --editable .
   fingerprint >"$stamp"
 fi
 
