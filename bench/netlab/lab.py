@@ -21,7 +21,7 @@ from bench.netlab import kernel
 from bench.netlab.drawing import draw
 from bench.netlab.errors import LabError
 from bench.netlab.host import DIE_WITH_PARENT, Host, children_of
-from bench.netlab.link import Link
+from bench.netlab.link import REPLAY_LEAD_S, Link
 from bench.netlab.plan import Plan, make_plan
 from bench.netlab.profile import LinkProfile
 from bench.netlab.router import translation_rules
@@ -148,9 +148,9 @@ class Lab:
     ) -> float:
         """Replay a trace on several links on one clock: `paths` maps interface -> path of the trace.
 
-        Returns the `time.monotonic()` of the trace's second 0 (default: now).
+        Returns the `time.monotonic()` of the trace's second 0 (default: `REPLAY_LEAD_S` from now).
         """
-        start = time.monotonic() if start is None else start
+        start = time.monotonic() + REPLAY_LEAD_S if start is None else start
         for interface, path in paths.items():
             self.link(interface, host=host).replay(trace, path, start=start, repeat=repeat)
         return start

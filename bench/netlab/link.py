@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # A trace of an hour takes the emulator well under a second to swallow.
 _ANSWER_TIMEOUT_S = 20.0
+# By then every link has its steps, so that the first ones are in time too, seconds.
+REPLAY_LEAD_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +142,7 @@ class Link:
         """Follow a path of a trace; `Lab.replay` does so for several links on one clock.
 
         Args:
-            start: `time.monotonic()` of the trace's second 0; default: now.
+            start: `time.monotonic()` of the trace's second 0; default: `REPLAY_LEAD_S` from now.
             repeat: begin anew at the end instead of keeping the last step.
 
         Raises:
@@ -149,7 +151,7 @@ class Link:
         self._ask(
             "replay",
             steps=[step.to_json() for step in trace.path(path)],
-            start=time.monotonic() if start is None else start,
+            start=time.monotonic() + REPLAY_LEAD_S if start is None else start,
             repeat_s=trace.duration_s if repeat else None,
         )
 

@@ -30,7 +30,7 @@ class DropReason(StrEnum):
     IN_FLIGHT_FULL = "in_flight_full"
     """More packets in flight than the emulator stores: the scenario is beyond this lab."""
     INTERFACE_DOWN = "interface_down"
-    """The receiving interface refused the packet, being down."""
+    """The receiving interface refused the packet, being down (with packet ports: noticed some ms late)."""
 
 
 @dataclass(frozen=True, slots=True)

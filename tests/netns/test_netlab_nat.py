@@ -126,8 +126,8 @@ def test_interfaces_of_four_kinds_and_two_robots_work_together() -> None:
         assert len(ping_times_ms(lab.host("robot"), target, device="usb0", count=1)) == 1
 
 
-def test_server_can_be_far_away() -> None:
-    robot = HostSpec("robot", (InterfaceSpec("eth0", emulated=False),))
+def test_server_can_be_far_away_and_packets_small() -> None:
+    robot = HostSpec("robot", (InterfaceSpec("eth0", emulated=False, mtu=1300),))
     config = LabConfig(robots=(robot,), clouds=(server("near"), server("far", delay_ms=20)))
     with Lab(config) as lab:
         for family in (4, 6):
@@ -137,5 +137,9 @@ def test_server_can_be_far_away() -> None:
             )
             assert len(near) == len(far) == 5
             assert min(near) < 40 <= min(far)
+        with udp(lab.host("robot")) as sender, udp(lab.host("near"), port=PORT) as receiver:
+            sender.sendto(bytes(2000), (lab.host("near").address(), PORT))  # in fragments
+            assert receiver.recv(9000) == bytes(2000)
+        assert "mtu 1300 " in lab.host("robot").run(["ip", "link", "show", "eth0"]).stdout
         lab.link("eth0", host="far").blackhole()
         assert unreachable(lab.host("robot"), lab.host("far").address(), device="eth0")
