@@ -91,13 +91,6 @@ class ControlHooks(Protocol):
         """The control plane came within reach, or went out of it."""
 
 
-class Memory(Protocol):
-    """Keeps what a restart needs (`state_store.StateStore`); must not block."""
-
-    def remember(self, message: Welcome | PeerSet | MappingSet) -> None:
-        """Keep a message that is in force now, in place of the last one of its kind."""
-
-
 class _StreamEndedError(Exception):
     """The stream is over; `refused`: by a decision of the control plane."""
 
@@ -110,11 +103,10 @@ class _StreamEndedError(Exception):
 class ControlClient:
     """Keeps one sidecar connected to the control plane at `target` (host:port) until `stop`."""
 
-    def __init__(self, target: str, session: ControlSession, hooks: ControlHooks, memory: Memory | None = None) -> None:
+    def __init__(self, target: str, session: ControlSession, hooks: ControlHooks) -> None:
         self._target = target
         self._session = session
         self._hooks = hooks
-        self._memory = memory
         self._connected = False
         self._stopping = False
         self._outage = OutageLog(target)
@@ -289,7 +281,6 @@ class ControlClient:
 
     def _on_welcome(self, welcome: Welcome) -> None:
         self._outage.over()
-        self._remember(welcome)
         try:
             self._hooks.welcome(welcome)
         except Exception:
@@ -307,9 +298,7 @@ class ControlClient:
             log.exception("applying %s failed", apply.resource.value)
             error = f"internal error: {failure}"
         self._session.applied(apply, error)
-        if error is None:
-            self._remember(content)
-        else:
+        if error is not None:
             log.warning("refused %s version %d: %s", apply.resource.value, content.version, error)
 
     def _take_report(self) -> Report:
@@ -318,10 +307,6 @@ class ControlClient:
         except Exception:
             log.exception("taking a report failed")
             return Report()
-
-    def _remember(self, message: Welcome | PeerSet | MappingSet) -> None:
-        if self._memory is not None:
-            self._memory.remember(message)
 
     def _note_connection(self, connected: bool, reason: str) -> None:
         if connected == self._connected:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import sdnotify
 
 from protos.errors import ConfigError
-from protos.model import PROTOCOL_VERSION, Registration, SessionId, Version
+from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, SessionId, Version
 from sidecar.config_fields import split_host_port
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
@@ -94,9 +94,9 @@ class Sidecar:
         self._interfaces.set_stun_servers(self._stun_servers(last.welcome))
         self._interfaces.start()
         if last.peers is not None:
-            self._restore("peers", self._data_plane.apply_peers(last.peers))
+            self._restore(ResourceKind.PEERS, self._data_plane.apply_peers(last.peers))
         if last.mapping is not None:
-            self._restore("mapping", self._data_plane.apply_mapping(last.mapping))
+            self._restore(ResourceKind.MAPPING, self._data_plane.apply_mapping(last.mapping))
         self._bridge.start(self._data_plane)
         self._control.start()
 
@@ -138,11 +138,12 @@ class Sidecar:
             problem = f"expected an address and port to listen on, got '{listen}': {error.strerror or error}"
             raise ConfigError("the configuration", "metrics_listen", problem) from error
 
-    def _restore(self, what: str, error: str | None) -> None:
+    def _restore(self, what: ResourceKind, error: str | None) -> None:
         if error:
-            log.warning("the %s kept on disk do not fit any more: %s", what, error)
+            log.warning("the %s kept on disk do not fit any more: %s", what.value, error)
+            self._control_session.forget(what)
         else:
-            log.info("started from the %s kept on disk", what)
+            log.info("started from the %s kept on disk", what.value)
 
     def _stun_servers(self, welcome: Welcome | None) -> tuple[str, ...]:
         if welcome is not None and welcome.stun_servers:

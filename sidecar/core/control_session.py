@@ -139,6 +139,10 @@ class ControlSession:
         """The version in force; 0 means none."""
         return self._in_force[resource]
 
+    def forget(self, resource: ResourceKind) -> None:
+        """What the registration said we hold could not be put in force after all."""
+        self._in_force[resource] = Version(0)
+
     # ── the stream ──
 
     def opened(self, now: float) -> None:

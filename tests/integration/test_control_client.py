@@ -59,12 +59,11 @@ OFFER = ServiceOffer(ServiceName("/plan"), "nav_msgs/srv/GetPlan")
 
 
 class Recorder:
-    """Hooks and memory that note what they are told."""
+    """Hooks that note what they are told."""
 
     def __init__(self) -> None:
         self.welcomes: list[Welcome] = []
         self.applied: list[PeerSet | MappingSet] = []
-        self.remembered: list[Welcome | PeerSet | MappingSet] = []
         self.connection: queue.Queue[tuple[bool, str]] = queue.Queue()
         self.report = Report()
         self.error: str | None = None
@@ -91,9 +90,6 @@ class Recorder:
     def connection_changed(self, connected: bool, reason: str) -> None:
         self.connection.put((connected, reason))
 
-    def remember(self, message: Welcome | PeerSet | MappingSet) -> None:
-        self.remembered.append(message)
-
     def expect_connection(self, connected: bool) -> str:
         now_connected, reason = self.connection.get(timeout=WAIT_S)
         assert now_connected is connected
@@ -114,7 +110,7 @@ class Rig:
         )
         self.hooks = Recorder()
         session = ControlSession(registration, random.Random(1))
-        self.client = ControlClient(target, session, self.hooks, self.hooks)
+        self.client = ControlClient(target, session, self.hooks)
 
 
 @pytest.fixture
@@ -147,7 +143,7 @@ def test_registers_with_what_it_holds_then_says_everything(server: ScriptedContr
     assert server.expect(ServiceSet) == ServiceSet(offers=(OFFER,))
 
 
-def test_applies_and_acks_and_remembers(server: ScriptedControlPlane, rig: Rig) -> None:
+def test_applies_and_acks(server: ScriptedControlPlane, rig: Rig) -> None:
     rig.client.start()
     rig.hooks.expect_connection(True)
     server.say(PeerSet(Version(41), nonce=5))
@@ -155,16 +151,14 @@ def test_applies_and_acks_and_remembers(server: ScriptedControlPlane, rig: Rig) 
     server.say(MappingSet(Version(7), nonce=6))
     assert server.expect(Ack) == Ack(ResourceKind.MAPPING, Version(7), 6)
     assert [content.version for content in rig.hooks.applied] == [41, 7]
-    assert rig.hooks.remembered == [WELCOME, PeerSet(Version(41), 5), MappingSet(Version(7), 6)]
 
 
-def test_what_the_engine_refuses_is_nacked_and_not_remembered(server: ScriptedControlPlane, rig: Rig) -> None:
+def test_what_the_engine_refuses_is_nacked(server: ScriptedControlPlane, rig: Rig) -> None:
     rig.hooks.error = "/plan: no interface 'wwan7' here"
     rig.client.start()
     rig.hooks.expect_connection(True)
     server.say(PeerSet(Version(41), nonce=5))
     assert server.expect(Nack) == Nack(ResourceKind.PEERS, Version(40), 5, rig.hooks.error)
-    assert rig.hooks.remembered == [WELCOME]
     rig.hooks.error = None
     server.say(PeerSet(Version(42), nonce=6))
     assert server.expect(Ack) == Ack(ResourceKind.PEERS, Version(42), 6)

@@ -192,6 +192,16 @@ def test_a_new_stream_says_what_is_held_by_now_and_forgets_old_nonces() -> None:
     assert not any(isinstance(message, Ack) for message in rest)
 
 
+def test_what_the_disk_held_in_vain_is_asked_for_again() -> None:
+    session = make_session(peers=4, mapping=5)
+    session.forget(ResourceKind.MAPPING)
+    session.opened(0.0)
+    registration = session.messages_to_send(0.0)[0]
+    assert isinstance(registration, Registration)
+    assert (registration.peers_version, registration.mapping_version) == (4, 0)
+    assert isinstance(session.receive(mapping(5), 0.0), Apply)
+
+
 def test_heartbeats_fill_the_silence_thrice_a_lease() -> None:
     session = online(make_session())
     sent: list[float] = []

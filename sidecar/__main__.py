@@ -1,0 +1,150 @@
+"""plr-sidecar: command line, logging and signals around `runtime.run`."""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from protos.errors import ConfigError
+from sidecar.config import SidecarConfig, config_schema, load_config
+from sidecar.logging_setup import Logging
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+log = logging.getLogger("sidecar.main")
+
+PROGRAM = "plr-sidecar"
+EXIT_OK = 0
+EXIT_FAILURE = 1
+EXIT_BAD_CONFIG = 2
+
+_DESCRIPTION = "Carries the ROS 2 service calls of a robot to cloud servers over every network interface."
+
+_EPILOG = """\
+examples:
+  plr-sidecar --config /etc/plr/sidecar.yaml                  run until SIGTERM or Ctrl-C
+  plr-sidecar --config /etc/plr/sidecar.yaml --check-config   say whether it would start
+  plr-sidecar --print-schema > sidecar.schema.json            describe the configuration to an editor
+
+exit codes:
+  0  stopped as asked, or the configuration is right
+  1  failed while running; the log says why
+  2  wrong usage or configuration; one line on stderr names the file, the key and what was expected
+"""
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        self.exit(EXIT_BAD_CONFIG, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns its exit code."""
+    options = _parser().parse_args(arguments)
+    if options.print_schema:
+        sys.stdout.write(json.dumps(config_schema(), indent=2) + "\n")
+        return EXIT_OK
+    if options.config is None:
+        _parser().error("expected --config FILE")
+    try:
+        config = load_config(options.config)
+        if options.check_config:
+            _check_interfaces(config, str(options.config))
+            sys.stdout.write(f"{options.config}: ok\n")
+            return EXIT_OK
+        return _run(config)
+    except ConfigError as error:
+        # What is found out later than the file is read does not know its name.
+        located = ConfigError(str(options.config), error.key, error.problem)
+        sys.stderr.write(f"{PROGRAM}: {located}\n")
+        return EXIT_BAD_CONFIG
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _OneLineParser(
+        prog=PROGRAM,
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration, YAML")
+    parser.add_argument("--check-config", action="store_true", help="check the configuration and exit")
+    parser.add_argument("--print-schema", action="store_true", help="print the configuration's JSON Schema and exit")
+    parser.add_argument("--version", action="version", version=f"{PROGRAM} {software_version()}")
+    return parser
+
+
+def software_version() -> str:
+    """Return the version of the installed distribution, or 0 when run from a bare checkout."""
+    try:
+        return version("fogros2-plr")
+    except PackageNotFoundError:
+        return "0"
+
+
+def _check_interfaces(config: SidecarConfig, source: str) -> None:
+    from sidecar.net.interfaces import choose, list_interfaces
+
+    interfaces = list_interfaces()
+    for name in choose(interfaces, config.interfaces).missing:
+        existing = ", ".join(interface.name for interface in interfaces)
+        index = (config.interfaces or ()).index(name)
+        raise ConfigError(source, f"interfaces[{index}]", f"expected one of {existing}, got '{name}'")
+
+
+def _run(config: SidecarConfig) -> int:
+    faulthandler.enable()
+    # gRPC's own lines on stderr have another format, and what they tell is in our log.
+    os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
+    # Late: it takes a second to import, and a wrong configuration is to be told at once.
+    from sidecar.runtime import run
+
+    stop = threading.Event()
+    with Logging(config.log_level.value, sys.stderr):
+        failure = _stop_on_signals_and_crashes(stop)
+        try:
+            code = run(config, software_version(), stop)
+        except ConfigError:
+            raise
+        except Exception:
+            log.critical("failed", exc_info=True)
+            return EXIT_FAILURE
+    return EXIT_FAILURE if failure.is_set() else code
+
+
+def _stop_on_signals_and_crashes(stop: threading.Event) -> threading.Event:
+    """Set `stop` on SIGTERM, SIGINT and when a thread dies; returns what is set in the last case."""
+    failure = threading.Event()
+
+    def on_signal(number: int, _frame: object) -> None:
+        # A second one ends the program at once.
+        signal.signal(number, signal.SIG_DFL)
+        log.info("stopping on %s", signal.Signals(number).name)
+        stop.set()
+
+    def on_crash(crash: threading.ExceptHookArgs) -> None:
+        name = crash.thread.name if crash.thread else "a thread"
+        value = crash.exc_value or crash.exc_type()
+        log.critical("%s died: stopping", name, exc_info=(crash.exc_type, value, crash.exc_traceback))
+        failure.set()
+        stop.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+    threading.excepthook = on_crash
+    return failure
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,92 @@
+"""Logging of the program: one line for each event, with time, level and component, written by a thread of its own.
+
+A journal or terminal that stalls must not stall the thread that logs: lines wait in a bounded queue, and what does not
+fit is counted and said afterwards.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import time
+from logging.handlers import QueueHandler, QueueListener
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing import TextIO
+
+MAX_WAITING_LINES = 10_000
+"""About 2 MB: some minutes of a busy log."""
+
+_PACKAGES = ("sidecar", "protos")
+
+
+class LineFormatter(logging.Formatter):
+    """2026-01-31T12:00:00.250Z WARNING control_client: text; a traceback follows on indented lines."""
+
+    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:
+        """Return UTC in ISO 8601 with milliseconds."""
+        seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
+        return f"{seconds}.{int(record.msecs):03d}Z"
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        component = record.name.removeprefix("sidecar.")
+        text = record.getMessage().replace("\r", "\\r").replace("\n", "\\n")
+        line = f"{self.formatTime(record)} {record.levelname} {component}: {text}"
+        if record.exc_info:
+            line += "\n    " + self.formatException(record.exc_info).replace("\n", "\n    ")
+        return line
+
+
+class _BoundedQueueHandler(QueueHandler):
+    """Never blocks; counts what it drops."""
+
+    def __init__(self, waiting: queue.Queue[logging.LogRecord]) -> None:
+        super().__init__(waiting)
+        self._waiting = waiting
+        self._dropped = 0
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        # Arguments may change before the line is written, so they are put into the text now.
+        record.msg = record.getMessage()
+        record.args = None
+        return record
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        # Called under the handler's lock.
+        try:
+            if self._dropped:
+                self._waiting.put_nowait(self._notice())
+                self._dropped = 0
+            self._waiting.put_nowait(record)
+        except queue.Full:
+            self._dropped += 1
+
+    def _notice(self) -> logging.LogRecord:
+        text = f"{self._dropped} log lines were dropped"
+        return logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None)
+
+
+class Logging:
+    """The program's logging while used as a context: ours from `level`, libraries' from WARNING."""
+
+    def __init__(self, level: str, stream: TextIO, *, max_waiting: int = MAX_WAITING_LINES) -> None:
+        output = logging.StreamHandler(stream)
+        output.setFormatter(LineFormatter())
+        waiting: queue.Queue[logging.LogRecord] = queue.Queue(max_waiting)
+        self._handler = _BoundedQueueHandler(waiting)
+        self._listener = QueueListener(waiting, output)
+        self._level = level.upper()
+
+    def __enter__(self) -> None:
+        root = logging.getLogger()
+        root.setLevel(logging.WARNING)
+        root.addHandler(self._handler)
+        for package in _PACKAGES:
+            logging.getLogger(package).setLevel(self._level)
+        self._listener.start()
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger().removeHandler(self._handler)
+        self._listener.stop()
