@@ -8,6 +8,7 @@ refreshed for ever, a failed round is repeated for ever with backoff.
 
 from __future__ import annotations
 
+from collections import Counter
 from ipaddress import ip_address
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,6 @@ from sidecar.core.stun_family import StunClientConfig, StunFamilyClient, StunOut
 
 if TYPE_CHECKING:
     import random
-    from collections import Counter
     from collections.abc import Iterable
 
     from protos.model import Address
@@ -33,7 +33,7 @@ class StunClient:
 
     `servers` are numeric addresses in canonical form, asked in order; raises ValueError for a host name.
     `rng` draws transaction ids: pass random.SystemRandom outside tests, since an id is what keeps strangers
-    from forging answers.
+    from forging answers. STUN datagrams not believed are counted into `drops`, by StunDrop.
     """
 
     def __init__(
@@ -43,18 +43,19 @@ class StunClient:
         config: StunClientConfig | None = None,
         *,
         software: str | None = None,
+        drops: Counter[str] | None = None,
     ) -> None:
         self._rng = rng
         self._config = config or StunClientConfig()
         self._software = software
         self._families: dict[int, StunFamilyClient] = {}
-        self._outbox = StunOutbox()
+        self._outbox = StunOutbox(Counter() if drops is None else drops)
         self.servers_ignored = 0
         self._set_servers(servers)
 
     @property
-    def drops(self) -> Counter[StunDrop]:
-        """STUN datagrams not believed, by reason."""
+    def drops(self) -> Counter[str]:
+        """STUN datagrams not believed, by StunDrop."""
         return self._outbox.drops
 
     @property
@@ -76,7 +77,10 @@ class StunClient:
                 client.start(now)
 
     def start(self, now: float) -> None:
-        """Ask at once; also to be called when the interface's address or link changed."""
+        """Ask at once; also to be called when the interface's address or link changed.
+
+        The answer is told as an event even if it is the same as before.
+        """
         for client in self._families.values():
             client.start(now)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass, field
 from ipaddress import ip_address
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from sidecar.core.stun_transaction import Retransmission, StunTransaction
 
 if TYPE_CHECKING:
     import random
+    from collections import Counter
 
     from protos.model import Address
 
@@ -51,10 +52,10 @@ class StunClientConfig:
 class StunOutbox:
     """What the families of one socket share: datagrams to send, events, counters."""
 
-    def __init__(self) -> None:
+    def __init__(self, drops: Counter[str]) -> None:
         self.sending: list[tuple[bytes, Address]] = []
         self.events: deque[StunEvent] = deque()
-        self.drops: Counter[StunDrop] = Counter()
+        self.drops = drops
         self.requests_sent = 0
         self.events_lost = 0
 
@@ -100,8 +101,9 @@ class StunFamilyClient:
         self._transactions: list[StunTransaction] = []
 
     def start(self, now: float) -> None:
-        """Ask at once, forgetting what is under way but not the mapping."""
+        """Ask at once, forgetting what is under way but not the mapping; the answer is told even if it is the same."""
         self._failed_rounds = 0
+        self._announced = False
         self._start_round(now)
 
     def find(self, transaction_id: bytes) -> StunTransaction | None:

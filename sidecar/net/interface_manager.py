@@ -79,7 +79,7 @@ class InterfaceManager:
         self._stun_names: tuple[str, ...] = config.stun.servers
         self._stun_servers: tuple[Address, ...] = ()
         self._candidates: tuple[Candidate, ...] = ()
-        self._readiness = Readiness(stun_enabled=config.stun.enabled, now=time.monotonic())
+        self._readiness = Readiness(stun_enabled=config.stun.enabled)
         self._skipped: dict[InterfaceName, str] = {}
         self._lock = threading.Lock()
         """Guards the addresses, which the interfaces' threads report."""
@@ -128,9 +128,10 @@ class InterfaceManager:
                 case Mapped(family, address) | MappingChanged(family, address):
                     log.info("%s: reachable from outside as %s port %d", interface, *address)
                     managed.reflexive[family] = address
-                    if self._readiness.mapped(interface):
+                    if self._readiness.mapped(interface, family):
                         self._set_ready(managed, ready=True)
                 case Failed(family, reason, last_known):
+                    self._readiness.failed(interface, family)
                     still = f"; still using {last_known[0]} port {last_known[1]}" if last_known else ""
                     log.warning("%s: STUN over IPv%d failed: %s%s; trying again", interface, family, reason, still)
         self._publish_candidates()
@@ -200,12 +201,12 @@ class InterfaceManager:
         )
         stun = None
         if self._config.stun.enabled:
-            stun = StunClient(self._stun_servers, random.SystemRandom())
+            stun = StunClient(self._stun_servers, random.SystemRandom(), drops=link.stats.dropped)
             stun.start(time.monotonic())
         thread = InterfaceThread(opened.socket, link, stun, self._data_plane)
         with self._lock:
             managed = self._managed[interface.name] = _Managed(interface, thread, number, {})
-            self._set_ready(managed, ready=self._readiness.add(interface.name))
+            self._set_ready(managed, ready=self._readiness.add(interface.name, time.monotonic()))
         thread.start()
         log.info(
             "%s: in use, port %d, bound to the %s, addresses %s",

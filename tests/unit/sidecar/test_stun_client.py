@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from itertools import pairwise
 
 import pytest
@@ -288,6 +289,22 @@ def test_a_restart_asks_at_once_and_keeps_the_mapping() -> None:
     ((request, _),) = net.client.datagrams_to_send()
     net.client.receive_datagram(reply(request, MOVED), A, net.now)
     assert net.client.next_event() == MappingChanged(4, MOVED, OUTSIDE, A)
+
+
+def test_a_restart_tells_the_mapping_again_where_it_is_the_same() -> None:
+    # The driver may have forgotten it: the interface's addresses changed.
+    net = Network(make(A), {A: OUTSIDE})
+    net.run(1)
+    net.client.start(net.now)
+    assert net.run(40) == [Mapped(4, OUTSIDE, A)]
+
+
+def test_drops_are_counted_where_the_driver_wants_them() -> None:
+    drops = Counter({"malformed": 2})
+    client = StunClient([A], random.Random(1), drops=drops)
+    request = start(client)
+    client.receive_datagram(request, A, 0.1)
+    assert drops == {"malformed": 2, "stun_not_a_response": 1}
 
 
 def test_new_servers_are_asked_and_old_ones_no_more() -> None:
