@@ -2,7 +2,7 @@
 
 An interface is ready once STUN showed its address. While STUN servers answer nobody (the control plane, which runs
 them, is away), waiting would lose requests for nothing: after a grace time every interface is ready, and the probes
-of each path decide. Readiness once given stays until the interface's addresses change.
+of each path decide. Readiness once given stays for as long as the interface does.
 """
 
 from __future__ import annotations
@@ -19,33 +19,48 @@ STUN_GRACE_S = 3.0
 class Readiness:
     """Which interfaces may be used."""
 
-    def __init__(self, *, stun_enabled: bool, now: float) -> None:
+    def __init__(self, *, stun_enabled: bool) -> None:
         self._stun_enabled = stun_enabled
-        self._grace_ends = now + STUN_GRACE_S
-        self._ready: dict[InterfaceName, bool] = {}
-        self._any_mapped = False
+        self._added_at: dict[InterfaceName, float] = {}
+        self._ready: set[InterfaceName] = set()
+        self._answered: set[tuple[InterfaceName, int]] = set()
+        """Interface and family whose last STUN round was answered."""
 
-    def add(self, interface: InterfaceName) -> bool:
-        """An interface appeared or changed its address; returns whether it is ready at once."""
-        self._ready[interface] = not self._stun_enabled
-        return self._ready[interface]
+    def add(self, interface: InterfaceName, now: float) -> bool:
+        """An interface appeared; returns whether it is ready at once."""
+        self._added_at[interface] = now
+        if not self._stun_enabled:
+            self._ready.add(interface)
+        return interface in self._ready
 
     def remove(self, interface: InterfaceName) -> None:
         """An interface is gone."""
-        self._ready.pop(interface, None)
+        self._added_at.pop(interface, None)
+        self._ready.discard(interface)
+        self._answered = {(name, family) for name, family in self._answered if name != interface}
 
-    def mapped(self, interface: InterfaceName) -> bool:
-        """STUN showed the interface's address; returns whether that made it ready."""
-        self._any_mapped = True
-        if self._ready.get(interface, True):
+    def mapped(self, interface: InterfaceName, family: int) -> bool:
+        """STUN over IPv4 or IPv6 showed the interface's address; returns whether that made it ready."""
+        if interface not in self._added_at:
             return False
-        self._ready[interface] = True
+        self._answered.add((interface, family))
+        if interface in self._ready:
+            return False
+        self._ready.add(interface)
         return True
+
+    def failed(self, interface: InterfaceName, family: int) -> None:
+        """No STUN server answered this interface."""
+        self._answered.discard((interface, family))
 
     def after_grace(self, now: float) -> list[InterfaceName]:
         """Return the interfaces that become ready because no STUN server answers anybody."""
-        if self._any_mapped or now < self._grace_ends:
+        if self._answered:
             return []
-        late = [interface for interface, ready in self._ready.items() if not ready]
-        self._ready.update(dict.fromkeys(late, True))
+        late = [
+            interface
+            for interface, added_at in self._added_at.items()
+            if interface not in self._ready and now >= added_at + STUN_GRACE_S
+        ]
+        self._ready.update(late)
         return late
