@@ -41,6 +41,8 @@ log = logging.getLogger(__name__)
 
 MAX_TIMER_SLEEP_S = 1.0
 """The timer thread looks at least this often."""
+ERROR_PAUSE_S = 0.1
+"""After an internal error, which may repeat itself at every turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,10 +235,18 @@ class ThreadedDataPlane:
 
     def _run_timer(self) -> None:
         while not self._stopping:
-            with self._lock:
-                self._wake_timer.clear()
-                self._engine.handle_timer(self._clock())
-                woken = self._queue_outputs()
-                self._timer_due = self._engine.next_timer()
-            self._wake(woken)
+            try:
+                self._timer_turn()
+            except Exception:
+                # Without this thread no deadline is noticed and no request ends.
+                log.exception("internal error; the timers go on")
+                time.sleep(ERROR_PAUSE_S)
             self._wake_timer.wait(min(max(0.0, self._timer_due - self._clock()), MAX_TIMER_SLEEP_S))
+
+    def _timer_turn(self) -> None:
+        with self._lock:
+            self._wake_timer.clear()
+            self._engine.handle_timer(self._clock())
+            woken = self._queue_outputs()
+            self._timer_due = self._engine.next_timer()
+        self._wake(woken)

@@ -35,6 +35,10 @@ RECEIVE_BATCH = 64
 """Datagrams read before anything else is looked at."""
 RECEIVE_BYTES = 2048
 """Longer than any datagram of ours: a longer one is truncated, hence malformed, hence dropped."""
+BLOCKED_TIMER_S = 0.005
+"""While the socket takes nothing, timers are looked at this often: what is due may wait for the socket itself."""
+ERROR_PAUSE_S = 0.1
+"""After an internal error, which may repeat itself at every turn."""
 MAX_INBOX = 65_536
 """Commands that wait for the thread; the engine's outbox is capped far below it."""
 
@@ -126,6 +130,7 @@ class InterfaceThread:
                     # One interface's bug must not silence the interface for good, nor hide.
                     log.exception("%s: internal error; the interface goes on", self.interface)
                     self.link.stats.dropped["internal_error"] += 1
+                    time.sleep(ERROR_PAUSE_S)
                 if bool(self._unsent) != blocked:
                     blocked = bool(self._unsent)
                     events = select.EPOLLIN | select.EPOLLOUT if blocked else select.EPOLLIN
@@ -142,7 +147,7 @@ class InterfaceThread:
             stun_due = self._stun.next_timer()
             if stun_due is not None:
                 due = min(due, stun_due)
-        return max(0.0, due - self._clock())
+        return max(BLOCKED_TIMER_S if self._unsent else 0.0, due - self._clock())
 
     def _turn(self) -> None:
         link, clock = self.link, self._clock
