@@ -18,7 +18,7 @@ class OutboundMessage:
     that reads an old value merely sends a symbol that is no longer needed.
     """
 
-    __slots__ = ("acked", "count", "data", "deadline", "expires", "number", "over", "path", "symbol")
+    __slots__ = ("acked", "count", "data", "deadline", "expires", "interfaces", "number", "over", "path", "symbol")
 
     def __init__(
         self,
@@ -32,7 +32,9 @@ class OutboundMessage:
     ) -> None:
         self.number = number
         self.path = path
-        """Where the engine last sent it; links do not look at this."""
+        """Where it was sent first."""
+        self.interfaces = {path.interface}
+        """Those it was sent over; the engine's, links do not look at this."""
         self.data = memoryview(data)
         self.deadline = deadline
         self.expires = expires
@@ -40,7 +42,7 @@ class OutboundMessage:
         self.count = symbol_count(len(data), symbol)
         self.acked = bytearray(self.count)
         self.over = False
-        """Delivered, cancelled or expired: nothing of it needs to travel any more."""
+        """Delivered, called off or expired: nothing of it needs to travel any more."""
 
     @property
     def peer(self) -> NodeName:

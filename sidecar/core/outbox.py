@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sidecar.core.fragments import MAX_PEER_BYTES as REASSEMBLED_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, Resend, Send
 from sidecar.core.outbound import OutboundMessage
+from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from sidecar.core.stats import EngineStats
 
 MAX_MESSAGES = 16_384
+"""All undelivered messages: one peer may have half of them, as many as requests may be in flight."""
 MAX_BYTES = 256 * 1024 * 1024
 """All undelivered messages together: sixteen of the largest."""
 
@@ -29,7 +32,8 @@ class Outbox:
         self._stats = stats
         self._messages: dict[int, OutboundMessage] = {}
         self._parked: dict[NodeName, dict[int, OutboundMessage]] = {}
-        self._bytes = 0
+        self._shares_of_messages = Shares(MAX_MESSAGES)
+        self._shares_of_bytes = Shares(MAX_BYTES)
         self._next_number = 1
 
     def __len__(self) -> int:
@@ -38,21 +42,27 @@ class Outbox:
     @property
     def held_bytes(self) -> int:
         """Bytes of all undelivered messages."""
-        return self._bytes
+        return self._shares_of_bytes.used
 
-    def has_room(self, size: int) -> bool:
-        """Whether another message of this size may be sent."""
-        return len(self._messages) < MAX_MESSAGES and self._bytes + size <= MAX_BYTES
+    def has_room(self, peer: NodeName, size: int) -> bool:
+        """Whether another message of this size may be sent to this peer."""
+        held = self._shares_of_bytes
+        return (
+            self._shares_of_messages.fits(peer)
+            and held.fits(peer, size)
+            and held.held(peer) + size <= REASSEMBLED_PEER_BYTES
+        )
 
     def send(self, path: PathId, data: bytes, *, deadline: float, expires: float) -> OutboundMessage | None:
         """Send a message over `path`; None (counted) when there is no room."""
-        if not self.has_room(len(data)):
+        if not self.has_room(path.peer, len(data)):
             self._stats.dropped["outbox_full"] += 1
             return None
         message = OutboundMessage(self._next_number, path, data, deadline=deadline, expires=expires)
         self._next_number += 1
         self._messages[message.number] = message
-        self._bytes += len(data)
+        self._shares_of_messages.take(path.peer)
+        self._shares_of_bytes.take(path.peer, len(data))
         self._command(Send(path, message))
         return message
 
@@ -68,7 +78,8 @@ class Outbox:
         """Nothing more of it needs to travel."""
         message.over = True
         if self._messages.pop(message.number, None) is not None:
-            self._bytes -= len(message.data)
+            self._shares_of_messages.give_back(message.peer)
+            self._shares_of_bytes.give_back(message.peer, len(message.data))
             self._parked.get(message.peer, {}).pop(message.number, None)
 
     def drop_peer(self, peer: NodeName) -> None:
@@ -92,21 +103,27 @@ class Outbox:
         if path is None:
             self._parked.setdefault(message.peer, {})[message.number] = message
         else:
-            message.path = path
-            self._command(Resend(path, message, indices))
+            self._resend(message, path, indices)
+
+    def _resend(self, message: OutboundMessage, path: PathId, indices: tuple[int, ...]) -> None:
+        message.interfaces.add(path.interface)
+        self._command(Resend(path, message, indices))
 
     def on_path_up(self, path: PathId) -> None:
         """Send what waited for a path to this peer."""
         for message in self._parked.pop(path.peer, {}).values():
             missing = message.missing()
             if missing:
-                message.path = path
-                self._command(Resend(path, message, missing))
+                self._resend(message, path, missing)
 
     def on_interface_gone(self, interface: InterfaceName, now: float) -> None:
-        """The interface's link is gone with all it had queued: its messages take other paths."""
-        for message in [message for message in self._messages.values() if message.path.interface == interface]:
-            self.on_lost(FragmentsLost(message.path, message, message.missing(), timed_out=True), now)
+        """The interface's link is gone with all it had queued: its messages take other paths.
+
+        What of them is on its way over another interface travels twice; nobody knows any more which it is.
+        """
+        for message in [message for message in self._messages.values() if interface in message.interfaces]:
+            message.interfaces.discard(interface)
+            self.on_lost(FragmentsLost(message.path, message, message.missing()), now)
 
     def expire(self, now: float) -> None:
         """Drop messages whose time is over."""

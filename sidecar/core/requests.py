@@ -153,14 +153,19 @@ class RequestTable:
             return f"the service's name or type is longer than {MAX_NAME_BYTES} bytes"
         if self.unanswered >= MAX_IN_FLIGHT:
             return f"{MAX_IN_FLIGHT} requests are in flight already"
-        if not self._parts.outbox.has_room(size):
-            return "too many bytes wait to be sent"
+        servers = self._parts.offers.servers(request.service)
+        if servers and not self._with_room(servers, size):
+            return "too much waits to be sent already"
         if request.id in self._requests:
             return "a request with this identity is in flight already"
         return None
 
+    def _with_room(self, servers: tuple[NodeName, ...], size: int) -> list[NodeName]:
+        has_room = self._parts.outbox.has_room
+        return [server for server in servers if has_room(server, size)]
+
     def _dispatch(self, request: Request, now: float) -> None:
-        servers = self._parts.offers.servers(request.service)
+        servers = self._with_room(self._parts.offers.servers(request.service), len(request.payload or b""))
         idempotent = request.rule.idempotent
         for path in self._parts.mapping.choose(request.service, servers, idempotent=idempotent):
             self._send_copy(request, path, now)
@@ -193,10 +198,12 @@ class RequestTable:
         if copy.state is CopyState.ANSWERED:
             self._parts.stats.duplicate_responses += 1
             return
+        was_pending = copy.state is CopyState.PENDING
         copy.state = CopyState.ANSWERED
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
         self._parts.outbox.drop(copy.message)
-        self._parts.measurements.answered(copy.path, request.service, now - copy.sent_at, response.processing_s)
+        if was_pending:
+            self._parts.measurements.answered(copy.path, request.service, now - copy.sent_at, response.processing_s)
         if request.done:
             self._parts.stats.duplicate_responses += 1
         else:
@@ -301,7 +308,8 @@ class RequestTable:
                 return
         busy = {copy.path.peer for copy in pending}
         refused = {copy.path.peer for copy in request.copies if copy.state is CopyState.REJECTED}
-        path = self._parts.mapping.rescue([server for server in servers if server not in busy | refused])
+        others = tuple(server for server in servers if server not in busy | refused)
+        path = self._parts.mapping.rescue(self._with_room(others, len(request.payload or b"")))
         if path is not None:
             self._send_copy(request, path, now)
 
@@ -309,6 +317,8 @@ class RequestTable:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
+        while self._timers and self._timers[0][1] not in self._requests:
+            heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
     def handle_timer(self, now: float) -> None:
