@@ -233,13 +233,15 @@ class Engine:
                 self._outbox.on_finished(peer, number)
             case FragmentsLost():
                 self._outbox.on_lost(event, now)
-            case PathMeasured():
+            case PathMeasured() if self._knows(event.path):
                 self.routes.set_rtt(event.path, event.smoothed_rtt_s)
                 self._measurements.path(event)
+            case PathMeasured():
+                pass  # of a peer that left, or an interface that went, a moment ago
             case PathChanged():
                 self._on_path_changed(event, now)
             case PeerRestarted():
-                if self.peers.restarted(event):
+                if self.peers.restarted(event, now):
                     self._end_session(event.peer, now)
                     self._commands.append((None, SetPeers(self.peers.for_links())))
             case PeerClosed(peer):
@@ -248,8 +250,8 @@ class Engine:
 
     def _on_fragment(self, event: FragmentReceived, now: float) -> None:
         path = event.path
-        if path.peer not in self.peers:
-            self.stats.dropped["fragment_of_unknown_peer"] += 1
+        if self.peers.session(path.peer) != event.session:
+            self.stats.dropped["fragment_of_old_session"] += 1
             return
         reassembler = self._reassemblers.get(path.peer)
         if reassembler is None:
@@ -282,10 +284,10 @@ class Engine:
         waiter = Waiter(path, message.copy)
         offer = self._local_offers.get(message.service)
         refusal = None
-        if self._draining:
-            refusal = RejectReason.DRAINING, "the sidecar is going away"
-        elif offer is None:
+        if offer is None:
             refusal = RejectReason.NOT_OFFERED, f"no server for {message.service}"
+        elif self._draining:
+            refusal = RejectReason.DRAINING, "the sidecar is going away"
         elif offer.type != message.type:
             refusal = RejectReason.WRONG_TYPE, f"{message.service} has type {offer.type}, not {message.type}"
         if refusal and not self._executions.knows(message.request_id):
@@ -306,24 +308,33 @@ class Engine:
 
     def _on_path_changed(self, event: PathChanged, now: float) -> None:
         path, state = event.path, event.state
-        if path.peer not in self.peers or path.interface not in self._interfaces:
+        if not self._knows(path) or self.routes.state(path) is state:
             return
         self.routes.set_state(path, state)
         if state is PathState.UP:
             self._outbox.on_path_up(path)
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
-            if self.peers.drop_if_unlisted(path.peer):
-                self._end_session(path.peer, now)
-                self._commands.append((None, SetPeers(self.peers.for_links())))
+            self._drop_if_unlisted(path.peer, now)
         self._update_offers(now)
         self._requests.on_path_changed(path, state, now)
+
+    def _knows(self, path: PathId) -> bool:
+        return path.peer in self.peers and path.interface in self._interfaces
+
+    def _drop_if_unlisted(self, name: NodeName, now: float) -> None:
+        """The last path to a peer died, and it may have been kept for its paths only."""
+        if self.peers.drop_if_unlisted(name):
+            self._end_session(name, now)
+            self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def _on_peer_closed(self, name: NodeName, now: float) -> None:
         """It said goodbye: nothing new goes there; the control plane will say the same."""
         for route in self.routes.all_to(name):
             self.routes.set_state(route.id, PathState.DOWN)
-        self._requests.on_peer_gone(name, now)
+        self._outbox.drop_peer(name)
         self._update_offers(now)
+        self._requests.on_peer_gone(name, now)
+        self._drop_if_unlisted(name, now)
 
     def _end_session(self, name: NodeName, now: float) -> None:
         self._reassemblers.pop(name, None)
@@ -353,4 +364,6 @@ class Engine:
             self._outbox.expire(now)
             for reassembler in self._reassemblers.values():
                 reassembler.expire(now)
-        self._update_offers(now)
+        dark_until = self._offers.next_timer()
+        if dark_until is not None and dark_until <= now:
+            self._update_offers(now)

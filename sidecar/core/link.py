@@ -116,8 +116,8 @@ class Link:
         if header.packet_number > path.largest_received:
             path.largest_received = header.packet_number
             path.remote = source
-        if path.state is PathState.DOWN and path.probe_at is not None:
-            path.probe_at = min(path.probe_at, now)
+        if path.state is PathState.DOWN:
+            path.hasten_probe(now)
         self._dirty[path.id] = path
         self._receive_frames(path, frames, now)
 
@@ -211,9 +211,11 @@ class Link:
                 case frame.Fragment():
                     eliciting = True
                     kind = "data"
-                    events.append(FragmentReceived(path.id, item))
+                    events.append(FragmentReceived(path.id, path.session, item))
                 case frame.AckFrame():
                     self._receive_ack(path, item, now)
+                case frame.Probe(probe_id) if self._closing:
+                    pass  # an answer would bring us back to life over there
                 case frame.Probe(probe_id):
                     self._owe(path, frame.encode_probe_reply(frame.ProbeReply(probe_id)))
                 case frame.ProbeReply(probe_id):
@@ -224,8 +226,11 @@ class Link:
                 case frame.Finished(number):
                     eliciting = True
                     events.append(MessageFinished(path.peer, number))
-                case frame.Close():
+                case frame.Close() if path.state is not PathState.DOWN:
+                    self._take_down(path, "peer closed")
                     events.append(PeerClosed(path.peer))
+                case frame.Close():
+                    pass
                 case frame.Hello():
                     pass
         self.stats.datagrams["received", kind] += 1
@@ -251,14 +256,19 @@ class Link:
         self._report_lost(path, recovery.detect_lost(now))
 
     def _path_up(self, path: Path) -> None:
+        self._report_measured(path)  # before its first request, so that its round-trip time counts in the choice
         self._events.append(PathChanged(path.id, PathState.UP, "answers"))
 
     # -- sending --------------------------------------------------------------------------------------------------
 
     def _live_path(self, path_id: PathId, message: OutboundMessage, indices: Iterable[int]) -> Path | None:
-        """Return the path if it can carry the message; otherwise hand the symbols back as lost."""
+        """Return the path if it can carry the message; otherwise hand the symbols back as lost.
+
+        The engine may know the path's state from before: it is told again, lest it send them here once more.
+        """
         path = self._paths.get((path_id.peer, path_id.remote))
         if path is None or path.state is PathState.DOWN:
+            self._events.append(PathChanged(path_id, PathState.DOWN, "not usable here"))
             self._events.append(FragmentsLost(path_id, message, tuple(indices)))
             return None
         self._dirty[path.id] = path
@@ -367,7 +377,7 @@ class Link:
 
     def _take_down(self, path: Path, reason: str) -> None:
         """Hand back what the path still carried, then say that it is down."""
-        path.state = PathState.DOWN
+        path.go_down()
         self._events.append(PathChanged(path.id, PathState.DOWN, reason))
         self._report_lost(path, path.recovery.give_up_all())
         for message, indices in path.queue.clear():
@@ -387,21 +397,24 @@ class Link:
 
     def _measure(self) -> None:
         for path in self._paths.values():
-            recovery = path.recovery
-            sent, lost = recovery.total_sent, recovery.total_lost
-            if path.rtts or sent != path.reported_sent:
-                self._events.append(
-                    PathMeasured(
-                        path.id,
-                        recovery.rtt.smoothed,
-                        tuple(path.rtts),
-                        sent - path.reported_sent,
-                        lost - path.reported_lost,
-                    )
-                )
-                path.rtts.clear()
-                path.reported_sent, path.reported_lost = sent, lost
+            self._report_measured(path)
         self._publish_path_stats()
+
+    def _report_measured(self, path: Path) -> None:
+        recovery = path.recovery
+        sent, lost = recovery.total_sent, recovery.total_lost
+        if path.rtts or sent != path.reported_sent:
+            self._events.append(
+                PathMeasured(
+                    path.id,
+                    recovery.rtt.smoothed,
+                    tuple(path.rtts),
+                    sent - path.reported_sent,
+                    lost - path.reported_lost,
+                )
+            )
+            path.rtts.clear()
+            path.reported_sent, path.reported_lost = sent, lost
 
     def _publish_path_stats(self) -> None:
         best: dict[NodeName, Path] = {}
@@ -415,6 +428,7 @@ class Link:
                 srtt_s=path.recovery.rtt.smoothed,
                 datagrams_sent=path.recovery.total_sent,
                 datagrams_lost=path.recovery.total_lost,
+                bytes_sent=path.bytes_sent,
             )
             for name, path in best.items()
         }

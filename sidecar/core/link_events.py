@@ -93,6 +93,8 @@ class FragmentReceived(NamedTuple):
     """A symbol came; its data views the received datagram."""
 
     path: PathId
+    session: SessionId
+    """The peer's: message numbers mean nothing beyond it."""
     fragment: Fragment
 
 

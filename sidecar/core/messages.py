@@ -92,7 +92,7 @@ def encode_message(message: Message) -> bytes:
                 message.payload,
             )
         )
-    text = message.text.encode()[:MAX_TEXT_BYTES]
+    text = message.text.encode(errors="replace")[:MAX_TEXT_BYTES]
     return b"".join(
         (
             _HEAD.pack(_REJECTION, message.request_id, message.copy),

@@ -75,6 +75,7 @@ class Offers:
                 if find_rule(self._rules, offer.name) is not None:
                     by_name.setdefault(offer.name, {}).setdefault(offer.type, []).append(peer)
         wanted = {}
+        self.conflicts = set()
         for name, by_type in by_name.items():
             current = self._offered.get(name)
             # Most servers win; the type already offered wins a tie, so that one odd server changes nothing.

@@ -38,11 +38,12 @@ class Path:
     __slots__ = (
         "_next_probe_id",
         "_probe_gap",
+        "_probed_at",
         "_probes_out",
         "_waiting_since",
+        "bytes_sent",
         "candidates",
         "id",
-        "is_validated",
         "largest_received",
         "pending",
         "probe_at",
@@ -78,9 +79,11 @@ class Path:
         self.largest_received = -1
         self.probe_at: float | None = now
         self.rtts: list[float] = []
+        self.bytes_sent = 0
         self.reported_sent = 0
         self.reported_lost = 0
         self._probe_gap = FIRST_PROBE_S
+        self._probed_at = now - FIRST_PROBE_S
         self._next_probe_id = 0
         self._probes_out: dict[int, float] = {}
         self._waiting_since: float | None = None
@@ -100,6 +103,7 @@ class Path:
 
     def next_probe(self, now: float, rng: random.Random) -> int:
         """Return the id of a probe that leaves now, and plan the next one."""
+        self._probed_at = now
         probe_id = self._next_probe_id
         self._next_probe_id = (probe_id + 1) & 0xFFFFFFFF
         self._probes_out[probe_id] = now
@@ -115,6 +119,11 @@ class Path:
             self._probe_gap = min(gap * PROBE_BACKOFF, MAX_PROBE_S)
         self.probe_at = now + gap * rng.uniform(0.9, 1.1)
         return probe_id
+
+    def hasten_probe(self, now: float) -> None:
+        """The peer was heard: it may be reachable again. Never closer than FIRST_PROBE_S, whatever the peer sends."""
+        if self.probe_at is not None:
+            self.probe_at = min(self.probe_at, max(now, self._probed_at + FIRST_PROBE_S))
 
     def answered_probe(self, probe_id: int, now: float) -> bool:
         """A PROBE_REPLY came; False when it answers nothing we asked."""
@@ -166,8 +175,12 @@ class Path:
         if self.state is PathState.UP:
             self.state = PathState.UNSTABLE
         else:
-            self.state = PathState.DOWN
-            self._waiting_since = None
-            self._probes_out.clear()
+            self.go_down()
         self.probe_at = now
         return self.state
+
+    def go_down(self) -> None:
+        """Nothing that is under way brings it up again: only what is asked from now on."""
+        self.state = PathState.DOWN
+        self._waiting_since = None
+        self._probes_out.clear()

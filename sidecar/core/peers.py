@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 MAX_PEERS = 4096
 """Peers kept; a control plane that names more is refused."""
+RESTART_GAP_S = 1.0
+"""A peer that says more often that it restarted is not believed: every restart costs all links work."""
 
 
 class Peers:
@@ -29,6 +31,7 @@ class Peers:
     def __init__(self) -> None:
         self._known: dict[NodeName, Peer] = {}
         self._unlisted: set[NodeName] = set()
+        self._restarted_at: dict[NodeName, float] = {}
         self.version = Version(0)
 
     def __contains__(self, name: object) -> bool:
@@ -53,31 +56,41 @@ class Peers:
         if len({peer.session for peer in peer_set.peers}) != len(peer_set.peers):
             return "two peers share a session"
         gone = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
-        known = {peer.name: self._newer(peer) for peer in peer_set.peers}
+        sessions = {peer.session for peer in peer_set.peers}
+        known = {peer.name: self._newer(peer, sessions) for peer in peer_set.peers}
         unlisted = set()
         for name, peer in self._known.items():
-            if name not in known and name not in gone and reaches(name):
+            if name in known or name in gone or peer.session in sessions or len(known) >= MAX_PEERS:
+                continue
+            if reaches(name):
                 known[name] = peer
                 unlisted.add(name)
         self._known = known
+        self._restarted_at = {name: at for name, at in self._restarted_at.items() if name in known}
         self._unlisted = unlisted
         self.version = peer_set.version
         return None
 
-    def _newer(self, listed: Peer) -> Peer:
-        """The view may be older than what the peer itself proved by its HELLO."""
+    def _newer(self, listed: Peer, sessions: set[SessionId]) -> Peer:
+        """The view may be older than what the peer itself proved by its HELLO; `sessions` are the view's."""
         known = self._known.get(listed.name)
-        if known is not None and known.token == listed.token and known.incarnation > listed.incarnation:
+        if known is None or known.token != listed.token or known.session in sessions:
+            return listed
+        if known.incarnation > listed.incarnation:
             return dataclasses.replace(listed, session=known.session, incarnation=known.incarnation)
         return listed
 
-    def restarted(self, event: PeerRestarted) -> bool:
-        """Take a peer's newer session; False when it is not newer."""
+    def restarted(self, event: PeerRestarted, now: float) -> bool:
+        """Take a peer's newer session; False when it is not newer, or comes too soon after the one before."""
         peer = self._known.get(event.peer)
         if peer is None or event.incarnation <= peer.incarnation:
             return False
+        restarted_at = self._restarted_at.get(event.peer)
+        if restarted_at is not None and now < restarted_at + RESTART_GAP_S:
+            return False
         if any(other.session == event.session for other in self._known.values()):
             return False
+        self._restarted_at[event.peer] = now
         self._known[event.peer] = dataclasses.replace(peer, session=event.session, incarnation=event.incarnation)
         return True
 
@@ -86,6 +99,7 @@ class Peers:
         if name not in self._unlisted:
             return False
         self._unlisted.discard(name)
+        self._restarted_at.pop(name, None)
         del self._known[name]
         return True
 
