@@ -1,0 +1,71 @@
+"""The locked dependencies are those that pyproject.toml asks for, pinned and hashed, from no registry in particular."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+LOCKS = ("dev.txt", "runtime.txt", "bootstrap.txt")
+PIN = re.compile(r"^([A-Za-z0-9._-]+)(?:\[[^]]*\])?==(\S+)(?: ; (.*?))? \\$", re.MULTILINE)
+
+Pins = dict[str, set[Version]]
+
+
+def pins(name: str) -> Pins:
+    """Locked versions by package; several where they depend on the Python version."""
+    found: Pins = {}
+    for package, version, _ in PIN.findall((ROOT / "requirements" / name).read_text()):
+        found.setdefault(canonicalize_name(package), set()).add(Version(version))
+    return found
+
+
+def unmet(requirements: list[str], locked: Pins) -> list[str]:
+    """Requirements that no locked version fits, or that some locked version does not fit."""
+    missing = []
+    for requirement in map(Requirement, requirements):
+        versions = locked.get(canonicalize_name(requirement.name), set())
+        if not versions or not all(version in requirement.specifier for version in versions):
+            missing.append(str(requirement))
+    return missing
+
+
+def test_everything_asked_for_is_locked() -> None:
+    asked = [*PROJECT["dependencies"]]
+    for extra in PROJECT["optional-dependencies"].values():
+        asked += extra
+    assert not unmet(asked, pins("dev.txt")), "run: make lock"
+
+
+def test_the_runtime_is_locked_at_the_same_versions() -> None:
+    runtime, everything = pins("runtime.txt"), pins("dev.txt")
+    assert not unmet(PROJECT["dependencies"], runtime), "run: make lock"
+    assert all(everything[package] == versions for package, versions in runtime.items())
+    assert not any(package.startswith("ros-") for package in runtime)
+
+
+def test_what_is_not_locked_is_noticed() -> None:
+    locked = {"grpcio": {Version("1.81.2")}}
+    assert unmet(["grpcio>=1.80", "grpcio>=1.82", "absent"], locked) == ["grpcio>=1.82", "absent"]
+
+
+@pytest.mark.parametrize("name", LOCKS)
+def test_every_line_is_pinned_and_hashed(name: str) -> None:
+    text = (ROOT / "requirements" / name).read_text()
+    entries = re.split(r"(?m)^(?=[A-Za-z])", "\n".join(line for line in text.splitlines() if line[:1] != "#"))
+    entries = [entry for entry in entries if entry.strip()]
+    assert len(entries) == sum(len(versions) for versions in pins(name).values())
+    assert all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries)
+
+
+@pytest.mark.parametrize("name", LOCKS)
+def test_no_registry_is_named(name: str) -> None:
+    text = (ROOT / "requirements" / name).read_text()
+    assert not re.search(r"https?:|file:|--(extra-)?index-url|--find-links|--index", text)
