@@ -1,0 +1,203 @@
+"""CPU cost of the data plane's cores: a robot's and a cloud's engine and link, joined directly, without sockets.
+
+Time inside the cores is simulated (every datagram takes half a millisecond), the CPU time is real. Prints one line
+for each kind of traffic; `--profile` shows where the time goes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import pstats
+import random
+import time
+from collections import defaultdict
+from dataclasses import dataclass
+
+from protos.model import (
+    Candidate,
+    CandidateKind,
+    InterfaceId,
+    InterfaceName,
+    NodeName,
+    Peer,
+    PeerSet,
+    Role,
+    ServiceName,
+    ServiceOffer,
+    SessionId,
+    Version,
+)
+from sidecar.core.engine import Engine, EngineConfig
+from sidecar.core.events import ExecuteRequest, RequestFailed, RequestId, ResponseArrived
+from sidecar.core.frame import MAX_SYMBOL_BYTES, symbol_count
+from sidecar.core.link import Link, LinkIdentity
+from sidecar.core.link_events import SetReady
+from sidecar.core.rules import ServiceRule
+
+SERVICE = ServiceName("/bench")
+TYPE = "bench/srv/Bytes"
+ONE_WAY_S = 0.0005
+ANSWER = bytes(1000)
+
+
+class Side:
+    """One sidecar with one interface."""
+
+    def __init__(self, name: str, role: Role, session: int, now: float) -> None:
+        self.name, self.role, self.session = NodeName(name), role, SessionId(session)
+        self.token = session.to_bytes(16, "big")
+        self.address = (name, 1)
+        self.engine = Engine(EngineConfig(role, (ServiceRule("/*", 10.0, 60.0, idempotent=True),)), now)
+        interface = InterfaceName("eth0")
+        identity = LinkIdentity(interface, InterfaceId(0), self.session, self.token, 1)
+        self.link = Link(identity, random.Random(session), now)
+        self.link.execute(SetReady(ready=True), now)
+        self.engine.set_interfaces([interface], now)
+        self.offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
+        self.engine.set_offers(self.offers)
+        self.answered = 0
+        self.datagrams = 0
+
+    def as_peer(self) -> Peer:
+        candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, self.address)
+        return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers)
+
+    def turn(self, now: float) -> list[bytes]:
+        """Let engine and link talk until both are done; returns the datagrams that leave."""
+        engine, link = self.engine, self.link
+        out: list[bytes] = []
+        while True:
+            while (event := link.next_event()) is not None:
+                engine.on_link_event(event, now)
+            for application_event in engine.take_events():
+                if isinstance(application_event, ExecuteRequest):
+                    engine.complete(application_event.execution, ANSWER, 0.0, now)
+                elif isinstance(application_event, ResponseArrived):
+                    self.answered += 1
+                elif isinstance(application_event, RequestFailed):
+                    raise SystemExit(f"a request failed: {application_event.reason}")
+            for _, command in engine.take_commands():
+                link.execute(command, now)
+            datagrams = link.datagrams_to_send(now)
+            if not datagrams:
+                self.datagrams += len(out)
+                return out
+            out += [data for _, data in datagrams]
+
+
+class Pair:
+    """The robot, the cloud and the simulated clock; `batch` datagrams are received before a side gets its turn."""
+
+    def __init__(self, batch: int) -> None:
+        self.now = 1.0
+        self.batch = batch
+        self.robot = Side("robot", Role.ROBOT, 1, self.now)
+        self.cloud = Side("cloud", Role.CLOUD, 2, self.now)
+        self.sent = 0
+        self.early: defaultdict[NodeName, list[bytes]] = defaultdict(list)
+        """What left in the turns between two batches, and is still to be carried."""
+        for side, other in ((self.robot, self.cloud), (self.cloud, self.robot)):
+            side.engine.apply_peers(PeerSet(Version(1), 1, (other.as_peer(),)), self.now)
+        while SERVICE not in {use.name for use in self._carried()}:
+            self.step()
+
+    def _carried(self) -> list[ServiceOffer]:
+        return [ServiceOffer(name, kind) for name, kind in self.robot.engine._offers.offered.items()]
+
+    def step(self) -> None:
+        """Carry one flight of datagrams each way, or let time pass until a timer is due."""
+        flights = [
+            (other, self.early.pop(side.name, []) + side.turn(self.now))
+            for side, other in ((self.robot, self.cloud), (self.cloud, self.robot))
+        ]
+        if any(flight for _, flight in flights):
+            self.now += ONE_WAY_S
+        else:
+            sides = (self.robot, self.cloud)
+            self.now = max(self.now, min(min(s.link.next_timer(), s.engine.next_timer()) for s in sides))
+        for receiver, flight in flights:
+            source = self.cloud.address if receiver is self.robot else self.robot.address
+            for position, data in enumerate(flight, 1):
+                receiver.link.receive_datagram(data, source, self.now)
+                if position % self.batch == 0:
+                    self.early[receiver.name] += receiver.turn(self.now)
+        for side in (self.robot, self.cloud):
+            side.engine.handle_timer(self.now)
+            side.link.handle_timer(self.now)
+
+    def call(self, payload: bytes, at_once: int) -> None:
+        """Send `at_once` requests and wait for all their answers."""
+        wanted = self.robot.answered + at_once
+        for _ in range(at_once):
+            self.sent += 1
+            self.robot.engine.submit(RequestId(self.sent.to_bytes(16, "big")), SERVICE, payload, self.now)
+        while self.robot.answered < wanted:
+            self.step()
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """What one line of the table measures."""
+
+    name: str
+    size: int
+    at_once: int
+    rounds: int
+
+
+TRAFFIC = (
+    Traffic("1 kB, one at a time", 1000, 1, 2000),
+    Traffic("1 kB, 32 at once", 1000, 32, 60),
+    Traffic("150 kB, one at a time", 150_000, 1, 100),
+    Traffic("150 kB, 8 at once", 150_000, 8, 15),
+    Traffic("16 MiB, one at a time", 16 * 1024 * 1024, 1, 2),
+)
+
+
+def measure(traffic: Traffic, batch: int) -> str:
+    """Run one kind of traffic and describe its cost."""
+    pair = Pair(batch)
+    payload = random.Random(1).randbytes(traffic.size)
+    pair.call(payload, traffic.at_once)  # warm: windows grow, caches fill
+    before = pair.robot.datagrams + pair.cloud.datagrams
+    start = time.process_time()
+    for _ in range(traffic.rounds):
+        pair.call(payload, traffic.at_once)
+    cpu_s = time.process_time() - start
+    requests = traffic.rounds * traffic.at_once
+    datagrams = (pair.robot.datagrams + pair.cloud.datagrams - before) / requests
+    fragments = requests * (symbol_count(traffic.size, MAX_SYMBOL_BYTES) + 1)
+    return (
+        f"{traffic.name:24s} {cpu_s / requests * 1e6:12.0f} {datagrams:12.1f} "
+        f"{fragments / cpu_s:14.0f} {requests * traffic.size / cpu_s / 1e6:10.1f}"
+    )
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--profile", action="store_true", help="show the functions that cost most")
+    parser.add_argument("--only", default="", help="run only the kinds of traffic whose name contains this")
+    parser.add_argument(
+        "--batch", type=int, default=4, help="datagrams received between two turns of a side (default 4)"
+    )
+    arguments = parser.parse_args()
+    chosen = [traffic for traffic in TRAFFIC if arguments.only in traffic.name]
+    print(
+        f"{'both cores together':24s} {'us/request':>12s} {'datagrams':>12s} {'fragments/s':>14s} {'MB/s':>10s}"
+    )
+    for traffic in chosen:
+        if arguments.profile:
+            with cProfile.Profile() as profile:
+                line = measure(traffic, arguments.batch)
+            print(line)
+            pstats.Stats(profile).sort_stats("tottime").print_stats(25)
+        else:
+            print(measure(traffic, arguments.batch))
+
+
+if __name__ == "__main__":
+    main()
