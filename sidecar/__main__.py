@@ -6,10 +6,12 @@ import argparse
 import faulthandler
 import json
 import logging
+import math
 import os
 import signal
 import sys
 import threading
+import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -27,6 +29,9 @@ PROGRAM = "plr-sidecar"
 EXIT_OK = 0
 EXIT_FAILURE = 1
 EXIT_BAD_CONFIG = 2
+
+IMPATIENT_AFTER_S = 1.0
+"""A signal this long after the first ends the program at once; sooner, it is one and the same sent to a group too."""
 
 _DESCRIPTION = "Carries the ROS 2 service calls of a robot to cloud servers over every network interface."
 
@@ -126,12 +131,18 @@ def _run(config: SidecarConfig) -> int:
 def _stop_on_signals_and_crashes(stop: threading.Event) -> threading.Event:
     """Set `stop` on SIGTERM, SIGINT and when a thread dies; returns what is set in the last case."""
     failure = threading.Event()
+    stopping_since = math.inf
 
     def on_signal(number: int, _frame: object) -> None:
-        # A second one ends the program at once.
-        signal.signal(number, signal.SIG_DFL)
-        log.info("stopping on %s", signal.Signals(number).name)
-        stop.set()
+        nonlocal stopping_since
+        now = time.monotonic()
+        if now - stopping_since > IMPATIENT_AFTER_S:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
+        if not stop.is_set():
+            stopping_since = now
+            log.info("stopping on %s", signal.Signals(number).name)
+            stop.set()
 
     def on_crash(crash: threading.ExceptHookArgs) -> None:
         name = crash.thread.name if crash.thread else "a thread"

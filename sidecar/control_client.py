@@ -109,7 +109,7 @@ class ControlClient:
         self._hooks = hooks
         self._connected = False
         self._stopping = False
-        self._outage = OutageLog(target)
+        self._outage = OutageLog(log, target)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._main_task: asyncio.Task[None] | None = None
         self._wake = asyncio.Event()

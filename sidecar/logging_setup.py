@@ -6,6 +6,7 @@ fit is counted and said afterwards.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import time
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
 MAX_WAITING_LINES = 10_000
 """About 2 MB: some minutes of a busy log."""
+
+STOP_TIMEOUT_S = 1.0
+"""What a stalled stream may cost at the end of the program; waiting lines are lost then."""
 
 _PACKAGES = ("sidecar", "protos")
 
@@ -42,7 +46,7 @@ class LineFormatter(logging.Formatter):
 class _BoundedQueueHandler(QueueHandler):
     """Never blocks; counts what it drops."""
 
-    def __init__(self, waiting: queue.Queue[logging.LogRecord]) -> None:
+    def __init__(self, waiting: queue.Queue[logging.LogRecord | None]) -> None:
         super().__init__(waiting)
         self._waiting = waiting
         self._dropped = 0
@@ -63,9 +67,31 @@ class _BoundedQueueHandler(QueueHandler):
         except queue.Full:
             self._dropped += 1
 
+    def tell_what_was_dropped(self) -> None:
+        """Say it now, if there is something to say and room for it."""
+        if self._dropped:
+            with contextlib.suppress(queue.Full):
+                self._waiting.put(self._notice(), timeout=STOP_TIMEOUT_S)
+
     def _notice(self) -> logging.LogRecord:
         text = f"{self._dropped} log lines were dropped"
         return logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None)
+
+
+class _PatientListener(QueueListener):
+    """Ends also when its stream has stalled for good."""
+
+    def __init__(self, waiting: queue.Queue[logging.LogRecord | None], output: logging.Handler) -> None:
+        super().__init__(waiting, output)
+        self._waiting = waiting
+
+    def stop(self) -> None:
+        if self._thread is None:
+            return
+        with contextlib.suppress(queue.Full):
+            self._waiting.put(None, timeout=STOP_TIMEOUT_S)
+        self._thread.join(STOP_TIMEOUT_S)
+        self._thread = None
 
 
 class Logging:
@@ -74,9 +100,9 @@ class Logging:
     def __init__(self, level: str, stream: TextIO, *, max_waiting: int = MAX_WAITING_LINES) -> None:
         output = logging.StreamHandler(stream)
         output.setFormatter(LineFormatter())
-        waiting: queue.Queue[logging.LogRecord] = queue.Queue(max_waiting)
+        waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(max_waiting)
         self._handler = _BoundedQueueHandler(waiting)
-        self._listener = QueueListener(waiting, output)
+        self._listener = _PatientListener(waiting, output)
         self._level = level.upper()
 
     def __enter__(self) -> None:
@@ -89,4 +115,5 @@ class Logging:
 
     def __exit__(self, *_: object) -> None:
         logging.getLogger().removeHandler(self._handler)
+        self._handler.tell_what_was_dropped()
         self._listener.stop()

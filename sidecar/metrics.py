@@ -12,19 +12,23 @@ from prometheus_client import CollectorRegistry, ProcessCollector, start_http_se
 from prometheus_client.core import HistogramMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
+from protos.model import ResourceKind
 from sidecar.config_fields import split_host_port
 from sidecar.metric_families import by_one, counter, cumulative, gauge
+from sidecar.state_store import FAILURES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from prometheus_client import Metric
 
+    from protos.model import ServiceName
     from sidecar.core.control_session import ControlStats
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.ros.stats import BridgeStats
 
 _STOP_TIMEOUT_S = 1.0
+_OUTCOMES = ("ok", "deadline_missed", "failed", "rejected")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +69,7 @@ class SidecarCollector(Collector):
             "plr_state_failures",
             "Files of the state folder that could not be read or written.",
             ("reason",),
-            {(reason,): count for reason, count in dict(sources.state_failures()).items()},
+            by_one(dict.fromkeys(FAILURES, 0) | dict(sources.state_failures())),
         )
 
 
@@ -93,7 +97,10 @@ class MetricsServer:
 
 def _requests(stats: EngineStats) -> Iterator[Metric]:
     yield counter(
-        "plr_requests", "Requests of local applications by what became of them.", ("service", "outcome"), stats.requests
+        "plr_requests",
+        "Requests of local applications by what became of them.",
+        ("service", "outcome"),
+        _all_outcomes(dict(stats.requests)),
     )
     durations = HistogramMetricFamily(
         "plr_request_duration_seconds", "From a request to its first response.", labels=("service",)
@@ -135,6 +142,14 @@ def _requests(stats: EngineStats) -> Iterator[Metric]:
     )
 
 
+def _all_outcomes(requests: dict[tuple[ServiceName, str], int]) -> dict[tuple[str, ...], int]:
+    """Start every outcome of a service at 0: a counter that appears at 1 has not increased for Prometheus."""
+    services = {service for service, _ in requests}
+    found: dict[tuple[str, ...], int] = {(service, outcome): 0 for service in services for outcome in _OUTCOMES}
+    found |= {(service, outcome): count for (service, outcome), count in requests.items()}
+    return found
+
+
 def _links(links: list[LinkStats]) -> Iterator[Metric]:
     datagrams: dict[tuple[str, ...], float] = {}
     dropped: dict[tuple[str, ...], float] = {}
@@ -174,13 +189,13 @@ def _control(stats: ControlStats, connected: bool, engine: EngineStats) -> Itera
         "plr_nacks",
         "Pushed peers and mappings that were refused.",
         ("resource",),
-        {(resource.value,): count for resource, count in dict(stats.nacks).items()},
+        {(resource.value,): stats.nacks[resource] for resource in ResourceKind},
     )
     yield counter(
         "plr_acks",
         "Pushed peers and mappings that are in force or were.",
         ("resource",),
-        {(resource.value,): count for resource, count in dict(stats.acks).items()},
+        {(resource.value,): stats.acks[resource] for resource in ResourceKind},
     )
     yield gauge("plr_control_plane_connected", "Whether the control plane is within reach.", (), {(): connected})
     yield counter("plr_control_attempts", "Attempts to reach the control plane.", (), {(): stats.attempts})

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import math
+from typing import TYPE_CHECKING
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    import logging
 
 REPEATED_FAILURE_LOG_S = 60.0
 """An outage is logged when it starts or its reason changes, and this often while it lasts."""
@@ -14,7 +15,8 @@ REPEATED_FAILURE_LOG_S = 60.0
 class OutageLog:
     """Says when the control plane is lost and found, without a line for every attempt between."""
 
-    def __init__(self, target: str) -> None:
+    def __init__(self, log: logging.Logger, target: str) -> None:
+        self._log = log
         self._target = target
         self._attempts = 0
         self._logged_at = -math.inf
@@ -24,13 +26,14 @@ class OutageLog:
         """An attempt failed or a stream ended at `now`; the next attempt comes in `delay_s`."""
         self._attempts = 1 if was_connected else self._attempts + 1
         quiet = now - self._logged_at < REPEATED_FAILURE_LOG_S and self._attempts > 1
-        level = logging.DEBUG if quiet and reason == self._reason else logging.WARNING
-        if level == logging.WARNING:
+        if quiet and reason == self._reason:
+            write = self._log.debug
+        else:
+            write = self._log.warning
             self._logged_at = now
             self._reason = reason
         what = "lost" if was_connected else "not reached"
-        log.log(
-            level,
+        write(
             "control plane %s %s: %s; going on without it, attempt %d in %.1f s",
             self._target,
             what,
@@ -41,6 +44,6 @@ class OutageLog:
 
     def over(self) -> None:
         """The control plane answered."""
-        log.info("registered with the control plane %s", self._target)
+        self._log.info("registered with the control plane %s", self._target)
         self._attempts = 0
         self._reason = ""

@@ -140,7 +140,7 @@ class Sidecar:
 
     def _restore(self, what: ResourceKind, error: str | None) -> None:
         if error:
-            log.warning("the %s kept on disk do not fit any more: %s", what.value, error)
+            log.warning("the %s kept on disk no longer fits: %s", what.value, error)
             self._control_session.forget(what)
         else:
             log.info("started from the %s kept on disk", what.value)

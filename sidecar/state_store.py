@@ -40,6 +40,9 @@ LAST_GOOD_FILE = "last-good"
 LOCK_FILE = "lock"
 SET_ASIDE_SUFFIX = ".refused"
 
+FAILURES = ("identity_refused", "last_good_refused", "write_failed")
+"""The keys of `StateStore.failures`."""
+
 CLOSE_TIMEOUT_S = 2.0
 """How long `close` waits for the last write: a slow card must not hold up a shutdown."""
 
@@ -63,7 +66,7 @@ class StateStore:
         self._folder = folder
         self._owner = owner
         self.failures: Counter[str] = Counter()
-        """Files not read or not written, by what failed: identity_refused, last_good_refused, write_failed."""
+        """Files not read or not written."""
         self._lock = _lock(folder)
         self.identity = self._next_identity()
         self._current = self._read(LAST_GOOD_FILE, lambda data: decode_last_good(data, owner)) or LastGood(owner)

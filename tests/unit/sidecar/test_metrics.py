@@ -110,6 +110,9 @@ def test_every_metric_of_the_contract_is_there_before_anything_happened() -> Non
 def test_counters_become_samples() -> None:
     found = samples(exposition(busy()))
     expected = {
+        "plr_requests_total{outcome=failed,service=/plan}": 0,
+        "plr_nacks_total{resource=peers}": 0,
+        "plr_state_failures_total{reason=identity_refused}": 0,
         "plr_sidecar_info{name=robot-1,role=robot,version=0.1.0}": 1,
         "plr_requests_total{outcome=ok,service=/plan}": 7,
         "plr_requests_total{outcome=deadline_missed,service=/plan}": 2,
