@@ -167,7 +167,7 @@ class System:
         """Wait until a robot's sidecar offers this many services (by its log)."""
         self.wait(
             f"{part.name} to offer {services} service(s)",
-            lambda: part.log.read_text(errors="replace").count("offering /") >= services,
+            lambda: part.log.read_text(errors="replace").count(" is offered here") >= services,
         )
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ from sidecar.state_store import StateDirError, StateStore
 if TYPE_CHECKING:
     import threading
 
-    from protos.model import InterfaceName, MappingSet, PeerSet, Report, Welcome
+    from protos.model import Assignment, InterfaceName, MappingSet, PeerSet, Report, ServiceName, Welcome
     from sidecar.config import SidecarConfig
     from sidecar.core.stun_events import StunEvent
 
@@ -78,6 +78,7 @@ class Sidecar:
             self._control.set_candidates,
         )
         self._metrics: MetricsServer | None = None
+        self._logged_mappings: dict[ServiceName, tuple[Assignment, ...]] = {}
         self._version = version
 
     def start(self) -> None:
@@ -177,10 +178,15 @@ class Sidecar:
         error = self._data_plane.apply_mapping(mapping)
         if error is None:
             self._store.remember(mapping)
-            for service in mapping.services:
+            self._log_changes(mapping)
+        return error
+
+    def _log_changes(self, mapping: MappingSet) -> None:
+        for service in mapping.services:
+            if self._logged_mappings.get(service.service) != service.assignments:
                 pairs = ", ".join(f"{pair.interface} to {pair.server}" for pair in service.assignments)
                 log.info("mapping %d: %s goes %s: %s", mapping.version, service.service, pairs, service.reason)
-        return error
+        self._logged_mappings = {service.service: service.assignments for service in mapping.services}
 
     def take_report(self) -> Report:
         """Return what was measured since the last call."""

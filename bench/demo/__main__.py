@@ -94,7 +94,7 @@ def main() -> int:
         with _folder(options.keep_logs) as folder:
             return run(folder, options)
     except (LabError, SystemFailureError) as error:
-        console.print(f"demo: {error}", style="red", markup=False)
+        print(f"demo: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         console.print("interrupted; nothing is left behind")
