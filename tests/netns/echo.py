@@ -1,0 +1,78 @@
+"""A ROS application for the lab tests: a service of a custom type that proves which request its answer belongs to.
+
+`python -m tests.netns.echo serve` and `python -m tests.netns.echo call --size 1000 --rate 50 --json FILE`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+from plr_demo_interfaces.srv import DetectPeople
+
+from examples import robot_client, service_server
+
+SERVICE = "/echo"
+
+
+def answer(request: Any, response: Any) -> dict[str, Any]:
+    """Answer with a checksum of the payload."""
+    data = bytes(request.image.data)
+    response.header = request.image.header
+    response.success = True
+    response.image_width = zlib.crc32(data)
+    response.image_height = len(data)
+    return {"id": request.image.header.frame_id}
+
+
+class EchoRequests:
+    """Requests of one size, each with other bytes."""
+
+    def __init__(self, size: int, rng: random.Random) -> None:
+        self._size = size
+        self._rng = rng
+        self._count = 0
+
+    def request(self, stamp: Any) -> Any:
+        request = DetectPeople.Request()
+        request.image.header.stamp = stamp
+        request.image.header.frame_id = f"{self._count}"
+        self._count += 1
+        request.image.data = self._rng.randbytes(self._size)
+        return request
+
+    def check(self, request: Any, response: Any) -> tuple[str | None, dict[str, float]]:
+        mine = response.header == request.image.header
+        if not mine or response.image_width != zlib.crc32(bytes(request.image.data)):
+            return "answer to another request", {}
+        return None, {}
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    service_server.add_arguments(commands.add_parser("serve"))
+    call = commands.add_parser("call")
+    robot_client.add_arguments(call, rate_hz=50.0, deadline_ms=500.0)
+    call.add_argument("--size", type=int, default=1000)
+    options = parser.parse_args()
+    if options.command == "serve":
+        return service_server.run("echo", DetectPeople, SERVICE, answer, options)
+    workload = EchoRequests(options.size, random.Random(options.seed))
+    return robot_client.run("caller", DetectPeople, SERVICE, workload, options)
+
+
+def journal_ids(path: Path) -> list[str]:
+    """Which requests a server ran, in order."""
+    import json
+
+    return [json.loads(line)["id"] for line in path.read_text().splitlines()] if path.exists() else []
+
+
+if __name__ == "__main__":
+    sys.exit(main())
