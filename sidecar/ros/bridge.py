@@ -42,6 +42,8 @@ log = logging.getLogger(__name__)
 class _Side(Protocol):
     """What RobotSide and CloudSide have in common."""
 
+    look_is_due: bool
+
     @property
     def scan_period_s(self) -> float: ...
     def handle(self, event: ApplicationEvent, now: float) -> None: ...
@@ -123,6 +125,7 @@ class RosBridge:
                 data_plane=data_plane,
                 stats=self.stats,
                 limited_log=self._limited,
+                now=time.monotonic(),
             )
         return CloudSide(
             loop=loop, rules=self._rules, data_plane=data_plane, stats=self.stats, limited_log=self._limited
@@ -133,7 +136,7 @@ class RosBridge:
         while not self._stopping:
             try:
                 now = time.monotonic()
-                if now >= look_at:
+                if now >= look_at or side.look_is_due:
                     look_at = now + graph.SCAN_PERIOD_S
                     side.look(now)
                     look_at = now + side.scan_period_s

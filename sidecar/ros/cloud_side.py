@@ -54,7 +54,9 @@ class CloudSide:
         self._offers: tuple[ServiceOffer, ...] = ()
         self._missing_types: dict[ServiceName, str] = {}
         self._types_retried_at = 0.0
+        self._several_servers: set[ServiceName] = set()
         self._settling = False
+        self.look_is_due = False
         self._paced: set[ServiceRunner] = set()
         """Runners with requests that wait for room at their server."""
 
@@ -132,6 +134,10 @@ class CloudSide:
             return
         self._data_plane.complete(execution.id, payload, now - execution.arrived_at)
 
+    def _expired(self, runner: ServiceRunner, execution: Execution) -> None:
+        """Its time was over before the server had room for it."""
+        self._refuse_executions([execution], runner.name, RejectReason.OVERLOADED, "expired in the server's queue")
+
     def _stray(self, _runner: ServiceRunner) -> None:
         """An answer to an abandoned request, or a second answer because two nodes serve one name."""
         self._stats.dropped["answer_without_execution"] += 1
@@ -159,6 +165,7 @@ class CloudSide:
             runner = self._runners.get(name)
             if runner is not None:
                 self._notice_restart(runner)
+                self._notice_several_servers(name, served[name].applications()[type_name])
             elif retry_types or name not in self._missing_types:
                 self._open_runner(name, type_name)
         self._publish_state()
@@ -184,12 +191,27 @@ class CloudSide:
         if endpoints:
             runner.endpoints = endpoints
 
+    def _notice_several_servers(self, name: ServiceName, nodes: frozenset[str]) -> None:
+        """ROS gives each request to all servers of a name: at most once on each, but more than once here."""
+        if len(nodes) < 2:
+            self._several_servers.discard(name)
+        elif name not in self._several_servers:
+            self._several_servers.add(name)
+            log.warning(
+                "service %s has %d servers here (%s): each request runs on all of them, the first answer counts",
+                name,
+                len(nodes),
+                ", ".join(sorted(nodes)),
+            )
+
     def _open_runner(self, name: ServiceName, type_name: str) -> None:
         if len(self._runners) >= MAX_CARRIED_SERVICES:
             self._stats.dropped["too_many_services"] += 1
             return
         try:
-            runner = ServiceRunner(self._loop.node, name, load_service_type(type_name), self._answered, self._stray)
+            runner = ServiceRunner(
+                self._loop.node, name, load_service_type(type_name), self._answered, self._stray, self._expired
+            )
         except RosBridgeError as error:
             if name not in self._missing_types:
                 self._missing_types[name] = type_name

@@ -31,6 +31,8 @@ MAX_PENDING_REQUESTS = 4096
 """Applications' requests without an answer; beyond this new ones are dropped, for an older one may still be in time."""
 MAX_OFFERED_SERVICES = 512
 """Services that peers may offer; each costs DDS endpoints and a slot in every wait."""
+DISCOVERY_SETTLES_S = 1.0
+"""After joining the domain, nothing is offered for so long: servers that run here already must be discovered first."""
 TYPE_RETRY_S = 30.0
 """How often a type that is not installed is looked for again: someone may be installing it."""
 
@@ -63,6 +65,7 @@ class RobotSide:
         data_plane: DataPlane,
         stats: BridgeStats,
         limited_log: LimitedLog,
+        now: float,
     ) -> None:
         self._loop = loop
         self._own_node = loop.node.get_fully_qualified_name()
@@ -79,6 +82,9 @@ class RobotSide:
         self._missing_types: dict[ServiceName, str] = {}
         self._left_alone: dict[ServiceName, frozenset[str]] = {}
         self._types_retried_at = 0.0
+        self._settled_at = now + DISCOVERY_SETTLES_S
+        self.look_is_due = False
+        """The graph should be looked at before the next scan period is over."""
 
     # -- what the data plane says ------------------------------------------------------------------------------
 
@@ -103,7 +109,7 @@ class RobotSide:
             case RequestFailed():
                 self._fail(event, now)
             case OfferService():
-                self._offer(event, now)
+                self._offer(event)
             case WithdrawService():
                 self._withdraw(event)
             case _:
@@ -168,7 +174,7 @@ class RobotSide:
         )
         self._notices.request_failed(event)
 
-    def _offer(self, event: OfferService, now: float) -> None:
+    def _offer(self, event: OfferService) -> None:
         if find_rule(self._rules, event.name) is None:
             self._stats.dropped["offer_not_in_rules"] += 1
             log.error("service %s is offered, but no rule of this sidecar carries it", event.name)
@@ -181,7 +187,7 @@ class RobotSide:
             self._close_proxy(event.name)
             self._missing_types.pop(event.name, None)
         self._offers[event.name] = event.type
-        self.look(now)
+        self.look_is_due = True
 
     def _withdraw(self, event: WithdrawService) -> None:
         if self._offers.pop(event.name, None) is None:
@@ -222,7 +228,8 @@ class RobotSide:
 
     def look(self, now: float) -> None:
         """Compare the graph with what is offered; create and withdraw proxies accordingly."""
-        if not self._offers:
+        self.look_is_due = False
+        if not self._offers or now < self._settled_at:
             return
         served = graph.scan(self._loop.node)
         self._stats.scans += 1

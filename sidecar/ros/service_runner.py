@@ -44,12 +44,14 @@ class ServiceRunner:
         service_type: ServiceType,
         on_answer: Callable[[ServiceRunner, Execution, bytes | RosBridgeError, float], None],
         on_stray_answer: Callable[[ServiceRunner], None],
+        on_expired: Callable[[ServiceRunner, Execution], None],
     ) -> None:
         self.name = name
         self.type = service_type
         self._node = node
         self._on_answer = on_answer
         self._on_stray_answer = on_stray_answer
+        self._on_expired = on_expired
         self._at_server: dict[int, Execution] = {}
         """By rmw's sequence number."""
         self.window: RequestWindow[Execution] = RequestWindow()
@@ -84,7 +86,10 @@ class ServiceRunner:
     def release(self, now: float) -> None:
         """Send what may be sent now."""
         for execution in self.window.release(now):
-            if execution.abandoned or execution.expires_at <= now:
+            if execution.abandoned:
+                continue
+            if execution.expires_at <= now:
+                self._on_expired(self, execution)
                 continue
             number = self._client.handle.send_request(execution.request)
             execution.request = None  # it may be a large image, and is not needed again

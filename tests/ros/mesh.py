@@ -77,10 +77,10 @@ class Mesh:
         self.robot.start(self.link.robot)
         self.cloud.start(self.link.cloud)
 
-    def run(self, domain: int, *arguments: str) -> Program:
-        """Start tests/ros/app.py with these arguments."""
+    def run(self, domain: int, *arguments: str, module: str = "tests.ros.app") -> Program:
+        """Start a program of the tests with these arguments."""
         self._count += 1
-        program = Program(f"app{self._count}", ["-m", "tests.ros.app", *arguments], domain, self.folder)
+        program = Program(f"app{self._count}", ["-m", module, *arguments], domain, self.folder)
         self._programs.append(program)
         return program
 

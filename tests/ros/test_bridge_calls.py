@@ -84,3 +84,14 @@ def test_a_second_response_is_dropped(mesh: Mesh) -> None:
     result = mesh.result(mesh.call("/plan", "--count", "20"))
     assert (result["answered"], result["twice"]) == (20, 0)
     assert mesh.robot.stats.dropped == {"response_without_request": 20}
+
+
+def test_a_custom_type_with_large_images(mesh: Mesh) -> None:
+    """Up to 16 MiB, the largest message that the data plane carries."""
+    mesh.start()
+    server = mesh.run(mesh.cloud_domain, "serve", module="tests.ros.image_app")
+    mesh.wait_carried("/detect")
+    sizes = [0, 1_000, 150_000, 150_000, 2_000_000, 16 * 2**20 - 1_000]
+    took_s = mesh.result(mesh.run(mesh.robot_domain, "call", *map(str, sizes), module="tests.ros.image_app"))["took_s"]
+    assert len(took_s) == len(sizes), server.output()
+    assert [offer.type for offer in mesh.link.offers] == ["plr_demo_interfaces/srv/DetectPeople"]

@@ -108,20 +108,18 @@ def test_a_service_comes_goes_and_comes_back(mesh: Mesh) -> None:
 
 def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """The name never leaves the graph: only the server's endpoint tells that the old requests are lost."""
-    monkeypatch.setattr("sidecar.ros.graph.SCAN_PERIOD_S", 4.0)
     mesh.start()
     old = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
-    scans = mesh.cloud.stats.scans
-    wait_until(lambda: mesh.cloud.stats.scans > scans, "a look at the graph")
     mesh.call("/plan", "--count", "4", "--tolerance", "-1", "--timeout-s", "1")
     wait_until(lambda: mesh.cloud.stats.pending == 4, "4 requests at the server")
+    monkeypatch.setattr("sidecar.ros.graph.SCAN_PERIOD_S", 5.0)
     scans = mesh.cloud.stats.scans
-    wait_until(lambda: mesh.cloud.stats.scans > scans, "a look at the graph")
+    wait_until(lambda: mesh.cloud.stats.scans >= scans + 2, "the last look before the long pause")
     old.stop(signal.SIGTERM)
     mesh.serve("--plan", "/plan")
     wait_until(lambda: len(mesh.link.refusals) == 4, "refusals")
-    assert mesh.link.refusals[0][0] is RejectReason.SERVER_LOST
+    assert mesh.link.refusals[0] == (RejectReason.SERVER_LOST, "the server was replaced")
     assert mesh.result(mesh.call("/plan"))["answered"] == 1
 
 
@@ -193,3 +191,30 @@ def test_missed_deadlines_and_failures_are_published(mesh: Mesh, caplog: pytest.
     assert {pair.key: pair.value for pair in failed.status[0].values}["outcome"] == "failed"
     assert mesh.robot.stats.deadlines_missed == {"/plan": 1}
     assert any("deadline of 200 ms missed" in record.getMessage() for record in caplog.records)
+
+
+def test_an_application_that_is_gone_holds_up_nobody(mesh: Mesh) -> None:
+    """Its answers come to nothing; another application's are as quick as ever."""
+    mesh.faults.delay_s = lambda: 0.5
+    mesh.start()
+    mesh.serve("--plan", "/plan", "--deep")
+    mesh.wait_carried("/plan")
+    for number, end in enumerate((signal.SIGTERM, signal.SIGKILL)):
+        gone = mesh.call("/plan", "--count", "50", "--timeout-s", "30")
+        wait_until(lambda: mesh.robot.stats.pending == 50, "50 requests on their way")
+        gone.stop(end)
+        staying = mesh.call("/plan", "--count", "5", "--first", "100")
+        assert mesh.result(staying)["answered"] == 5
+        wait_until(lambda: not mesh.robot.stats.pending, "an empty table")
+        assert mesh.robot.stats.answers_sent[PLAN] == 55 * (number + 1)
+
+
+def test_a_request_expires_while_it_waits_for_a_slow_server(mesh: Mesh) -> None:
+    mesh.faults.lifetime_s = 1.0
+    mesh.start()
+    mesh.serve("--plan", "/plan", "--busy-s", "0.3")
+    mesh.wait_carried("/plan")
+    result = mesh.result(mesh.call("/plan", "--count", "20", "--timeout-s", "4"))
+    assert 1 <= result["answered"] <= 4
+    wait_until(lambda: not mesh.cloud.stats.pending, "an empty table")
+    assert not mesh.robot.stats.pending
