@@ -61,7 +61,6 @@ def test_nothing_it_does_is_refused(seen: dict[str, Any], program: str) -> None:
 def test_the_sidecar_reaches_the_control_plane_and_its_stun_server(seen: dict[str, Any]) -> None:
     measured = seen["controlplane"]["metrics"] | seen["sidecar"]["metrics"]
     assert all(measured.get(name) for name in WORKING), measured
-    assert measured['plr_stun_datagrams_total{outcome="answered"}'] >= 1
 
 
 def test_the_sidecar_may_bind_its_sockets_to_the_interface(seen: dict[str, Any]) -> None:

@@ -35,6 +35,7 @@ WORKING = (
     "plr_control_plane_connected",
     'plr_connected_sidecars{role="robot"}',
     'plr_datagrams_total{direction="received",interface="wlan0",kind="stun"}',
+    'plr_stun_datagrams_total{outcome="answered"}',
 )
 """Metrics that are not 0 once the two have found each other and STUN has been answered."""
 
