@@ -6,15 +6,18 @@
 from __future__ import annotations
 
 import argparse
+import json
 import random
 import sys
 import zlib
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plr_demo_interfaces.srv import DetectPeople
 
 from examples import robot_client, service_server
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 SERVICE = "/echo"
 
@@ -69,8 +72,6 @@ def main() -> int:
 
 def journal_ids(path: Path) -> list[str]:
     """Which requests a server ran, in order."""
-    import json
-
     return [json.loads(line)["id"] for line in path.read_text().splitlines()] if path.exists() else []
 
 

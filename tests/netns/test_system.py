@@ -6,6 +6,7 @@ they leave behind.
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -120,7 +121,7 @@ def test_a_path_blackholed_silently_at_50_hz(system: System) -> None:
     system.lab.link("wlan0").blackhole()
     run = call.result()
     assert_flawless(run)
-    assert system.lab.link("wlan0").stats().up.dropped
+    assert sum(system.lab.link("wlan0").stats().up.drops.values())
 
 
 def test_both_paths_dark_for_two_seconds(system: System) -> None:
@@ -128,7 +129,7 @@ def test_both_paths_dark_for_two_seconds(system: System) -> None:
     call.wait_until_sending()
     for name in ("wlan0", "wwan0"):
         system.lab.link(name).blackhole()
-    system.wait("requests to miss their deadline", lambda: counter(system, "plr_path_up") == 0, 15)
+    time.sleep(2.0)
     for name in ("wlan0", "wwan0"):
         system.lab.link(name).restore()
     run = call.result()
