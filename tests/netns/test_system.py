@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from bench.echo import journal_ids
 from bench.netlab import Lab, LabConfig, LinkProfile
 from bench.system import System, read_json
-from tests.netns.echo import journal_ids
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -57,7 +57,7 @@ def good_links(system: System) -> None:
 
 def start_cloud(system: System, cloud: str, *server_options: str) -> None:
     journal = str(system.folder / f"{cloud}.journal")
-    argv = ["-m", "tests.netns.echo", "serve", "--journal", journal, *server_options]
+    argv = ["-m", "bench.echo", "serve", "--journal", journal, *server_options]
     system.start_node(f"{cloud}.echo", cloud, argv)
     system.start_node(f"{cloud}.planner", cloud, ["-m", "examples.motion_planning.server"])
     system.start_cloud(cloud, CLOUD_SERVICES)
@@ -66,7 +66,7 @@ def start_cloud(system: System, cloud: str, *server_options: str) -> None:
 class Call:
     """A client of /echo in the background."""
 
-    def __init__(self, system: System, *options: str, module: str = "tests.netns.echo call") -> None:
+    def __init__(self, system: System, *options: str, module: str = "bench.echo call") -> None:
         self._out = system.folder / "call.json"
         self._out.unlink(missing_ok=True)
         self._system = system
@@ -195,7 +195,7 @@ def test_only_the_ros_server_killed(system: System) -> None:
 
 def test_a_slow_server_beside_a_fast_one(system: System) -> None:
     """cloud_a, without echo server since the test before, gets one that needs longer than the deadline."""
-    argv = ["-m", "tests.netns.echo", "serve", "--delay-ms", "700", "--delay-every", "1"]
+    argv = ["-m", "bench.echo", "serve", "--delay-ms", "700", "--delay-every", "1"]
     system.start_node("cloud_a.echo", "cloud_a", argv)
     system.wait("cloud_a to offer /echo", lambda: "/echo" in system.parts["cloud_a.sidecar"].log.read_text()[-2000:])
     run = Call(system, "--duration", "4", "--rate", "5").result()

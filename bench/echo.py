@@ -1,6 +1,6 @@
-"""A ROS application for the lab tests: a service of a custom type that proves which request its answer belongs to.
+"""A ROS application for tests and benchmarks: a service of a custom type that proves which request its answer belongs to.
 
-`python -m tests.netns.echo serve` and `python -m tests.netns.echo call --size 1000 --rate 50 --json FILE`.
+`python -m bench.echo serve` and `python -m bench.echo call --size 1000 --rate 50 --json FILE`.
 """
 
 from __future__ import annotations
