@@ -120,9 +120,7 @@ class SidecarConfig(_Section):
     services: Annotated[tuple[ServiceConfig, ...], Field(min_length=1), _converted]
     """What is carried; nothing else is."""
     interfaces: (
-        Annotated[
-            tuple[InterfacePattern, ...], Field(min_length=1), AfterValidator(refuse_duplicates), _converted
-        ]
+        Annotated[tuple[InterfacePattern, ...], Field(min_length=1), AfterValidator(refuse_duplicates), _converted]
         | None
     ) = None
     """Names or globs; none: all usable ones, which leaves out loopback, containers, bridges and tunnels."""

@@ -72,17 +72,13 @@ def _check_listen(text: str) -> str:
 
 def _check_node_name(text: str) -> str:
     if not _NODE_NAME.fullmatch(text):
-        raise ValueError(
-            f"expected 1 to 63 letters, digits, '-', '_' or '.', a letter or digit first, got {text!r}"
-        )
+        raise ValueError(f"expected 1 to 63 letters, digits, '-', '_' or '.', a letter or digit first, got {text!r}")
     return text
 
 
 def _check_interface(text: str) -> str:
     if not (_INTERFACE_GLOB if is_glob(text) else _INTERFACE).fullmatch(text):
-        raise ValueError(
-            f"expected an interface name of at most 15 characters, or a glob such as wl*, got {text!r}"
-        )
+        raise ValueError(f"expected an interface name of at most 15 characters, or a glob such as wl*, got {text!r}")
     return text
 
 

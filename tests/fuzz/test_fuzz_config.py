@@ -13,13 +13,7 @@ from sidecar.config import SidecarConfig, parse_config
 
 _KEYS = st.sampled_from([*SidecarConfig.model_fields, "deadline_ms", "name", "servers", "address", "enabled"])
 _SCALARS = (
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text(max_size=20)
-    | st.dates()
-    | st.binary(max_size=4)
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20) | st.dates() | st.binary(max_size=4)
 )
 _VALUES = st.recursive(
     _SCALARS | st.sampled_from(["robot", "cloud", "a:1", "/a", "/*", "eth0"]),
