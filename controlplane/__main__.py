@@ -22,7 +22,6 @@ import sdnotify
 
 from controlplane import version
 from controlplane.config import load_config
-from controlplane.server import StartError, serve
 from protos.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -50,10 +49,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"{arguments.config}: ok\n")
         return EXIT_OK
     _start_logging(config.log_level)
+    return _serve(arguments.config, config)
+
+
+def _serve(source: Path, config: ControlPlaneConfig) -> int:
+    # gRPC takes half a second to import, which checking a configuration need not wait for.
+    from controlplane.server import StartError
+
     try:
         asyncio.run(_run(config))
     except StartError as error:
-        log.critical("%s: %s", arguments.config, error)
+        log.critical("%s: %s", source, error)
         return EXIT_FAILED
     except Exception:
         log.critical("the control plane failed", exc_info=True)
@@ -87,6 +93,8 @@ def _start_logging(level: str) -> None:
 
 
 async def _run(config: ControlPlaneConfig) -> None:
+    from controlplane.server import serve
+
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -8,10 +8,10 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
+from controlplane.core.assignment import Plan, Problem
 from controlplane.core.control import Close, CloseReason, ControlCore, NackNotice, Send
 from controlplane.core.registry import Refusal
 from controlplane.mailbox import Mailbox
-from controlplane.solver import solve
 
 if TYPE_CHECKING:
     from controlplane.config import ControlPlaneConfig
@@ -30,6 +30,13 @@ METRICS_INTERVAL_S = 1.0
 def wall_clock_epoch() -> int:
     """Where versions start: milliseconds since 1970, with 2^20 versions left for each."""
     return time.time_ns() // 1_000_000 << 20
+
+
+def _solve(problem: Problem, time_limit_s: float, hint: Plan) -> Plan:
+    # OR-Tools takes one to two seconds to import: the streams need not wait for it after a restart.
+    from controlplane.solver import solve
+
+    return solve(problem, time_limit_s=time_limit_s, hint=hint)
 
 
 class ControlLoop:
@@ -107,6 +114,7 @@ class ControlLoop:
     async def run(self) -> None:
         """Run until `stop`."""
         metrics_at = self._loop.time()
+        self._executor.submit(_solve, Problem(()), 0.0, Plan({}))
         async with asyncio.TaskGroup() as solving:
             while not self._stopping:
                 now = self._loop.time()
@@ -140,9 +148,7 @@ class ControlLoop:
         hint = self._core.plan
 
         try:
-            plan = await self._loop.run_in_executor(
-                self._executor, lambda: solve(picture.problem, time_limit_s=limit_s, hint=hint)
-            )
+            plan = await self._loop.run_in_executor(self._executor, _solve, picture.problem, limit_s, hint)
         except Exception:
             # The plan in force goes on; one failed solving must not take the streams down.
             log.exception("solving failed; the plan in force stays")

@@ -1,0 +1,252 @@
+"""A real control plane process, and real gRPC streams to it."""
+
+from __future__ import annotations
+
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+import grpc
+import yaml
+
+from protos.convert import control_message_from_proto, sidecar_message_to_proto
+from protos.model import (
+    Ack,
+    CandidateSet,
+    ControlMessage,
+    Drain,
+    Heartbeat,
+    MappingSet,
+    Nack,
+    PeerSet,
+    Registration,
+    ResourceKind,
+    Role,
+    ServiceSet,
+    SidecarMessage,
+    Version,
+)
+from protos.plr.v1 import control_pb2, control_pb2_grpc
+from tests.unit.controlplane.samples import interfaces, offer, registration, use
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+Message = TypeVar("Message", bound=ControlMessage)
+
+PATIENCE_S = 30.0
+"""Only bounds how long a broken test hangs: nothing is asserted about how long things take."""
+
+HEARTBEAT_S = 0.2
+
+_LISTENS = re.compile(r"listens: gRPC (\S+), STUN (.+), metrics (\S+)$")
+
+
+class ControlPlaneProcess:
+    """`python -m controlplane` on free ports of loopback."""
+
+    def __init__(self, folder: Path, **changes: Any) -> None:
+        settings = {
+            "listen": "127.0.0.1:0",
+            "stun_listen": ["127.0.0.1:0"],
+            "stun_servers": ["192.0.2.1:3478"],
+            "metrics_listen": "127.0.0.1:0",
+            "lease_ms": 60_000,
+            "report_interval_ms": 100,
+            **changes,
+        }
+        self.config = folder / "controlplane.yaml"
+        self.config.write_text(yaml.safe_dump(settings))
+        self.lines: list[str] = []
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "controlplane", "--config", str(self.config)],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.address, self.stun, self.metrics = self._addresses()
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _addresses(self) -> tuple[str, str, str]:
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            self.lines.append(line.rstrip())
+            found = _LISTENS.search(line.rstrip())
+            if found:
+                return found[1], found[2], found[3]
+        raise AssertionError(f"it did not start: {self.lines}")
+
+    def _read(self) -> None:
+        assert self._process.stderr is not None
+        self.lines.extend(line.rstrip() for line in self._process.stderr)
+
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """Send a signal and return the exit code."""
+        self._process.send_signal(number)
+        code = self._process.wait(PATIENCE_S)
+        self._reader.join()
+        assert self._process.stderr is not None
+        self._process.stderr.close()
+        return code
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self.stop(signal.SIGKILL)
+        else:
+            self._reader.join()
+
+
+class Stream:
+    """One control stream: what is put in goes out, what comes in waits in a queue."""
+
+    def __init__(self, address: str) -> None:
+        self._channel = grpc.insecure_channel(address)
+        self._outgoing: queue.SimpleQueue[control_pb2.SidecarMessage | None] = queue.SimpleQueue()
+        self._incoming: queue.SimpleQueue[ControlMessage | grpc.RpcError | None] = queue.SimpleQueue()
+        stub = control_pb2_grpc.ControlPlaneStub(self._channel)
+        self._call: Any = stub.Connect(iter(self._outgoing.get, None))
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        try:
+            for message in self._call:
+                self._incoming.put(control_message_from_proto(message))
+            self._incoming.put(None)
+        except grpc.RpcError as error:
+            self._incoming.put(error)
+
+    def send(self, message: SidecarMessage) -> None:
+        self._outgoing.put(sidecar_message_to_proto(message))
+
+    def send_raw(self, message: control_pb2.SidecarMessage) -> None:
+        """Send what no sidecar would."""
+        self._outgoing.put(message)
+
+    def next(self) -> ControlMessage:
+        """The next message; the lease is renewed while waiting for it."""
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                message = self._incoming.get(timeout=HEARTBEAT_S)
+                break
+            except queue.Empty:
+                assert time.monotonic() < end, "nothing came"
+                self.beat()
+        assert message is not None, "the stream ended"
+        if isinstance(message, grpc.RpcError):
+            raise message
+        return message
+
+    def expect(self, kind: type[Message], condition: Callable[[Message], bool] = lambda message: True) -> Message:
+        """The next message of this type that meets the condition; others are passed over."""
+        while True:
+            message = self.next()
+            if isinstance(message, kind) and condition(message):
+                return message
+
+    def quiet_for(self, seconds: float) -> bool:
+        """Whether nothing comes for that long."""
+        try:
+            self._incoming.get(timeout=seconds)
+        except queue.Empty:
+            return True
+        return False
+
+    def end(self) -> tuple[grpc.StatusCode, str]:
+        """Wait until the control plane ends the stream; returns the status."""
+        while True:
+            message = self._incoming.get(timeout=PATIENCE_S)
+            if message is None or isinstance(message, grpc.RpcError):
+                return self._call.code(), self._call.details()
+
+    def beat(self) -> None:
+        """Renew the lease; of no use before registration."""
+
+    def half_close(self) -> None:
+        """Say nothing more."""
+        self._outgoing.put(None)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._outgoing.put(None)
+        self._call.cancel()
+        self._thread.join()
+        self._channel.close()
+
+
+class Sidecar(Stream):
+    """A stream on which a sidecar registered."""
+
+    def __init__(self, address: str, said: Registration) -> None:
+        super().__init__(address)
+        self.registration = said
+        self.send(said)
+
+    def beat(self) -> None:
+        self.send(Heartbeat())
+
+    def __exit__(self, *_: object) -> None:
+        """Leave, so that the next test finds nobody here; a stream that is ended already stays so."""
+        self.send(Drain())
+        self.half_close()
+        self._thread.join(PATIENCE_S)
+        super().__exit__()
+
+    def kill(self) -> None:
+        """Go without a word, as after kill -9."""
+        self._call.cancel()
+        self._thread.join()
+
+    def ack(self, message: PeerSet | MappingSet) -> None:
+        self.send(Ack(_resource(message), message.version, message.nonce))
+
+    def nack(self, message: PeerSet | MappingSet, error: str, in_force: int = 0) -> None:
+        self.send(Nack(_resource(message), Version(in_force), message.nonce, error))
+
+    def peers(self, *names: str) -> PeerSet:
+        """Wait for the set of exactly these peers, and acknowledge it."""
+        found = self.expect(PeerSet, lambda message: {peer.name for peer in message.peers} == set(names))
+        self.ack(found)
+        return found
+
+    def mapping(self, *servers: str) -> MappingSet:
+        """Wait for a mapping of one service to exactly these servers, and acknowledge it."""
+
+        def fits(message: MappingSet) -> bool:
+            return [sorted(a.server for a in service.assignments) for service in message.services] == [sorted(servers)]
+
+        found = self.expect(MappingSet, fits)
+        self.ack(found)
+        return found
+
+
+def _resource(message: PeerSet | MappingSet) -> ResourceKind:
+    return ResourceKind.PEERS if isinstance(message, PeerSet) else ResourceKind.MAPPING
+
+
+def cloud(address: str, name: str, **changes: Any) -> Sidecar:
+    """A cloud that offers /plan."""
+    sidecar = Sidecar(address, registration(name, Role.CLOUD, **changes))
+    sidecar.send(CandidateSet(interfaces("eth0")))
+    sidecar.send(ServiceSet((offer(),)))
+    return sidecar
+
+
+def robot(address: str, name: str = "robot", **changes: Any) -> Sidecar:
+    """A robot that uses /plan over wlan0 and wwan0."""
+    sidecar = Sidecar(address, registration(name, Role.ROBOT, **changes))
+    sidecar.send(CandidateSet(interfaces("wlan0", "wwan0")))
+    sidecar.send(ServiceSet((), (use(),)))
+    return sidecar
