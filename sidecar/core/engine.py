@@ -197,6 +197,7 @@ class Engine:
             self.stats.nacks += 1
             return error
         self.stats.peers_version = self.peers.version
+        self._offers.set_peers(self.peers.all())
         for name, session in before.items():
             if self.peers.session(name) != session:
                 self._end_session(name, now)
@@ -324,6 +325,7 @@ class Engine:
     def _drop_if_unlisted(self, name: NodeName, now: float) -> None:
         """The last path to a peer died, and it may have been kept for its paths only."""
         if self.peers.drop_if_unlisted(name):
+            self._offers.set_peers(self.peers.all())
             self._end_session(name, now)
             self._commands.append((None, SetPeers(self.peers.for_links())))
 
@@ -345,7 +347,7 @@ class Engine:
 
     def _update_offers(self, now: float) -> None:
         if self._config.role is Role.ROBOT:
-            self._events.extend(self._offers.update(self.peers.all(), self.routes, now))
+            self._events.extend(self._offers.update(self.routes, now))
 
     # -- time -----------------------------------------------------------------------------------------------------
 

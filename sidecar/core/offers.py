@@ -27,7 +27,8 @@ class Offers:
     def __init__(self, rules: tuple[ServiceRule, ...]) -> None:
         self._rules = rules
         self._offered: dict[ServiceName, str] = {}
-        self._servers: dict[ServiceName, tuple[NodeName, ...]] = {}
+        self._wanted: dict[ServiceName, tuple[str, tuple[NodeName, ...]]] = {}
+        """Service -> (type, servers), as the peers offer it."""
         self._dark_since: dict[ServiceName, float] = {}
         self.conflicts: set[tuple[ServiceName, NodeName, str]] = set()
         """Servers left out because they offer another type than the rest."""
@@ -39,12 +40,12 @@ class Offers:
 
     def servers(self, service: ServiceName) -> tuple[NodeName, ...]:
         """Return the servers that a new request for this service may go to."""
-        return self._servers.get(service, ())
+        wanted = self._wanted.get(service)
+        return wanted[1] if wanted else ()
 
-    def update(self, peers: list[Peer], routes: Routes, now: float) -> list[OfferService | WithdrawService]:
-        """Follow the peers and their paths; returns what changes on the robot."""
-        wanted = self._wanted(peers)
-        self._servers = {name: servers for name, (_, servers) in wanted.items()}
+    def update(self, routes: Routes, now: float) -> list[OfferService | WithdrawService]:
+        """Follow the peers' offers and the paths to them; returns what changes on the robot."""
+        wanted = self._wanted
         events: list[OfferService | WithdrawService] = [
             self._withdraw(name, "the last server is gone")
             for name, kind in list(self._offered.items())
@@ -67,14 +68,14 @@ class Offers:
         self._dark_since.pop(name, None)
         return WithdrawService(name, reason)
 
-    def _wanted(self, peers: list[Peer]) -> dict[ServiceName, tuple[str, tuple[NodeName, ...]]]:
-        """Service -> (type, servers), servers that drain only where there is no other."""
+    def set_peers(self, peers: list[Peer]) -> None:
+        """Take what the peers offer; servers that drain count only where there is no other."""
         by_name: dict[ServiceName, dict[str, list[Peer]]] = {}
         for peer in peers:
             for offer in peer.offers:
                 if find_rule(self._rules, offer.name) is not None:
                     by_name.setdefault(offer.name, {}).setdefault(offer.type, []).append(peer)
-        wanted = {}
+        self._wanted = {}
         self.conflicts = set()
         for name, by_type in by_name.items():
             current = self._offered.get(name)
@@ -84,8 +85,7 @@ class Offers:
                 (name, peer.name, other) for other, others in by_type.items() if other != kind for peer in others
             )
             fresh = [peer.name for peer in by_type[kind] if not peer.draining]
-            wanted[name] = (kind, tuple(fresh or [peer.name for peer in by_type[kind]]))
-        return wanted
+            self._wanted[name] = (kind, tuple(fresh or [peer.name for peer in by_type[kind]]))
 
     def next_timer(self) -> float | None:
         """When the oldest darkness ends an offer."""
