@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+import pytest
+
+from protos.model import NodeName, ServiceName
+from sidecar.core import dedup
+from sidecar.core.dedup import (
+    MAX_CACHED_BYTES,
+    MAX_RUNNING,
+    MAX_WAITERS,
+    MIN_REMEMBER_S,
+    TIMER_SLACK,
+    ExecutionTable,
+    Reply,
+    Waiter,
+)
+from sidecar.core.events import ExecuteRequest, ExecutionId, RejectReason
+from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
+from sidecar.core.rules import MAX_LIFETIME_S
+from sidecar.core.stats import EngineStats
+from tests.unit.sidecar.core.builders import ECHO, path, request
+
+ROBOT = path(peer="robot")
+ROBOT_2ND = path(peer="robot", remote=1)
+OTHER = path(peer="other")
+
+
+def table() -> ExecutionTable:
+    return ExecutionTable(EngineStats())
+
+
+def run(executions: ExecutionTable, message: RequestMessage, now: float = 1.0) -> ExecuteRequest:
+    outcome = executions.on_request(ROBOT, message, now)
+    assert isinstance(outcome, ExecuteRequest)
+    return outcome
+
+
+def test_copies_of_a_running_request_wait_and_all_get_the_answer() -> None:
+    executions = table()
+    execution = run(executions, request(copy=0))
+    assert execution.payload == b"question"
+    assert executions.on_request(ROBOT_2ND, request(copy=1), 1.1) is None
+    assert executions.on_request(ROBOT_2ND, request(copy=1), 1.2) is None, "a duplicate"
+    replies = executions.complete(execution.execution, b"answer", 0.05, 1.3)
+    assert [reply.waiter for reply in replies] == [Waiter(ROBOT, 0), Waiter(ROBOT_2ND, 1)]
+    for reply in replies:
+        assert reply.message == ResponseMessage(request().request_id, reply.waiter.copy, 0.05, b"answer")
+    stats = executions._stats.executions
+    assert (stats[ECHO, "run"], stats[ECHO, "coalesced"]) == (1, 2)
+
+
+def test_a_late_copy_gets_the_cached_answer_and_is_not_run() -> None:
+    executions = table()
+    executions.complete(run(executions, request()).execution, b"answer", 0.05, 1.1)
+    reply = executions.on_request(ROBOT_2ND, request(copy=1), 5.0)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.message, ResponseMessage)
+    assert (reply.message.copy, reply.message.payload) == (1, b"answer")
+
+
+def test_a_second_answer_is_counted_and_dropped() -> None:
+    executions = table()
+    execution = run(executions, request()).execution
+    assert executions.complete(execution, b"one", 0.0, 1.1)
+    assert executions.complete(execution, b"two", 0.0, 1.2) == []
+    assert executions.refuse(ExecutionId(99), RejectReason.SERVER_LOST, "", 1.2) == []
+    assert executions._stats.dropped["answer_to_unknown_execution"] == 2
+    reply = executions.on_request(ROBOT, request(copy=1), 1.3)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.message, ResponseMessage)
+    assert reply.message.payload == b"one"
+
+
+@pytest.mark.parametrize("reason", RejectReason)
+def test_a_refused_request_runs_again_only_when_it_certainly_has_not(reason: RejectReason) -> None:
+    executions = table()
+    (reply,) = executions.refuse(run(executions, request()).execution, reason, "why", 1.1)
+    assert reply.message == RejectionMessage(request().request_id, 0, reason, "why")
+    again = executions.on_request(ROBOT, request(copy=1), 1.2)
+    assert isinstance(again, ExecuteRequest) is reason.certainly_not_run
+    if isinstance(again, Reply):
+        assert isinstance(again.message, RejectionMessage)
+        assert again.message.reason is reason
+
+
+def test_an_answer_too_large_is_a_rejection_that_says_so() -> None:
+    executions = table()
+    execution = run(executions, request()).execution
+    (reply,) = executions.complete(execution, bytes(MAX_PAYLOAD_BYTES + 1), 0.0, 1.1)
+    assert isinstance(reply.message, RejectionMessage)
+    assert reply.message.reason is RejectReason.TOO_LARGE
+
+
+def test_an_execution_nobody_waits_for_is_abandoned_and_never_run_again() -> None:
+    executions = table()
+    execution = run(executions, request(lifetime_s=5.0)).execution
+    assert executions.next_timer() == 6.0
+    executions.on_request(ROBOT_2ND, request(copy=1, lifetime_s=7.0), 2.0)
+    assert executions.handle_timer(6.0) == [], "the second copy waits longer"
+    assert executions.next_timer() == 9.0
+    (abandoned,) = executions.handle_timer(9.0)
+    assert abandoned.execution == execution
+    assert executions.running == 0
+    assert executions.next_timer() is None
+    reply = executions.on_request(ROBOT, request(copy=2), 9.1)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.message, RejectionMessage)
+    assert reply.message.reason is RejectReason.SERVER_LOST
+
+
+def test_lifetimes_from_the_wire_are_cut() -> None:
+    execution = run(table(), request(lifetime_s=1e6))
+    assert execution.expires_s == MAX_LIFETIME_S
+
+
+@pytest.mark.parametrize("lifetime_s", [1.0, MAX_LIFETIME_S])
+def test_an_id_is_remembered_twice_as_long_as_any_copy_may_come(lifetime_s: float) -> None:
+    executions = table()
+    executions.complete(run(executions, request(1, lifetime_s=lifetime_s)).execution, b"answer", 0.0, 2.0)
+    remembered_s = max(2 * lifetime_s, MIN_REMEMBER_S)
+    run(executions, request(2), 2.0 + remembered_s - 0.1)
+    assert executions.knows(request(1).request_id)
+    run(executions, request(3), 2.0 + remembered_s)
+    assert not executions.knows(request(1).request_id)
+    assert executions._cached_bytes == 0
+
+
+def test_cached_answers_are_capped_in_bytes_and_their_ids_stay() -> None:
+    executions = table()
+    size = 16 * 1024 * 1024
+    for number in range(MAX_CACHED_BYTES // size + 1):
+        executions.complete(run(executions, request(number)).execution, bytes(size), 0.0, 1.0)
+    assert executions._cached_bytes == MAX_CACHED_BYTES
+    assert executions._stats.dropped["cached_answer_evicted"] == 1
+    reply = executions.on_request(ROBOT, request(0, copy=1), 1.1)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.message, RejectionMessage)
+    assert reply.message.reason is RejectReason.FORGOTTEN
+
+
+def test_an_id_used_for_another_service_or_by_another_robot_is_dropped() -> None:
+    executions = table()
+    run(executions, request(1))
+    assert executions.on_request(ROBOT, request(1, service=ServiceName("/else")), 1.1) is None
+    assert executions.on_request(OTHER, request(1, copy=1), 1.1) is None
+    assert executions._stats.dropped["request_id_mismatch"] == 2
+    (reply,) = executions.complete(ExecutionId(0), b"secret", 0.0, 1.2)
+    assert reply.waiter.path == ROBOT
+    assert executions.on_request(OTHER, request(1, copy=1), 1.3) is None, "nor does the cache tell strangers"
+
+
+def test_waiters_are_capped() -> None:
+    executions = table()
+    execution = run(executions, request()).execution
+    for copy in range(1, 255):
+        executions.on_request(ROBOT, request(copy=copy), 1.1)
+    assert len(executions.complete(execution, b"", 0.0, 1.2)) == MAX_WAITERS
+
+
+def test_a_full_table_refuses_one_robot_and_still_serves_another() -> None:
+    executions = table()
+    for number in range(MAX_RUNNING // 2):
+        run(executions, request(number))
+    reply = executions.on_request(ROBOT, request(99_999), 1.0)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.message, RejectionMessage)
+    assert reply.message.reason is RejectReason.OVERLOADED
+    assert executions._stats.dropped["executions_full"] == 1
+    assert not executions.knows(request(99_999).request_id)
+    assert isinstance(executions.on_request(OTHER, request(100_000), 1.0), ExecuteRequest)
+    executions.complete(ExecutionId(0), b"", 0.0, 1.1)
+    executions.complete(ExecutionId(1), b"", 0.0, 1.1)
+    run(executions, request(99_999), 1.2)
+
+
+def test_remembered_ids_are_capped_per_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dedup, "MAX_REMEMBERED", 20)
+    executions = table()
+    for number in range(10):
+        executions.complete(run(executions, request(number)).execution, b"", 0.0, 1.0)
+    assert isinstance(executions.on_request(ROBOT, request(10), 1.0), Reply)
+    assert isinstance(executions.on_request(OTHER, request(11), 1.0), ExecuteRequest)
+    run(executions, request(10), 1.0 + MIN_REMEMBER_S)
+
+
+def test_what_is_over_leaves_no_timers_behind() -> None:
+    executions = table()
+    for number in range(5 * TIMER_SLACK):
+        execution = run(executions, request(number, lifetime_s=MAX_LIFETIME_S)).execution
+        executions.refuse(execution, RejectReason.BAD_PAYLOAD, "", 1.0)
+    assert len(executions._timers) <= TIMER_SLACK + 1
+    assert not executions._forget_at
+    assert executions.next_timer() is None
+
+
+def test_unknown_services_make_no_counters() -> None:
+    executions = table()
+    for number in range(100):
+        message = request(number, service=ServiceName(f"/made/up/{number}"))
+        executions.refuse_unseen(Waiter(ROBOT, 0), message, RejectReason.NOT_OFFERED, "", 1.0)
+    assert not executions._stats.executions
+    assert executions._stats.dropped["request_for_unknown_service"] == 100
+
+
+def test_robots_are_told_apart_by_name() -> None:
+    executions = table()
+    assert run(executions, request()).robot == NodeName("robot")

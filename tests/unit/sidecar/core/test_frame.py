@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import pytest
+
+from protos.errors import DecodeError
+from protos.model import InterfaceId, SessionId
+from sidecar.core import frame
+from sidecar.core.frame import AckFrame, Close, Finished, Fragment, Header, Hello, Probe, ProbeReply
+
+HEADER = Header(InterfaceId(1), InterfaceId(2), SessionId(0x0102030405060708), 0x1112131415161718)
+CLEAR = "d1 00 01 02 01 02 03 04 05 06 07 08 11 12 13 14 15 16 17 18"
+SYMBOL = bytes(range(256))
+
+GOLDENS = {
+    "probe": (frame.encode_probe(Probe(0xA1B2C3D4)), "01 a1b2c3d4", Probe(0xA1B2C3D4)),
+    "probe reply": (frame.encode_probe_reply(ProbeReply(5)), "02 00000005", ProbeReply(5)),
+    "ack": (
+        frame.encode_ack([(90, 100), (80, 85), (3, 3)], 0.001234),
+        "03 0000000000000064 000004d2 03 000a 0000 0005 0003 0000 004b",
+        AckFrame(((90, 100), (80, 85), (3, 3)), 0.001234),
+    ),
+    "fragment": (
+        frame.encode_fragment_head(7, 300, 256, 0) + SYMBOL,
+        "04 0000000000000007 0000012c 0100 0000" + SYMBOL.hex(),
+        Fragment(7, 300, 256, 0, memoryview(SYMBOL)),
+    ),
+    "finished": (frame.encode_finished(Finished(9)), "06 0000000000000009", Finished(9)),
+    "close": (frame.encode_close(), "08", Close()),
+    "hello": (
+        frame.encode_hello(Hello(bytes(range(16)), 2)),
+        "09 000102030405060708090a0b0c0d0e0f 0000000000000002",
+        Hello(bytes(range(16)), 2),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", GOLDENS)
+def test_the_bytes_of_a_datagram_of_each_kind(kind: str) -> None:
+    encoded, golden, value = GOLDENS[kind]
+    datagram = frame.encode_header(HEADER) + encoded
+    assert datagram == bytes.fromhex(CLEAR + golden)
+    assert frame.decode_header(datagram) == HEADER
+    assert frame.decode_frames(memoryview(datagram)[frame.HEADER_BYTES :]) == [value]
+
+
+def test_room_is_left_for_the_tag() -> None:
+    assert (
+        frame.HEADER_BYTES + 17 + frame.MAX_SYMBOL_BYTES + frame.TAG_BYTES == frame.MAX_DATAGRAM_BYTES == 1200
+    )
+
+
+def test_the_last_fragment_is_shorter_and_an_empty_message_has_one() -> None:
+    for total, index, length in ((300, 1, 44), (256, 0, 256), (0, 0, 0)):
+        data = frame.encode_fragment_head(1, total, 256, index) + bytes(length)
+        (fragment,) = frame.decode_frames(memoryview(data))
+        assert isinstance(fragment, Fragment)
+        assert len(fragment.data) == length
+
+
+def test_several_frames_in_a_datagram_keep_their_order() -> None:
+    data = frame.encode_probe(Probe(1)) + frame.encode_close() + frame.encode_probe(Probe(2))
+    assert frame.decode_frames(memoryview(data)) == [Probe(1), Close(), Probe(2)]
+
+
+def test_the_newest_ranges_are_told_when_there_are_more_than_fit() -> None:
+    ranges = [(number, number) for number in range(200, 0, -2)]
+    (ack,) = frame.decode_frames(memoryview(frame.encode_ack(ranges, 0.0)))
+    assert isinstance(ack, AckFrame)
+    assert list(ack.ranges) == ranges[: frame.MAX_ACK_RANGES]
+
+
+def test_a_range_or_gap_too_wide_to_tell_ends_the_ack_at_its_newest_part() -> None:
+    for ranges, told in (
+        ([(0, 70_000)], [(70_000 - 65_535, 70_000)]),
+        ([(70_000, 70_001), (0, 1)], [(70_000, 70_001)]),
+        ([(65_538, 65_539), (0, 1)], [(65_538, 65_539), (0, 1)]),
+    ):
+        (ack,) = frame.decode_frames(memoryview(frame.encode_ack(ranges, 0.0)))
+        assert isinstance(ack, AckFrame)
+        assert list(ack.ranges) == told
+
+
+def test_another_version_is_told_from_garbage() -> None:
+    datagram = frame.encode_header(HEADER)
+    with pytest.raises(frame.VersionError, match="version 2"):
+        frame.decode_header(b"\xd2" + datagram[1:])
+    for bad in (b"\x00" + datagram[1:], datagram[:-1], b"", datagram[:1] + b"\x01" + datagram[2:]):
+        with pytest.raises(DecodeError) as error:
+            frame.decode_header(bad)
+        assert not isinstance(error.value, frame.VersionError)
+
+
+BROKEN = {
+    "nothing": "",
+    "unknown type": "00",
+    "reserved type": "05",
+    "truncated probe": "01 0000",
+    "truncated hello": "09 00",
+    "truncated finished": "06 00",
+    "ack of nothing": "03 0000000000000064 00000000 00",
+    "ack with too many ranges": "03 0000000000000064 00000000 21" + "0000 0000" * 33,
+    "ack with missing ranges": "03 0000000000000064 00000000 02 0000 0000",
+    "ack range below zero": "03 0000000000000001 00000000 01 0002 0000",
+    "ack gap below zero": "03 0000000000000001 00000000 02 0000 0000 0000 0000",
+    "fragment truncated": "04 0000000000000007 0000012c 0100 0000" + "00" * 255,
+    "fragment past the end": "04 0000000000000007 0000012c 0100 0002",
+    "fragment of nothing past the end": "04 0000000000000007 00000000 0100 0001",
+    "fragment with a tiny symbol": "04 0000000000000007 0000012c 00ff 0000" + "00" * 255,
+    "fragment of a giant": "04 0000000000000007 01000401 0100 0000" + "00" * 256,
+    "whole frame then garbage": "08 ff",
+    "65 frames": "08" * 65,
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_broken_frames_are_refused(kind: str) -> None:
+    with pytest.raises(DecodeError):
+        frame.decode_frames(memoryview(bytes.fromhex(BROKEN[kind])))

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import pytest
+
+from protos.errors import DecodeError
+from protos.model import ServiceName
+from sidecar.core.events import RejectReason, RequestId
+from sidecar.core.messages import (
+    MAX_PAYLOAD_BYTES,
+    MAX_TEXT_BYTES,
+    Message,
+    RejectionMessage,
+    RequestMessage,
+    ResponseMessage,
+    decode_message,
+    encode_message,
+)
+
+ID = RequestId(bytes(range(16)))
+GOLDENS: dict[str, tuple[Message, str]] = {
+    "request": (
+        RequestMessage(ID, 2, 1.5, ServiceName("/a"), "t", b"xyz"),
+        "01" + ID.hex() + "02 000005dc 0002 2f61 0001 74 78797a",
+    ),
+    "response": (ResponseMessage(ID, 1, 0.25, b"xyz"), "02" + ID.hex() + "01 0003d090 78797a"),
+    "rejection": (
+        RejectionMessage(ID, 0, RejectReason.OVERLOADED, "full"),
+        "03" + ID.hex() + "00 04 0004 66756c6c",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", GOLDENS)
+def test_the_bytes_of_each_message(kind: str) -> None:
+    message, golden = GOLDENS[kind]
+    encoded = encode_message(message)
+    assert encoded == bytes.fromhex(golden)
+    assert decode_message(memoryview(encoded)) == message
+
+
+@pytest.mark.parametrize("kind", GOLDENS)
+def test_a_message_cut_within_its_head_is_refused(kind: str) -> None:
+    encoded = encode_message(GOLDENS[kind][0])
+    head = len(encoded) - (3 if kind != "rejection" else 0)
+    for length in range(head):
+        with pytest.raises(DecodeError):
+            decode_message(memoryview(encoded[:length]))
+
+
+def test_other_kinds_reasons_and_text_are_refused() -> None:
+    for bad in (
+        "04" + ID.hex() + "00",
+        "03" + ID.hex() + "00 ff 0000",
+        "01" + ID.hex() + "00 00000000 0001 ff 0000",
+    ):
+        with pytest.raises(DecodeError):
+            decode_message(memoryview(bytes.fromhex(bad)))
+
+
+def test_a_payload_over_the_limit_is_refused() -> None:
+    whole = encode_message(ResponseMessage(ID, 0, 0.0, bytes(MAX_PAYLOAD_BYTES)))
+    assert isinstance(decode_message(memoryview(whole)), ResponseMessage)
+    with pytest.raises(DecodeError, match="limit"):
+        decode_message(memoryview(whole + b"\0"))
+
+
+def test_a_rejection_carries_any_text_cut_to_its_limit() -> None:
+    for text in ("\u00fc" * MAX_TEXT_BYTES, "lone surrogate \udc80", "x" * 10_000):
+        decoded = decode_message(
+            memoryview(encode_message(RejectionMessage(ID, 0, RejectReason.BAD_PAYLOAD, text)))
+        )
+        assert isinstance(decoded, RejectionMessage)
+        assert decoded.text[:10] == text[:10].replace("\udc80", "?")
+        assert len(decoded.text) <= MAX_TEXT_BYTES
+
+
+def test_times_out_of_range_are_cut() -> None:
+    for seconds, told in ((-1.0, 0.0), (1e12, 0xFFFFFFFF / 1e6)):
+        decoded = decode_message(memoryview(encode_message(ResponseMessage(ID, 0, seconds, b""))))
+        assert isinstance(decoded, ResponseMessage)
+        assert decoded.processing_s == told

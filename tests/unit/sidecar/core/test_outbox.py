@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import pytest
+
+from sidecar.core import outbox as outbox_module
+from sidecar.core.fragments import MAX_PEER_BYTES
+from sidecar.core.link_events import FragmentsLost, LinkCommand, PathId, PathState, Resend, Send
+from sidecar.core.outbound import OutboundMessage
+from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES, Outbox
+from sidecar.core.routes import Routes
+from sidecar.core.stats import EngineStats
+from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
+
+OVER_WLAN, OVER_WWAN, TO_B = path(WLAN), path(WWAN), path(WLAN, B)
+
+
+class Box:
+    """An outbox whose commands the test reads."""
+
+    def __init__(self, *up: PathId) -> None:
+        self.routes = Routes()
+        for up_path in up:
+            self.routes.set_state(up_path, PathState.UP)
+        self.commands: list[LinkCommand] = []
+        self.stats = EngineStats()
+        self.outbox = Outbox(self.routes, self.commands.append, self.stats)
+
+    def send(self, over: PathId = OVER_WLAN, size: int = 3000, expires: float = 10.0) -> OutboundMessage:
+        message = self.outbox.send(over, bytes(size), deadline=1.0, expires=expires)
+        assert message is not None
+        assert self.commands.pop() == Send(over, message)
+        return message
+
+    def lost(
+        self, message: OutboundMessage, *indices: int, over: PathId = OVER_WLAN, timed_out: bool = False
+    ) -> None:
+        self.outbox.on_lost(FragmentsLost(over, message, indices, timed_out), 1.0)
+
+
+def test_numbers_are_never_reused_and_finished_messages_go() -> None:
+    box = Box(OVER_WLAN)
+    numbers = []
+    for _ in range(3):
+        message = box.send()
+        numbers.append(message.number)
+        assert box.outbox.on_finished(A, message.number) is message
+        assert message.over
+        assert box.outbox.on_finished(A, message.number) is None
+    assert len(set(numbers)) == 3
+    assert (len(box.outbox), box.outbox.held_bytes) == (0, 0)
+
+
+def test_a_peer_cannot_finish_the_messages_of_another() -> None:
+    box = Box(OVER_WLAN)
+    message = box.send()
+    assert box.outbox.on_finished(B, message.number) is None
+    assert not message.over
+
+
+def test_lost_symbols_travel_again_but_not_those_that_arrived() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = box.send()
+    message.acked[1] = 1
+    box.lost(message, 0, 1)
+    assert box.commands == [Resend(OVER_WLAN, message, (0,))]
+    box.lost(message, 1)
+    assert len(box.commands) == 1
+
+
+def test_after_a_timeout_the_other_path_is_taken_and_the_same_one_only_for_want_of_it() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = box.send()
+    box.lost(message, 0, timed_out=True)
+    assert box.commands.pop() == Resend(OVER_WWAN, message, (0,))
+    box.routes.set_state(OVER_WWAN, PathState.DOWN)
+    box.lost(message, 0, timed_out=True)
+    assert box.commands.pop() == Resend(OVER_WLAN, message, (0,))
+
+
+def test_without_a_path_messages_wait_and_all_missing_symbols_leave_with_the_first_one_up() -> None:
+    box = Box()
+    message, delivered, called_off = box.send(), box.send(), box.send()
+    for parked in (message, delivered, called_off):
+        box.lost(parked, 0)
+        box.lost(parked, 2)
+    assert not box.commands
+    message.acked[1] = 1
+    box.outbox.on_finished(A, delivered.number)
+    box.outbox.drop(called_off)
+    box.outbox.on_path_up(TO_B)
+    assert not box.commands
+    box.outbox.on_path_up(OVER_WWAN)
+    assert box.commands == [Resend(OVER_WWAN, message, (0, 2))]
+    box.outbox.on_path_up(OVER_WLAN)
+    assert len(box.commands) == 1, "they wait no more"
+
+
+def test_expired_messages_are_dropped_and_counted_also_when_they_wait() -> None:
+    box = Box()
+    message, longer = box.send(expires=5.0), box.send(expires=6.0)
+    box.lost(message, 0)
+    box.outbox.expire(5.0)
+    assert message.over
+    assert not longer.over
+    assert box.stats.dropped["message_expired"] == 1
+    box.outbox.on_path_up(OVER_WLAN)
+    assert not box.commands
+
+
+def test_losses_of_a_message_past_its_time_end_it() -> None:
+    box = Box(OVER_WLAN)
+    message = box.send(expires=0.5)
+    box.lost(message, 0)
+    assert message.over
+    assert not box.commands
+    assert len(box.outbox) == 0
+
+
+def test_dropping_a_peer_ends_its_messages_and_nobody_elses() -> None:
+    box = Box(OVER_WLAN, TO_B)
+    gone, stays = box.send(OVER_WLAN), box.send(TO_B)
+    box.outbox.drop_peer(A)
+    assert gone.over
+    assert not stays.over
+    assert box.outbox.held_bytes == 3000
+
+
+def test_an_interface_that_goes_leaves_none_of_its_messages_behind() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    only_there, partly_there, elsewhere = box.send(OVER_WLAN), box.send(OVER_WLAN), box.send(OVER_WWAN)
+    box.lost(partly_there, 0, timed_out=True)  # its other symbols are still queued on wlan0
+    box.commands.clear()
+    box.routes.forget_interface(WLAN)
+    box.outbox.on_interface_gone(WLAN, 1.0)
+    assert box.commands == [
+        Resend(OVER_WWAN, only_there, (0, 1, 2)),
+        Resend(OVER_WWAN, partly_there, (0, 1, 2)),
+    ]
+    assert not elsewhere.over
+
+
+def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
+    box = Box(OVER_WLAN, TO_B)
+    taken = 0
+    while box.outbox.send(OVER_WLAN, b"x", deadline=1.0, expires=10.0) is not None:
+        taken += 1
+    assert taken == MAX_MESSAGES // 2
+    assert box.stats.dropped["outbox_full"] == 1
+    assert box.outbox.has_room(B, 1000)
+
+
+def test_one_peer_never_gets_more_bytes_than_it_can_reassemble(monkeypatch: pytest.MonkeyPatch) -> None:
+    box = Box(OVER_WLAN)
+    size = MAX_PEER_BYTES // 4
+    for _ in range(4):
+        box.send(size=size)
+    assert not box.outbox.has_room(A, 1)
+    assert box.outbox.has_room(B, size)
+    monkeypatch.setattr(outbox_module, "REASSEMBLED_PEER_BYTES", MAX_BYTES)
+    assert box.outbox.has_room(A, 1)

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from protos.model import SessionId
+from sidecar.core.link_events import PathState
+from sidecar.core.paths import (
+    DOWN_FACTOR,
+    DOWN_FLOOR_S,
+    FIRST_PROBE_S,
+    IDLE_PROBE_S,
+    MAX_PROBE_S,
+    MAX_PROBES_OUT,
+    MAX_RTT_SAMPLES,
+    Path,
+)
+from sidecar.core.rtt import UNSTABLE_FLOOR_S
+from tests.unit.sidecar.core.builders import path
+
+RNG = random.Random(1)
+HERE, THERE, ELSEWHERE = ("192.0.2.1", 1), ("192.0.2.2", 2), ("192.0.2.3", 3)
+
+
+def new() -> Path:
+    return Path(path(), SessionId(1), (HERE, THERE), 0, 100.0)
+
+
+def up(now: float = 100.0, rtt_s: float = 0.01) -> Path:
+    subject = new()
+    probe = subject.next_probe(now - rtt_s, RNG)
+    assert subject.answered_probe(probe, now)
+    assert subject.made_progress(now)
+    return subject
+
+
+def test_a_new_path_is_down_and_probes_with_growing_gaps() -> None:
+    subject = new()
+    assert subject.state is PathState.DOWN
+    now, gaps = 100.0, []
+    for _ in range(12):
+        assert subject.probe_at is not None
+        gaps.append(subject.probe_at - now)
+        now = subject.probe_at
+        subject.next_probe(now, RNG)
+    assert gaps[0] == 0
+    assert 0.9 * FIRST_PROBE_S <= gaps[1] <= 1.1 * FIRST_PROBE_S
+    assert 0.9 * MAX_PROBE_S <= gaps[-1] <= 1.1 * MAX_PROBE_S
+    assert subject.silence_timer is None, "a path that is down has nothing to lose"
+
+
+def test_up_unstable_down_up() -> None:
+    subject = up(rtt_s=0.01)
+    assert subject.silence_timer is None, "nothing waits for an answer"
+    subject.waits_for_answer(101.0)
+    assert subject.silence_timer == pytest.approx(101.0 + UNSTABLE_FLOOR_S)
+    assert subject.check_silence(101.0 + UNSTABLE_FLOOR_S - 0.001) is None
+    assert subject.check_silence(101.0 + UNSTABLE_FLOOR_S) is PathState.UNSTABLE
+    assert subject.probe_at == 101.0 + UNSTABLE_FLOOR_S, "it is asked at once"
+    down_at = 101.0 + max(DOWN_FACTOR * UNSTABLE_FLOOR_S, DOWN_FLOOR_S)
+    assert subject.silence_timer == pytest.approx(down_at)
+    assert subject.check_silence(down_at) is PathState.DOWN
+    assert subject.check_silence(down_at + 100) is None
+    probe = subject.next_probe(down_at, RNG)
+    assert subject.answered_probe(probe, down_at + 0.01)
+    assert subject.made_progress(down_at + 0.01)
+    assert subject.state is PathState.UP  # type: ignore[comparison-overlap]  # made_progress changed it
+
+
+def test_an_unstable_path_that_answers_is_up_again() -> None:
+    subject = up()
+    subject.waits_for_answer(101.0)
+    subject.check_silence(101.1)
+    assert subject.state is PathState.UNSTABLE
+    assert subject.made_progress(101.2)
+    assert not subject.made_progress(101.3), "already up"
+
+
+def test_the_silence_is_counted_from_the_first_unanswered_datagram() -> None:
+    subject = up()
+    subject.waits_for_answer(101.0)
+    subject.waits_for_answer(101.05)
+    assert subject.silence_timer == pytest.approx(101.0 + UNSTABLE_FLOOR_S)
+
+
+def test_a_quiet_path_is_probed_at_ease_and_traffic_postpones_it() -> None:
+    subject = up(now=100.0)
+    assert subject.probe_at == 100.0 + IDLE_PROBE_S
+    subject.made_progress(100.4)
+    assert subject.probe_at == 100.4 + IDLE_PROBE_S
+
+
+def test_an_unstable_path_is_probed_fast() -> None:
+    subject = up()
+    subject.waits_for_answer(101.0)
+    subject.check_silence(101.1)
+    subject.next_probe(101.1, RNG)
+    assert subject.probe_at is not None
+    assert subject.probe_at <= 101.1 + 1.1 * FIRST_PROBE_S
+
+
+def test_hearing_a_dead_path_hastens_its_probe_but_no_flood_does() -> None:
+    subject = new()
+    now = 100.0
+    for _ in range(10):
+        subject.next_probe(now, RNG)
+        now += 2.0
+    subject.hasten_probe(now)
+    assert subject.probe_at is not None
+    assert subject.probe_at <= now
+    subject.next_probe(now, RNG)
+    for _ in range(100):
+        subject.hasten_probe(now + 0.001)
+    assert subject.probe_at == pytest.approx(now + FIRST_PROBE_S)
+
+
+def test_only_what_was_asked_counts_as_an_answer_and_once() -> None:
+    subject = new()
+    probe = subject.next_probe(100.0, RNG)
+    assert not subject.answered_probe(probe + 1, 100.1)
+    assert subject.answered_probe(probe, 100.1)
+    assert not subject.answered_probe(probe, 100.1)
+    stale = subject.next_probe(100.2, RNG)
+    subject.go_down()
+    assert not subject.answered_probe(stale, 100.3)
+
+
+def test_unanswered_probes_and_samples_are_capped() -> None:
+    subject = new()
+    for step in range(1000):
+        subject.next_probe(100.0 + step, RNG)
+        subject.note_rtt()
+    assert len(subject._probes_out) == MAX_PROBES_OUT
+    assert len(subject.rtts) == MAX_RTT_SAMPLES
+
+
+def test_probes_go_to_every_candidate_until_the_path_is_up() -> None:
+    subject = new()
+    assert subject.destinations() == (HERE, THERE)
+    subject.remote = ELSEWHERE
+    assert subject.destinations() == (ELSEWHERE, HERE, THERE)
+    subject.remote = THERE
+    assert subject.destinations() == (HERE, THERE)
+    subject.state = PathState.UP
+    assert subject.destinations() == (THERE,)

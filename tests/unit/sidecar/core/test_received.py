@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+from sidecar.core.frame import MAX_ACK_RANGES
+from sidecar.core.received import MAX_ACK_DELAY_S, STALE_PACKETS, ReceivedPackets
+
+
+def received(*numbers: int) -> ReceivedPackets:
+    packets = ReceivedPackets()
+    for number in numbers:
+        assert packets.add(number, 1.0)
+    return packets
+
+
+def ranges(packets: ReceivedPackets) -> list[tuple[int, int]]:
+    return packets.take_ack(1.0)[0]
+
+
+def test_ranges_grow_join_and_stay_sorted() -> None:
+    assert ranges(received(5)) == [(5, 5)]
+    assert ranges(received(5, 6, 7)) == [(5, 7)]
+    assert ranges(received(5, 7)) == [(7, 7), (5, 5)]
+    assert ranges(received(5, 7, 6)) == [(5, 7)]
+    assert ranges(received(10, 5, 7, 6, 4, 9)) == [(9, 10), (4, 7)]
+    assert ranges(received(10, 2, 6)) == [(10, 10), (6, 6), (2, 2)]
+
+
+def test_a_number_counts_once() -> None:
+    packets = received(5, 7, 3)
+    for number in (5, 7, 3):
+        assert not packets.add(number, 1.0)
+    assert ranges(packets) == [(7, 7), (5, 5), (3, 3)]
+
+
+def test_the_oldest_ranges_are_forgotten_and_nothing_of_them_is_taken_again() -> None:
+    packets = received(*range(0, 4 * MAX_ACK_RANGES, 2))
+    assert len(ranges(packets)) == MAX_ACK_RANGES
+    lowest = ranges(packets)[-1][0]
+    assert not packets.add(lowest - 2, 1.0), "a forgotten one came before"
+    assert not packets.add(lowest - 3, 1.0), "it may have come before"
+    assert packets.add(lowest - 1, 1.0), "it did not"
+    assert not packets.add(0, 1.0)
+    assert packets.add(lowest + 1, 1.0), "it closes a gap that is remembered"
+
+
+def test_a_leap_makes_everything_far_below_stale_not_new() -> None:
+    packets = received(1, 2, 3)
+    assert packets.add(3 + STALE_PACKETS + 1, 1.0)
+    for number in (1, 2, 3):
+        assert not packets.add(number, 1.0)
+    assert packets.add(4, 1.0)
+    assert ranges(packets) == [(3 + STALE_PACKETS + 1,) * 2, (4, 4)]
+
+
+def test_a_lone_datagram_is_acknowledged_soon_the_second_at_once() -> None:
+    packets = received(1)
+    assert packets.ack_at is None
+    packets.owe_ack(1.0)
+    assert packets.ack_at == 1.0 + MAX_ACK_DELAY_S
+    packets.add(2, 1.001)
+    packets.owe_ack(1.001)
+    assert packets.ack_at == 1.001
+    assert packets.take_ack(1.003) == ([(1, 2)], 1.003 - 1.001)
+    assert packets.ack_at is None
+
+
+def test_a_gap_and_a_late_filler_are_acknowledged_at_once() -> None:
+    for numbers in ((1, 3), (3, 1)):
+        packets = received(*numbers)
+        packets.owe_ack(2.0)
+        assert packets.ack_at == 2.0
+        packets.take_ack(2.0)
+    packets.add(4, 2.0)
+    packets.owe_ack(2.0)
+    assert packets.ack_at == 2.0 + MAX_ACK_DELAY_S, "the old gap is no news"
+
+
+def test_a_duplicate_owes_nothing_new() -> None:
+    packets = received(1, 2)
+    packets.take_ack(1.0)
+    packets.add(1, 1.0)
+    packets.add(3, 1.0)
+    packets.owe_ack(1.0)
+    assert packets.ack_at == 1.0 + MAX_ACK_DELAY_S

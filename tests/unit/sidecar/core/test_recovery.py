@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from sidecar.core import frame
+from sidecar.core.frame import AckFrame
+from sidecar.core.received import MAX_ACK_DELAY_S, ReceivedPackets
+from sidecar.core.recovery import MAX_PTO_BACKOFF, PACKET_THRESHOLD, PTO_DATAGRAMS, Recovery, Sent
+from tests.unit.sidecar.core.builders import message
+
+
+def ack(*ranges: tuple[int, int], delay_s: float = 0.0) -> AckFrame:
+    return AckFrame(ranges, delay_s)
+
+
+def with_sent(count: int, *, at: float = 1.0, every_s: float = 0.0, first: int = 0) -> Recovery:
+    recovery = Recovery(first)
+    for index in range(count):
+        recovery.on_sent(recovery.take_number(), at + index * every_s, 100, finished=index)
+    return recovery
+
+
+def numbers(lost: list[Sent]) -> list[int | None]:
+    return [datagram.finished for datagram in lost]
+
+
+def test_acknowledged_datagrams_leave_the_flight() -> None:
+    recovery = with_sent(5)
+    assert recovery.in_flight == 500
+    newly = recovery.on_ack(ack((3, 4), (0, 0)), 1.1)
+    assert newly is not None
+    assert sorted(datagram.finished or 0 for datagram in newly) == [0, 3, 4]
+    assert (recovery.in_flight, recovery.acked_bytes, recovery.largest_acked) == (200, 300, 4)
+    assert recovery.rtt.latest == pytest.approx(0.1)
+
+
+def test_repeating_an_acknowledgement_does_nothing() -> None:
+    recovery = with_sent(5)
+    recovery.on_ack(ack((0, 4)), 1.1)
+    assert recovery.on_ack(ack((0, 4)), 5.0) == []
+    assert recovery.rtt.latest == pytest.approx(0.1)
+    assert recovery.in_flight == 0
+
+
+def test_acknowledging_the_unsent_is_refused_whole() -> None:
+    recovery = with_sent(5)
+    assert recovery.on_ack(ack((0, 5)), 1.1) is None
+    assert recovery.in_flight == 500
+
+
+def test_numbers_from_before_the_path_and_giant_ranges_are_cheap() -> None:
+    recovery = with_sent(2, first=2**40)
+    newly = recovery.on_ack(ack((2**40, 2**40 + 1), (0, 2**40 - 2)), 1.1)  # would never end if walked through
+    assert newly is not None
+    assert len(newly) == 2
+
+
+def test_lost_by_packet_threshold() -> None:
+    recovery = with_sent(5)
+    recovery.on_ack(ack((PACKET_THRESHOLD, PACKET_THRESHOLD)), 1.0001)
+    assert numbers(recovery.detect_lost(1.0001)) == [0]
+    assert recovery.in_flight == 300
+    assert recovery.total_lost == 1
+
+
+def test_lost_by_time_threshold_and_not_earlier() -> None:
+    recovery = with_sent(2)
+    recovery.on_ack(ack((1, 1)), 1.1)
+    assert recovery.detect_lost(1.1) == []
+    timer = recovery.loss_timer
+    assert timer == pytest.approx(1.0 + 9 / 8 * 0.1)
+    assert timer is not None
+    assert recovery.detect_lost(timer - 1e-6) == []
+    assert numbers(recovery.detect_lost(timer)) == [0]
+    assert recovery.loss_timer is None
+
+
+def test_what_was_sent_after_the_acknowledged_is_not_lost() -> None:
+    recovery = with_sent(3)
+    recovery.on_ack(ack((0, 0)), 1.1)
+    assert recovery.detect_lost(99.0) == []
+    assert recovery.loss_timer is None
+
+
+def test_probe_timeout_doubles_gives_up_the_oldest_and_ends_with_an_acknowledgement() -> None:
+    recovery = with_sent(12)
+    recovery.rtt.sample(0.1)
+    timeout = 0.1 + 4 * 0.05 + MAX_ACK_DELAY_S
+    assert recovery.pto_timer == pytest.approx(1.0 + timeout)
+    assert numbers(recovery.on_probe_timeout(2.0)) == list(range(PTO_DATAGRAMS))
+    assert recovery.pto_timer == pytest.approx(2.0 + 2 * timeout)
+    recovery.on_probe_timeout(3.0)
+    assert recovery.pto_timer == pytest.approx(3.0 + 4 * timeout)
+    recovery.on_ack(ack((5, 5)), 3.1)
+    assert recovery.pto_timer == pytest.approx(3.0 + recovery.rtt.probe_timeout(MAX_ACK_DELAY_S))
+
+
+def test_probe_timeouts_stop_doubling_and_end_with_the_flight() -> None:
+    recovery = with_sent(40)
+    recovery.rtt.sample(0.1)
+    for turn in range(20):
+        assert recovery.pto_timer is not None
+        assert recovery.pto_timer - recovery.last_eliciting_at <= 0.4 * 2**MAX_PTO_BACKOFF
+        recovery.on_probe_timeout(float(turn + 2))
+    assert recovery.pto_timer is None
+    assert recovery.in_flight == 0
+
+
+def test_giving_up_leaves_nothing_in_flight() -> None:
+    recovery = with_sent(7)
+    assert numbers(recovery.give_up_all()) == list(range(7))
+    assert (recovery.in_flight, recovery.total_lost, recovery.pto_timer) == (0, 7, None)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_sender_and_receiver_agree_whatever_the_network_does(seed: int) -> None:
+    """ReceivedPackets, the ACK codec and Recovery together, over a net that loses, doubles and reorders both ways."""
+    rng = random.Random(seed)
+    loss, doubling = rng.uniform(0, 0.4), rng.uniform(0, 0.3)
+    recovery, packets = Recovery(first_number=rng.choice([0, 2**40])), ReceivedPackets()
+    now = 1.0
+    to_receiver: list[tuple[float, int]] = []
+    to_sender: list[tuple[float, bytes]] = []
+    arrived: set[int] = set()
+    fate: dict[int, str] = {}
+    carried = message(size=0)
+
+    def settle(what: str, gone: list[Sent]) -> None:
+        for datagram in gone:
+            assert datagram.finished is not None
+            assert datagram.finished not in fate, "acknowledged or lost twice"
+            fate[datagram.finished] = what
+
+    sent: list[int] = []
+    while len(sent) < 400 or recovery.sent:
+        now += rng.choice([0.0001, 0.001, 0.02])
+        if len(sent) < 400 and rng.random() < 0.7:
+            number = recovery.take_number()
+            if rng.random() < 0.8:
+                sent.append(number)
+                recovery.on_sent(number, now, 100, (carried, 0), finished=number)
+            for _ in range(2 if rng.random() < doubling else 1):
+                if rng.random() >= loss:
+                    to_receiver.append((now + rng.choice([0.01, 0.011, 0.05]), number))
+        for due in [due for due in to_receiver if due[0] <= now]:
+            to_receiver.remove(due)
+            new = packets.add(due[1], now)
+            assert not (new and due[1] in arrived), "taken twice"
+            arrived |= {due[1]} if new else set()
+            packets.owe_ack(now)
+        if packets.ack_at is not None and packets.ack_at <= now:
+            encoded = frame.encode_ack(*packets.take_ack(now))
+            if rng.random() >= loss:
+                to_sender.append((now + rng.choice([0.01, 0.04]), encoded))
+        for due_ack in [due_ack for due_ack in to_sender if due_ack[0] <= now]:
+            to_sender.remove(due_ack)
+            (decoded,) = frame.decode_frames(memoryview(due_ack[1]))
+            assert isinstance(decoded, AckFrame)
+            newly = recovery.on_ack(decoded, now)
+            assert newly is not None, "an honest receiver acknowledges nothing unsent"
+            assert {datagram.finished for datagram in newly} <= arrived, "acknowledged without having come"
+            settle("acked", newly)
+            settle("lost", recovery.detect_lost(now))
+        if recovery.loss_timer is not None:
+            if recovery.loss_timer <= now:
+                settle("lost", recovery.detect_lost(now))
+        elif recovery.pto_timer is not None and recovery.pto_timer <= now:
+            settle("lost", recovery.on_probe_timeout(now))
+        assert recovery.in_flight == 100 * len(recovery.sent)
+    assert recovery.in_flight == 0
+    assert sorted(fate) == sent, "some datagram is neither acknowledged nor lost"
+    assert recovery.total_lost == sum(what == "lost" for what in fate.values())
+    assert recovery.loss_timer is None or recovery.detect_lost(now) == []
+    assert recovery.pto_timer is None

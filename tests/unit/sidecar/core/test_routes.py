@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from sidecar.core.link_events import PathState
+from sidecar.core.routes import Routes
+from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
+
+FAST, SLOW, SHAKY = path(WLAN, A), path(WWAN, A), path(WLAN, A, 1)
+
+
+def routes() -> Routes:
+    table = Routes()
+    for known, state, rtt_s in (
+        (SLOW, PathState.UP, 0.1),
+        (FAST, PathState.UP, 0.01),
+        (SHAKY, PathState.UNSTABLE, 0.001),
+        (path(WLAN, B), PathState.DOWN, 0.001),
+    ):
+        table.set_state(known, state)
+        table.set_rtt(known, rtt_s)
+    return table
+
+
+def test_up_comes_before_fast_and_what_is_down_is_not_usable() -> None:
+    assert [route.id for route in routes().usable((A, B))] == [FAST, SLOW, SHAKY]
+
+
+def test_the_best_path_may_be_avoided_unless_it_is_the_only_one() -> None:
+    table = routes()
+    assert table.best_to(A) == FAST
+    assert table.best_to(A, avoid=FAST) == SLOW
+    for gone in (SLOW, SHAKY):
+        table.set_state(gone, PathState.DOWN)
+    assert table.best_to(A, avoid=FAST) == FAST
+    assert table.best_to(B) is None
+
+
+def test_the_best_over_one_interface() -> None:
+    table = routes()
+    best = table.best_over(WWAN, A)
+    assert best is not None
+    assert best.id == SLOW
+    assert table.best_over(WLAN, B) is None
+
+
+def test_unknown_paths_are_down() -> None:
+    assert Routes().state(FAST) is PathState.DOWN
+    assert not Routes().reaches(A)
+
+
+def test_forgetting_a_peer_or_an_interface_leaves_nothing_of_it() -> None:
+    table = routes()
+    assert set(table.forget_interface(WLAN)) == {FAST, SHAKY, path(WLAN, B)}
+    assert table.interfaces_to(A) == [WWAN]
+    assert table.reaches(A)
+    table.forget_peer(A)
+    assert not table.reaches(A)
+    assert table.all_to(A) == []
+    assert not table._routes
