@@ -149,12 +149,12 @@ class RosBridge:
                 time.sleep(_ERROR_PAUSE_S)
                 continue
             now = time.monotonic()
-            self._drain(side, data_plane, now)
-            for entity in ready:
+            for entity in ready:  # before the events, which may destroy one of them
                 try:
                     entity.take(now)
                 except Exception:
                     self._note_error("take", now)
+            self._drain(side, data_plane, now)
             try:
                 side.on_timer(now)
             except Exception:

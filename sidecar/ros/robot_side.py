@@ -286,13 +286,14 @@ class RobotSide:
         if proxy is None:
             return False
         self._loop.set_services(tuple(self._proxies.values()))
-        proxy.close()
+        unseen = proxy.close()
+        self._stats.requests_taken[name] += unseen
         orphans = [request_id for request_id, pending in self._pending.items() if pending.proxy is proxy]
         for request_id in orphans:
             del self._pending[request_id]
         self._stats.pending = len(self._pending)
-        if orphans:
-            self._stats.unanswered[name, "withdrawn"] += len(orphans)
+        if orphans or unseen:
+            self._stats.unanswered[name, "withdrawn"] += len(orphans) + unseen
         return True
 
     def _publish_state(self) -> None:

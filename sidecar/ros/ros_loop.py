@@ -64,8 +64,8 @@ class RosLoop:
             parameter_overrides=[Parameter("start_type_description_service", value=False)],
         )
         self._guard = _rclpy.GuardCondition(self._context.handle)
-        self._services: list[Waited] = []
-        self._clients: list[Waited] = []
+        self._services: dict[Any, Waited] = {}
+        self._clients: dict[Any, Waited] = {}
         self._by_pointer: dict[int, Waited] = {}
         self._wait_set: Any = None
         self._woken = False
@@ -77,12 +77,12 @@ class RosLoop:
 
     def set_services(self, services: Sequence[Waited]) -> None:
         """Wait on these services from now on."""
-        self._services = list(services)
+        self._services = {service.handle: service for service in services}
         self._wait_set = None
 
     def set_clients(self, clients: Sequence[Waited]) -> None:
         """Wait on these clients from now on."""
-        self._clients = list(clients)
+        self._clients = {client.handle: client for client in clients}
         self._wait_set = None
 
     def wake(self) -> None:
@@ -100,9 +100,9 @@ class RosLoop:
         wait_set.clear_entities()
         wait_set.add_guard_condition(self._guard)
         for service in self._services:
-            wait_set.add_service(service.handle)
+            wait_set.add_service(service)
         for client in self._clients:
-            wait_set.add_client(client.handle)
+            wait_set.add_client(client)
         wait_set.wait(int(min(max(timeout_s, 0.0), LONGEST_WAIT_S) * _NANOSECONDS))
         self._woken = False
         ready = []
@@ -120,5 +120,7 @@ class RosLoop:
         self._context.try_shutdown()
 
     def _rebuild(self) -> None:
-        self._by_pointer = {entity.handle.pointer: entity for entity in (*self._services, *self._clients)}
+        self._by_pointer = {
+            handle.pointer: entity for handle, entity in (*self._services.items(), *self._clients.items())
+        }
         self._wait_set = _rclpy.WaitSet(0, 1, 0, len(self._clients), len(self._services), 0, self._context.handle)

@@ -68,10 +68,14 @@ class ServiceProxy:
         """Answer the request with this rmw id; raises rclpy's RCLError when rmw cannot."""
         self._service.handle.service_send_response(response, request_id)
 
-    def close(self) -> None:
-        """Withdraw the service."""
+    def close(self) -> int:
+        """Withdraw the service; return how many requests lay there unseen."""
         self.open = False
+        unseen = 0
+        while self._service.handle.service_take_request(self.type.request)[1] is not None:
+            unseen += 1
         self._node.destroy_service(self._service)
+        return unseen
 
 
 def _unused(_request: Any, response: Any) -> Any:
