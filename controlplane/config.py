@@ -71,51 +71,55 @@ class ControlPlaneConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", title="plr-controlplane")
 
-    listen: Listen = Field("[::]:50051", description="host:port of the gRPC server; port 0 takes a free one.")
+    listen: Listen = Field(default="[::]:50051", description="host:port of the gRPC server; port 0 takes a free one.")
     stun_listen: Annotated[
         tuple[Listen, ...], BeforeValidator(_as_list), AfterValidator(_each_once), Field(max_length=16)
     ] = Field(
-        ("[::]:3478",),
+        default=("[::]:3478",),
         description="host:port or a list of them where STUN is answered; an empty list turns it off. "
         "[::] means all addresses, IPv4 included.",
     )
     stun_servers: Annotated[
         tuple[Target, ...], BeforeValidator(_as_list), AfterValidator(_each_once), Field(max_length=16)
     ] = Field(
-        (),
+        default=(),
         description="host:port of the STUN servers that sidecars are told to use, seen from the sidecars: "
         "this one's public address, others, or both.",
     )
-    metrics_listen: Listen | None = Field("127.0.0.1:9465", description="host:port for Prometheus; null turns it off.")
+    metrics_listen: Listen | None = Field(
+        default="127.0.0.1:9465", description="host:port for Prometheus; null turns it off."
+    )
     lease_ms: int = Field(
-        5000,
+        default=5000,
         ge=500,
         le=600_000,
         description="A sidecar silent for this long leaves its peers' view. Ten reports long: a cellular "
         "handover or a lost TCP segment takes seconds, and dead paths are noticed by the data plane much sooner.",
     )
-    report_interval_ms: int = Field(500, ge=50, le=60_000, description="How often sidecars report what they measured.")
+    report_interval_ms: int = Field(
+        default=500, ge=50, le=60_000, description="How often sidecars report what they measured."
+    )
     warm_up_ms: int = Field(
-        RECONNECT_MAX_MS + 2000,
+        default=RECONNECT_MAX_MS + 2000,
         ge=0,
         le=600_000,
         description="After a start, robots that still hold peers are not sent a set that lacks some for at most "
         f"this long: sidecars come back within {RECONNECT_MAX_MS} ms, and the time to register.",
     )
     histogram_half_life_s: float = Field(
-        60.0, ge=1.0, le=86_400.0, description="Age at which a latency sample counts half."
+        default=60.0, ge=1.0, le=86_400.0, description="Age at which a latency sample counts half."
     )
     default_capacity_interfaces: int = Field(
-        1,
+        default=1,
         ge=0,
         le=256,
         description="How many interfaces of one robot may share a server for one service; 0 means no limit. The "
         "paper's value is 1. Exceeded by the least amount where there are too few servers.",
     )
     solver_time_limit_ms: int = Field(
-        2000, ge=10, le=60_000, description="Longest time for one solving; then the best plan found is taken."
+        default=2000, ge=10, le=60_000, description="Longest time for one solving; then the best plan found is taken."
     )
-    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least level logged.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="Least level logged.")
 
     @model_validator(mode="after")
     def _leases_outlast_reports(self) -> Self:

@@ -1,0 +1,93 @@
+"""The sidecar's control client against the real control plane."""
+
+from __future__ import annotations
+
+import queue
+import random
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import grpc
+
+from protos.convert import status_from_proto
+from protos.model import MappingSet, PeerSet, Report, Role, SyncState, Welcome
+from protos.plr.v1 import admin_pb2, admin_pb2_grpc
+from sidecar.control_client import ControlClient
+from sidecar.core.control_session import ControlSession
+from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
+from tests.unit.controlplane.samples import interfaces, path, registration, use
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from protos.model import SidecarStatus
+
+
+class Engine:
+    """Takes whatever the control plane says, and reports every path as up."""
+
+    def __init__(self) -> None:
+        self.peers: queue.SimpleQueue[PeerSet] = queue.SimpleQueue()
+        self.mappings: queue.SimpleQueue[MappingSet] = queue.SimpleQueue()
+        self.known: tuple[str, ...] = ()
+
+    def welcome(self, welcome: Welcome) -> None:
+        """Nothing to do."""
+
+    def apply_peers(self, peers: PeerSet) -> str | None:
+        self.known = tuple(peer.name for peer in peers.peers)
+        self.peers.put(peers)
+        return None
+
+    def apply_mapping(self, mapping: MappingSet) -> str | None:
+        self.mappings.put(mapping)
+        return None
+
+    def take_report(self) -> Report:
+        return Report(paths=tuple(path(nic, server) for nic in ("wlan0", "wwan0") for server in self.known))
+
+    def connection_changed(self, connected: bool, reason: str) -> None:
+        """Nothing to do."""
+
+
+def status(plane: ControlPlaneProcess) -> dict[str, SidecarStatus]:
+    with grpc.insecure_channel(plane.address) as channel:
+        answer = admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest(), timeout=PATIENCE_S)
+    return {found.peer.name: found for found in status_from_proto(answer)}
+
+
+def test_a_client_registers_follows_and_outlives_a_restart(tmp_path: Path) -> None:
+    engine = Engine()
+    session = ControlSession(registration("robot", Role.ROBOT), random.Random(1))
+    with ControlPlaneProcess(tmp_path, lease_ms=10_000) as plane:
+        client = ControlClient(plane.address, session, engine)
+        client.set_candidates(interfaces("wlan0", "wwan0"))
+        client.set_services((), (use(),))
+        client.start()
+        try:
+            with cloud(plane.address, "cloud-a"), cloud(plane.address, "cloud-b"):
+                while {peer.name for peer in engine.peers.get(timeout=PATIENCE_S).peers} != {"cloud-a", "cloud-b"}:
+                    pass
+                while len(last := engine.mappings.get(timeout=PATIENCE_S).services[0].assignments) < 2:
+                    pass
+                assert {assignment.server for assignment in last} == {"cloud-a", "cloud-b"}
+                end = time.monotonic() + PATIENCE_S
+                while (shown := status(plane)["robot"]).mapping.state is not SyncState.SYNCED:
+                    assert time.monotonic() < end
+                    time.sleep(0.05)
+                assert shown.peers.state is SyncState.SYNCED
+                version = shown.mapping.version_sent
+                plane.stop(signal.SIGKILL)
+            with (
+                ControlPlaneProcess(tmp_path, listen=plane.address, lease_ms=10_000) as again,
+                cloud(again.address, "cloud-a"),
+                cloud(again.address, "cloud-b"),
+            ):
+                while (mapping := engine.mappings.get(timeout=PATIENCE_S)).version <= version:
+                    pass
+                assert {assignment.server for assignment in mapping.services[0].assignments} == {"cloud-a", "cloud-b"}
+                client.stop()
+                assert "robot" not in status(again)
+        finally:
+            client.stop()

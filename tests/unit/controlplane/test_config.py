@@ -1,0 +1,114 @@
+"""The configuration: defaults, every kind of mistake as one line, and no byte string that breaks the parser."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from controlplane.config import ControlPlaneConfig, check_target, load_config, split_host_port
+from controlplane.config_file import MAX_CONFIG_BYTES, parse
+from protos.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def read(text: str) -> ControlPlaneConfig:
+    return parse(ControlPlaneConfig, text.encode(), "control.yaml")
+
+
+def test_an_empty_file_means_the_defaults() -> None:
+    config = read("")
+    assert config == ControlPlaneConfig()
+    assert config.default_capacity_interfaces == 1
+    assert config.settings().lease_s == 5.0
+    assert config.settings().half_life_s == 60.0
+
+
+def test_one_address_may_stand_without_a_list() -> None:
+    assert read("stun_listen: '127.0.0.1:3478'").stun_listen == ("127.0.0.1:3478",)
+    assert read("stun_listen: []").stun_listen == ()
+    assert read("stun_servers: [a.example:1, '[2001:db8::1]:2']").settings().stun_servers == (
+        "a.example:1",
+        "[2001:db8::1]:2",
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("lease: 3", "lease: unknown key; did you mean lease_ms?"),
+        ("xyz: 3", "xyz: unknown key; expected one of default_capacity_interfaces, "),
+        ("lease_ms: soon", "lease_ms: expected a valid integer, unable to parse string as an integer, got 'soon'"),
+        ("lease_ms: [1]", "lease_ms: expected a whole number, got [1]"),
+        ("lease_ms: 1", "lease_ms: expected greater than or equal to 500, got 1"),
+        ("lease_ms: 600", "lease_ms: expected at least three times report_interval_ms (500), got 600"),
+        ("listen: '50051'", "listen: expected host:port with a name, IPv4 or [IPv6] address, got '50051'"),
+        ("listen: ':50051'", "listen: expected host:port with a name, IPv4 or [IPv6] address, got ':50051'"),
+        ("listen: '::1:50051'", "listen: expected host:port with a name, IPv4 or [IPv6] address, got '::1:50051'"),
+        ("listen: '[::g]:1'", "listen: expected an IPv6 address in the brackets, got '[::g]:1'"),
+        ("listen: 'a:70000'", "listen: expected host:port, got 'a:70000'"),
+        ("stun_listen: ['a:1', 'a:1']", "stun_listen: expected each entry once, got 'a:1' twice"),
+        ("stun_listen: [a:1, 2]", "stun_listen[1]: expected text, got 2"),
+        ("stun_servers: '0.0.0.0:3478'", "stun_servers[0]: expected an address that sidecars can reach, got"),
+        ("stun_servers: 'a:0'", "stun_servers[0]: expected a port from 1 to 65535, got 'a:0'"),
+        ("log_level: loud", "log_level: expected 'debug', 'info', 'warning' or 'error', got 'loud'"),
+        ("lease_ms: 5000\nlease_ms: 6000", "line 1: expected YAML: key 'lease_ms' is written twice"),
+        ("1: 2", "line 1: expected YAML: a key that is not text"),
+        ("- lease_ms", "expected keys and values, got ['lease_ms']"),
+        ("a: [", "line 1: expected YAML: "),
+        ("a: !!int x", "expected YAML: "),
+        ("a: !!python/object:os.system x", "line 1: expected YAML: could not determine a constructor"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_file_key_and_expectation(text: str, line: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read(text)
+    assert str(caught.value).startswith(f"control.yaml: {line}")
+    assert "\n" not in str(caught.value)
+
+
+def test_several_mistakes_are_counted() -> None:
+    with pytest.raises(ConfigError, match=r"\(and 1 more\)$"):
+        read("lease_ms: x\nlog_level: y")
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        load_config(tmp_path / "none.yaml")
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        load_config(tmp_path)
+    large = tmp_path / "large.yaml"
+    large.write_bytes(b"#" * (MAX_CONFIG_BYTES + 1))
+    with pytest.raises(ConfigError, match="at most"):
+        load_config(large)
+
+
+def test_it_is_frozen() -> None:
+    config = read("")
+    with pytest.raises(ValidationError, match="frozen"):
+        config.lease_ms = 1
+
+
+@given(st.binary(max_size=60) | st.text(alphabet="abl_ms:[]{}&*!|>-'\"\n 01.#%@", max_size=40).map(str.encode))
+def test_any_bytes_are_read_or_refused(data: bytes) -> None:
+    with contextlib.suppress(ConfigError):
+        assert isinstance(parse(ControlPlaneConfig, data, "control.yaml"), ControlPlaneConfig)
+
+
+@given(st.text(max_size=30))
+def test_any_text_is_an_address_or_refused(text: str) -> None:
+    for check in (split_host_port, check_target):
+        with contextlib.suppress(ValueError):
+            assert check(text)
+
+
+def test_addresses_are_split() -> None:
+    assert split_host_port("[::]:50051") == ("::", 50051)
+    assert split_host_port("control.example.org:1") == ("control.example.org", 1)
+    assert split_host_port("10.0.0.1:0") == ("10.0.0.1", 0)

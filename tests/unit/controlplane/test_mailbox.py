@@ -1,0 +1,56 @@
+"""What waits for one stream stays bounded and in order."""
+
+from __future__ import annotations
+
+import asyncio
+
+from controlplane.core.control import CloseReason
+from controlplane.mailbox import Mailbox
+from protos.model import MappingSet, PeerSet, Version, Welcome
+
+WELCOME = Welcome(5.0, 0.5)
+
+
+def peers(version: int) -> PeerSet:
+    return PeerSet(Version(version), version)
+
+
+def mapping(version: int) -> MappingSet:
+    return MappingSet(Version(version), version)
+
+
+async def take(mailbox: Mailbox, count: int) -> list[object]:
+    return [await mailbox.get() for _ in range(count)]
+
+
+def test_a_newer_resource_takes_the_place_of_an_unsent_older_one() -> None:
+    async def scenario() -> None:
+        mailbox = Mailbox()
+        for version in range(1, 1001):
+            mailbox.put(mapping(version))
+            mailbox.put(peers(version))
+        mailbox.put(WELCOME)
+        # A mapping goes after the peers it names, whatever the order of their changes.
+        assert await take(mailbox, 3) == [WELCOME, peers(1000), mapping(1000)]
+        assert mailbox.superseded == 2 * 999
+
+    asyncio.run(scenario())
+
+
+def test_waiting_ends_with_a_message_or_with_the_close() -> None:
+    async def scenario() -> None:
+        mailbox = Mailbox()
+        async with asyncio.TaskGroup() as tasks:
+            waiting = tasks.create_task(take(mailbox, 2))
+            await asyncio.sleep(0)
+            mailbox.put(peers(1))
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            mailbox.put(mapping(1))
+            mailbox.close(CloseReason.REPLACED)
+        first, second = waiting.result()
+        assert first == peers(1)
+        # What is unsent when a stream is closed would only be superseded by the next stream.
+        assert second is CloseReason.REPLACED
+
+    asyncio.run(scenario())

@@ -1,0 +1,68 @@
+"""What the operator reads."""
+
+from __future__ import annotations
+
+from controlplane.status_table import render
+from protos.model import (
+    Assignment,
+    InterfaceName,
+    NodeName,
+    PathReport,
+    Peer,
+    ResourceStatus,
+    Role,
+    ServiceMapping,
+    SessionId,
+    SidecarStatus,
+    SyncState,
+    Version,
+)
+from tests.unit.controlplane.samples import PLAN, histogram, offer, use
+
+SYNCED = ResourceStatus(Version(7), Version(7), SyncState.SYNCED)
+
+
+def test_nobody_is_said_so() -> None:
+    assert render([]) == "no sidecars"
+
+
+def test_a_robot_and_a_cloud() -> None:
+    wlan, a = InterfaceName("wlan0"), NodeName("cloud-a")
+    cloud = SidecarStatus(
+        Peer(a, Role.CLOUD, SessionId(1), b"", 1, offers=(offer(),), draining=True), True, 4.0, "0.1.0", peers=SYNCED
+    )
+    robot = SidecarStatus(
+        Peer(NodeName("robot"), Role.ROBOT, SessionId(2), b"", 1),
+        connected=False,
+        lease_left_s=1.25,
+        software_version="",
+        uses=(use(),),
+        peers=SYNCED,
+        mapping=ResourceStatus(Version(9), Version(8), SyncState.REJECTED, "no interface 'wwan0' here"),
+        services=(ServiceMapping(PLAN, (Assignment(wlan, a),), 0.0125, "least sum"),),
+        paths=(
+            PathReport(wlan, a, True, histogram(0.02, times=9), 90, 1),
+            PathReport(InterfaceName("wwan0"), a, False, histogram()),
+        ),
+    )
+    text = render([cloud, robot])
+    assert [line.split() for line in text.splitlines()[:3]] == [
+        ["NAME", "ROLE", "STREAM", "LEASE", "PEERS", "MAPPING", "SERVICES", "SOFTWARE"],
+        ["cloud-a", "cloud", "leaving", "4.0", "s", "synced", "-", "/plan", "0.1.0"],
+        ["robot", "robot", "lost", "1.2", "s", "synced", "rejected", "/plan", "-"],
+    ]
+    assert "mapping REJECTED version 9, keeps 8: no interface 'wwan0' here" in text
+    assert "/plan: wlan0 -> cloud-a (predicted miss 0.0125; least sum)" in text
+    assert "wlan0 -> cloud-a  up    rtt 20." in text
+    assert "wwan0 -> cloud-a  DOWN  rtt -" in text
+
+
+def test_a_mapping_to_nowhere_is_said_so() -> None:
+    robot = SidecarStatus(
+        Peer(NodeName("robot"), Role.ROBOT, SessionId(2), b"", 1),
+        True,
+        1.0,
+        "",
+        services=(ServiceMapping(PLAN, (), 1.0, "no live server"),),
+    )
+    assert "/plan: nowhere (predicted miss 1; no live server)" in render([robot])
