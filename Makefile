@@ -31,7 +31,7 @@ demo: setup ## a robot keeps its deadline while a link, a server and the control
 	@$(PY) -m bench.demo $(DEMO_ARGS)
 
 test: setup ## all tests
-	@$(PY) -m pytest $(PYTEST_ARGS)
+	@deploy/dev/test.sh $(PYTEST_ARGS)
 
 lint: setup ## ruff, mypy, import rules, stub drift
 	@deploy/dev/lint.sh
