@@ -306,6 +306,7 @@ class Link:
                 )
             )
             recovery.on_sent(number, now, len(datagram), fragment=item)
+            path.bytes_sent += len(datagram)
             path.waits_for_answer(now)
             out.append((path.remote, datagram))
             stats.datagrams["sent", "data"] += 1
@@ -344,6 +345,7 @@ class Link:
             if finished is not None:
                 path.recovery.on_sent(number, now, len(datagram), finished=finished)
                 path.waits_for_answer(now)
+            path.bytes_sent += len(datagram)
             out.append((path.remote, datagram))
             self.stats.datagrams["sent", "control"] += 1
 
@@ -353,7 +355,9 @@ class Link:
             me = self.identity
             probe = frame.encode_hello(frame.Hello(me.token, me.incarnation)) + probe
         for address in path.destinations():
-            out.append((address, self._header(path, path.recovery.take_number()) + probe))
+            datagram = self._header(path, path.recovery.take_number()) + probe
+            path.bytes_sent += len(datagram)
+            out.append((address, datagram))
             self.stats.datagrams["sent", "control"] += 1
 
     def _header(self, path: Path, number: int) -> bytes:
