@@ -84,7 +84,7 @@ class Bench:
     """One link with one known peer, whose datagrams the test writes itself."""
 
     link: Link = field(init=False)
-    now: float = 100.0
+    now: float = 1.0
     number: int = -1
 
     def __post_init__(self) -> None:

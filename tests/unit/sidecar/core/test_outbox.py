@@ -1,15 +1,19 @@
 from __future__ import annotations
 
-import pytest
+from typing import TYPE_CHECKING
 
 from sidecar.core import outbox as outbox_module
 from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, LinkCommand, PathId, PathState, Resend, Send
-from sidecar.core.outbound import OutboundMessage
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES, Outbox
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
+
+if TYPE_CHECKING:
+    import pytest
+
+    from sidecar.core.outbound import OutboundMessage
 
 OVER_WLAN, OVER_WWAN, TO_B = path(WLAN), path(WWAN), path(WLAN, B)
 

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
-from sidecar.core.outbound import OutboundMessage
 from sidecar.core.pacing import MAX_WINDOW_BYTES, MIN_WINDOW_BYTES, RATE_MEMORY_S, SendQueue, Window
 from sidecar.core.recovery import Sent
 from sidecar.core.rtt import RttEstimator
 from tests.unit.sidecar.core.builders import message
+
+if TYPE_CHECKING:
+    from sidecar.core.outbound import OutboundMessage
 
 
 def rtt(seconds: float) -> RttEstimator:

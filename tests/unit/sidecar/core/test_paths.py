@@ -65,7 +65,7 @@ def test_up_unstable_down_up() -> None:
     probe = subject.next_probe(down_at, RNG)
     assert subject.answered_probe(probe, down_at + 0.01)
     assert subject.made_progress(down_at + 0.01)
-    assert subject.state is PathState.UP  # type: ignore[comparison-overlap]  # made_progress changed it
+    assert subject.state is PathState.UP
 
 
 def test_an_unstable_path_that_answers_is_up_again() -> None:

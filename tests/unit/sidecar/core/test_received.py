@@ -52,8 +52,8 @@ def test_a_leap_makes_everything_far_below_stale_not_new() -> None:
 
 
 def test_a_lone_datagram_is_acknowledged_soon_the_second_at_once() -> None:
+    assert received(1).ack_at is None
     packets = received(1)
-    assert packets.ack_at is None
     packets.owe_ack(1.0)
     assert packets.ack_at == 1.0 + MAX_ACK_DELAY_S
     packets.add(2, 1.001)

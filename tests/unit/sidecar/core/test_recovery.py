@@ -142,8 +142,8 @@ def test_sender_and_receiver_agree_whatever_the_network_does(seed: int) -> None:
                 sent.append(number)
                 recovery.on_sent(number, now, 100, (carried, 0), finished=number)
             for _ in range(2 if rng.random() < doubling else 1):
-                if rng.random() >= loss:
-                    to_receiver.append((now + rng.choice([0.01, 0.011, 0.05]), number))
+                arrives_at = now + rng.choice([0.01, 0.011, 0.05])
+                to_receiver += [(arrives_at, number)] if rng.random() >= loss else []
         for due in [due for due in to_receiver if due[0] <= now]:
             to_receiver.remove(due)
             new = packets.add(due[1], now)

@@ -1,0 +1,398 @@
+from __future__ import annotations
+
+import pytest
+
+from protos.model import InterfaceId, InterfaceName, NodeName, SessionId
+from sidecar.core import frame
+from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Hello, Probe, ProbeReply
+from sidecar.core.link_events import (
+    FragmentReceived,
+    FragmentsLost,
+    LinkPeer,
+    MessageFinished,
+    PathChanged,
+    PathId,
+    PathMeasured,
+    PathState,
+    PeerClosed,
+    PeerRestarted,
+    Resend,
+    Send,
+    SendClose,
+    SendFinished,
+    SetPeers,
+    SetReady,
+)
+from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
+from sidecar.core.received import MAX_ACK_DELAY_S
+from sidecar.core.rtt import UNSTABLE_FLOOR_S
+from tests.unit.sidecar.core.builders import (
+    OUR_TOKEN,
+    PEER_ADDRESS,
+    PEER_SESSION,
+    PEER_TOKEN,
+    WLAN,
+    A,
+    Bench,
+    message,
+)
+
+PATH = PathId(WLAN, A, InterfaceId(0))
+OTHER_SESSION = SessionId(99)
+
+
+def frames(datagrams: list[bytes]) -> list[frame.Frame]:
+    return [item for datagram in datagrams for item in frame.decode_frames(memoryview(datagram)[frame.HEADER_BYTES :])]
+
+
+def numbers(datagrams: list[bytes]) -> list[int]:
+    return [frame.decode_header(datagram).packet_number for datagram in datagrams]
+
+
+def up() -> Bench:
+    bench = Bench()
+    probes = [item for item in frames(bench.sent()) if isinstance(item, Probe)]
+    bench.now += 0.01
+    bench.receive(frame.encode_probe_reply(ProbeReply(probes[0].id)))
+    assert PathChanged(PATH, PathState.UP, "answers") in bench.events()
+    bench.sent()
+    return bench
+
+
+def fragment(number: int = 1, size: int = 100) -> bytes:
+    return frame.encode_fragment_head(number, size, frame.MAX_SYMBOL_BYTES, 0) + bytes(size)
+
+
+def state_changes(bench: Bench) -> list[PathState]:
+    return [event.state for event in bench.events() if isinstance(event, PathChanged)]
+
+
+# -- life of a path ---------------------------------------------------------------------------------------------------
+
+
+def test_a_new_path_introduces_itself_and_probes() -> None:
+    bench = Bench()
+    (datagram,) = bench.sent()
+    header = frame.decode_header(datagram)
+    assert header[:3] == (3, 0, 0x0102030405060708)
+    assert frames([datagram]) == [Hello(OUR_TOKEN, 7), Probe(0)]
+
+
+def test_no_probe_leaves_before_the_interface_is_ready() -> None:
+    bench = Bench()
+    bench.execute(SetReady(ready=False))
+    assert bench.wait(3.0) == []
+    bench.execute(SetReady(ready=True))
+    assert frames(bench.sent()) == [Hello(OUR_TOKEN, 7), Probe(0)]
+
+
+def test_probes_to_a_silent_peer_back_off() -> None:
+    bench = Bench()
+    assert len(bench.sent() + bench.wait(1.0)) in range(5, 9)
+    bench.wait(10.0)
+    assert len(bench.wait(10.0)) == pytest.approx(10.0 / MAX_PROBE_S, abs=1)
+
+
+def test_an_answer_brings_the_path_up_with_its_round_trip_time_told_first() -> None:
+    bench = Bench()
+    bench.sent()
+    bench.now += 0.02
+    bench.receive(frame.encode_probe_reply(ProbeReply(0)))
+    measured, changed = bench.events()
+    assert isinstance(measured, PathMeasured)
+    assert measured.smoothed_rtt_s == pytest.approx(0.02)
+    assert changed == PathChanged(PATH, PathState.UP, "answers")
+
+
+def test_silence_makes_it_unstable_then_down_and_an_answer_up_again() -> None:
+    bench = up()
+    bench.wait(IDLE_PROBE_S + 0.01)
+    bench.wait(UNSTABLE_FLOOR_S)
+    assert state_changes(bench) == [PathState.UNSTABLE]
+    probes = bench.wait(0.3)
+    assert 4 <= len(probes) <= 8, "one every 50 ms"
+    bench.wait(max(DOWN_FACTOR * UNSTABLE_FLOOR_S, DOWN_FLOOR_S))
+    assert state_changes(bench) == [PathState.DOWN]
+    probe = next(item for item in frames(bench.wait(2.0)[-1:]) if isinstance(item, Probe))
+    bench.receive(frame.encode_probe_reply(ProbeReply(probe.id)))
+    assert state_changes(bench) == [PathState.UP]
+
+
+def test_a_living_path_stays_up_with_two_probes_a_second() -> None:
+    bench = up()
+    sent = 0
+    for _ in range(100):
+        for item in frames(bench.wait(0.05)):
+            assert isinstance(item, Probe)
+            sent += 1
+            bench.now += 0.001
+            bench.receive(frame.encode_probe_reply(ProbeReply(item.id)))
+    assert state_changes(bench) == []
+    assert 8 <= sent <= 12
+
+
+def test_a_path_that_goes_down_hands_back_what_it_carried_once() -> None:
+    bench = up()
+    outbound = message(size=300_000)
+    bench.execute(Send(PATH, outbound))
+    sent = bench.sent()
+    assert len(sent) < outbound.count, "the window holds the rest back"
+    bench.wait(3.0)
+    lost = [index for event in bench.events() if isinstance(event, FragmentsLost) for index in event.indices]
+    assert sorted(lost) == list(range(outbound.count))
+
+
+def test_sending_over_a_path_that_is_not_usable_says_so_and_hands_back() -> None:
+    for target in (PATH, PathId(WLAN, NodeName("nobody"), InterfaceId(9))):
+        bench, outbound = Bench(), message()
+        bench.execute(Send(target, outbound))
+        bench.execute(Resend(target, outbound, (1,)))
+        assert bench.events() == [
+            PathChanged(target, PathState.DOWN, "not usable here"),
+            FragmentsLost(target, outbound, (0, 1, 2)),
+            PathChanged(target, PathState.DOWN, "not usable here"),
+            FragmentsLost(target, outbound, (1,)),
+        ]
+
+
+def test_the_peers_newest_address_is_followed() -> None:
+    bench = up()
+    moved = ("198.51.100.1", 5)
+    bench.link.receive_datagram(bench.datagram(frame.encode_probe(Probe(1)), number=50), moved, bench.now)
+    bench.link.receive_datagram(bench.datagram(frame.encode_probe(Probe(2)), number=40), PEER_ADDRESS, bench.now)
+    ((address, _),) = bench.link.datagrams_to_send(bench.now)
+    assert address == moved
+
+
+# -- messages ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_message_goes_out_in_numbered_datagrams_and_is_acknowledged() -> None:
+    bench, outbound = up(), message(size=3000)
+    bench.execute(Send(PATH, outbound))
+    sent = bench.sent()
+    assert [item.symbol_index for item in frames(sent) if isinstance(item, Fragment)] == [0, 1, 2]
+    first = numbers(sent)[0]
+    assert numbers(sent) == [first, first + 1, first + 2]
+    assert all(len(datagram) <= frame.MAX_DATAGRAM_BYTES - frame.TAG_BYTES for datagram in sent)
+    bench.now += 0.01
+    bench.receive(frame.encode_ack([(first, first + 2)], 0.0), frame.encode_finished(Finished(1)))
+    assert bytes(outbound.acked) == b"\1\1\1"
+    assert MessageFinished(A, 1) in bench.events()
+
+
+def test_a_hole_in_the_acknowledgements_is_reported_lost() -> None:
+    bench, outbound = up(), message(size=9000)
+    bench.execute(Send(PATH, outbound))
+    first = numbers(bench.sent())[0]
+    bench.now += 0.01
+    bench.receive(frame.encode_ack([(first + 3, first + 7), (first + 1, first + 1)], 0.0))
+    lost = [event for event in bench.events() if isinstance(event, FragmentsLost)]
+    assert [(event.indices, event.timed_out) for event in lost] == [((0, 2), False)]
+
+
+def test_without_any_acknowledgement_the_oldest_are_reported_timed_out() -> None:
+    bench, outbound = up(), message(size=9000)
+    bench.execute(Send(PATH, outbound))
+    bench.sent()
+    bench.wait(0.059)
+    lost = [event for event in bench.events() if isinstance(event, FragmentsLost)]
+    assert lost[0].indices == (0, 1)
+    assert lost[0].timed_out
+
+
+def test_a_received_fragment_is_handed_up_and_acknowledged() -> None:
+    bench = up()
+    bench.receive(fragment())
+    (event,) = bench.events()
+    assert isinstance(event, FragmentReceived)
+    assert (event.path, event.session, event.fragment.message) == (PATH, PEER_SESSION, 1)
+    assert bench.sent() == [], "the acknowledgement waits for company"
+    (ack,) = frames(bench.wait(MAX_ACK_DELAY_S))
+    assert isinstance(ack, AckFrame)
+    assert ack.ranges[0] == (bench.number - 1, bench.number)
+
+
+def test_an_owed_finished_takes_the_acknowledgement_along_and_is_repeated_until_acknowledged() -> None:
+    bench = up()
+    bench.receive(fragment())
+    bench.execute(SendFinished(PATH, 1))
+    (datagram,) = bench.sent()
+    assert [type(item) for item in frames([datagram])] == [Finished, AckFrame]
+    again = [item for item in frames(bench.wait(0.2)) if isinstance(item, Finished)]
+    assert again == [Finished(1)] * len(again)
+    assert again
+    bench.receive(frame.encode_ack([(0, numbers([datagram])[0] + 20)], 0.0))
+
+
+def test_expired_messages_are_not_sent_and_counted() -> None:
+    bench = up()
+    bench.execute(Send(PATH, message(expires=bench.now - 1)))
+    assert bench.sent() == []
+    assert bench.link.stats.dropped["expired"] == 1
+
+
+# -- bad input: dropped, counted, and nothing is sent back ------------------------------------------------------------
+
+
+def valid_header(session: SessionId = PEER_SESSION, receiver: int = 3, sender: int = 0) -> bytes:
+    return frame.encode_header(Header(InterfaceId(sender), InterfaceId(receiver), session, 10))
+
+
+PROBE = frame.encode_probe(Probe(1))
+STRANGE_HELLO = frame.encode_hello(Hello(bytes(16), 2**63)) + PROBE
+OLD_HELLO = frame.encode_hello(Hello(PEER_TOKEN, 1)) + PROBE
+BAD = {
+    "garbage": (b"\xff" * 100, "malformed"),
+    "empty": (b"", "malformed"),
+    "truncated header": (valid_header()[:-1], "malformed"),
+    "another version": (b"\xd2" + valid_header()[1:] + PROBE, "version"),
+    "sealed": (b"\xd1\x01" + valid_header()[2:] + PROBE, "malformed"),
+    "no frames": (valid_header(), "malformed"),
+    "good frame then garbage": (valid_header() + PROBE + b"\xff", "malformed"),
+    "wrong interface": (valid_header(receiver=4) + PROBE, "wrong_interface"),
+    "unknown interface of the peer": (valid_header(sender=8) + PROBE, "unknown_path"),
+    "unknown session": (valid_header(OTHER_SESSION) + PROBE, "unknown_session"),
+    "a stranger's hello": (valid_header(OTHER_SESSION) + STRANGE_HELLO, "unknown_session"),
+    "a peer's hello from before its restart": (valid_header(OTHER_SESSION) + OLD_HELLO, "unknown_session"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_datagrams_are_counted_and_provoke_nothing(kind: str) -> None:
+    datagram, reason = BAD[kind]
+    bench = up()
+    bench.link.receive_datagram(datagram, ("203.0.113.9", 666), bench.now)
+    assert bench.link.stats.dropped == {reason: 1}
+    assert bench.events() == []
+    assert bench.sent() == []
+    bench.receive(PROBE)
+    assert frames(bench.sent()) == [ProbeReply(1)], "the others are still served"
+
+
+def test_a_duplicate_is_dropped_and_not_answered_again() -> None:
+    bench = up()
+    for _ in range(3):
+        bench.receive(PROBE, number=10)
+    assert bench.link.stats.dropped["duplicate"] == 2
+    assert frames(bench.sent()) == [ProbeReply(1)]
+
+
+def test_an_unasked_probe_reply_brings_nothing_up() -> None:
+    bench = Bench()
+    bench.sent()
+    bench.receive(frame.encode_probe_reply(ProbeReply(77)))
+    assert state_changes(bench) == []
+    assert bench.link.stats.dropped["unasked_probe_reply"] == 1
+
+
+def test_acknowledging_the_unsent_is_counted_and_changes_nothing() -> None:
+    bench, outbound = up(), message()
+    bench.execute(Send(PATH, outbound))
+    bench.sent()
+    bench.receive(frame.encode_ack([(0, 10**6)], 0.0))
+    assert bench.link.stats.dropped["acks_the_unsent"] == 1
+    assert bytes(outbound.acked) == b"\0\0\0"
+
+
+def test_a_flood_of_probes_is_answered_in_fewer_bytes_than_it_has() -> None:
+    bench = up()
+    before = bench.link.stats.bytes.copy()
+    for number in range(100, 200):
+        bench.receive(PROBE * frame.MAX_FRAMES, number=number)
+        bench.sent()
+    flood = bench.link.stats.bytes
+    assert flood["sent"] - before["sent"] <= flood["received"] - before["received"]
+
+
+def test_a_flood_to_a_path_that_is_down_provokes_few_probes() -> None:
+    bench = Bench()
+    bench.wait(10.0)
+    hellos = 0
+    start = bench.now
+    for number in range(1000):
+        bench.now += 0.0001
+        bench.receive(PROBE, number=number)
+        hellos += sum(isinstance(item, Hello) for item in frames(bench.sent()))
+    assert 1 <= hellos <= (bench.now - start) / FIRST_PROBE_S + 1
+
+
+def test_owed_frames_are_capped() -> None:
+    bench = up()
+    for number in range(10, 60):
+        bench.receive(PROBE * 60, number=number)
+    assert bench.link.stats.dropped["pending_frames_full"] == 50 * 60 - 256
+    assert len(frames(bench.sent())) == 256
+
+
+# -- peers ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_known_peers_newer_start_is_reported() -> None:
+    bench = up()
+    hello = frame.encode_hello(Hello(PEER_TOKEN, 2)) + PROBE
+    bench.link.receive_datagram(bench.datagram(hello, session=OTHER_SESSION), PEER_ADDRESS, bench.now)
+    assert bench.events() == [PeerRestarted(A, OTHER_SESSION, 2)]
+    assert bench.sent() == []
+
+
+def test_a_restarted_peer_starts_afresh_and_our_numbers_go_on() -> None:
+    bench, outbound = up(), message()
+    bench.execute(Send(PATH, outbound))
+    before = numbers(bench.sent())
+    bench.know(session=OTHER_SESSION, incarnation=2)
+    events = bench.events()
+    assert PathChanged(PATH, PathState.DOWN, "peer left or restarted") in events
+    assert FragmentsLost(PATH, outbound, (0, 1, 2)) in events
+    assert numbers(bench.sent())[0] > before[-1]
+    bench.link.receive_datagram(bench.datagram(PROBE, number=0, session=OTHER_SESSION), PEER_ADDRESS, bench.now)
+    assert ProbeReply(1) in frames(bench.sent())
+
+
+def test_a_peer_that_stays_keeps_its_path_when_others_come() -> None:
+    bench = up()
+    addresses = ((InterfaceId(0), (PEER_ADDRESS,)),)
+    other = LinkPeer(NodeName("cloud-b"), OTHER_SESSION, bytes(16), 1, addresses)
+    bench.execute(SetPeers((LinkPeer(A, PEER_SESSION, PEER_TOKEN, 1, addresses), other)))
+    assert state_changes(bench) == []
+    assert frames(bench.sent()) == [Hello(OUR_TOKEN, 7), Probe(0)], "to the newcomer"
+
+
+def test_a_peer_that_left_is_forgotten_with_its_timers() -> None:
+    bench = up()
+    bench.execute(SetPeers(()))
+    assert state_changes(bench) == [PathState.DOWN]
+    assert bench.wait(5.0) == []
+    assert not bench.link._timer_of
+    bench.receive(PROBE)
+    assert bench.link.stats.dropped["unknown_session"] == 1
+
+
+def test_goodbye_takes_the_path_down_once_and_a_flood_of_it_is_one() -> None:
+    bench = up()
+    bench.receive(frame.encode_close() * frame.MAX_FRAMES)
+    assert bench.events() == [PathChanged(PATH, PathState.DOWN, "peer closed"), PeerClosed(A)]
+    bench.receive(frame.encode_close())
+    assert bench.events() == []
+
+
+def test_after_our_goodbye_nothing_makes_us_look_alive() -> None:
+    bench = up()
+    bench.execute(SendClose())
+    assert frames(bench.sent()) == [frame.Close()]
+    bench.receive(PROBE)
+    assert bench.sent() == []
+    assert bench.wait(5.0) == []
+
+
+def test_stats_tell_what_was_carried() -> None:
+    bench = up()
+    bench.execute(Send(PATH, message(size=3000)))
+    sent = bench.sent()
+    bench.wait(0.3)
+    stats = bench.link.stats.paths[A]
+    assert stats.srtt_s == pytest.approx(0.01)
+    assert stats.datagrams_sent >= 4
+    assert stats.bytes_sent >= sum(map(len, sent))
+    assert bench.link.stats.datagrams["sent", "data"] >= 3
+    assert bench.link.stats.interface == InterfaceName("wlan0")
