@@ -32,6 +32,13 @@ if TYPE_CHECKING:
 EXIT_OK = 0
 EXIT_FAILED = 1
 
+_OPTIONS = (
+    # A thousand robots with their paths and histograms are more than gRPC's default of 4 MiB.
+    ("grpc.max_receive_message_length", 256 << 20),
+    # Behaviour comes from the command line, not from the environment.
+    ("grpc.enable_http_proxy", 0),
+)
+
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 
 
@@ -76,7 +83,7 @@ def _address(text: str) -> str:
 
 def _status(arguments: argparse.Namespace) -> int:
     try:
-        with grpc.insecure_channel(arguments.address) as channel:
+        with grpc.insecure_channel(arguments.address, _OPTIONS) as channel:
             stub = admin_pb2_grpc.AdminStub(channel)
             answer = stub.GetStatus(admin_pb2.GetStatusRequest(), timeout=arguments.timeout_s)
         sidecars = status_from_proto(answer)

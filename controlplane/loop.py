@@ -9,7 +9,7 @@ import time
 from typing import TYPE_CHECKING
 
 from controlplane.core.assignment import Plan, Problem
-from controlplane.core.control import Close, CloseReason, ControlCore, NackNotice, Send
+from controlplane.core.control import Close, CloseReason, ControlCore, DepartureNotice, NackNotice, Send
 from controlplane.core.registry import Refusal
 from controlplane.mailbox import Mailbox
 
@@ -60,7 +60,6 @@ class ControlLoop:
         """Begin a stream; returns what to write to it, or why it is refused."""
         result = self._core.register(registration, self._loop.time())
         if isinstance(result, Refusal):
-            log.warning("%s refused: %s", registration.name, result.value)
             return result
         log.info(
             "%s (%s, incarnation %d, software %s) connected",
@@ -107,7 +106,14 @@ class ControlLoop:
                         nack.version,
                         nack.error,
                     )
+                case DepartureNotice(sidecar=name, reason=reason):
+                    log.info("%s is gone: %s", name, reason.value)
         self._wake.set()
+
+    def stream_ended(self, peer: str, code: str, details: str) -> None:
+        """A stream was ended by us; `peer` is where it came from."""
+        self._metrics.streams_ended.labels(code).inc()
+        log.warning("stream of %s ended: %s: %s", peer, code, details)
 
     # ── the loop ──
 

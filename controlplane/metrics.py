@@ -50,6 +50,12 @@ class Metrics:
             registry=self.registry,
             buckets=SOLVE_BUCKETS_S,
         )
+        self.streams_ended = prometheus_client.Counter(
+            "plr_streams_ended_total",
+            "Control streams ended by the control plane, by gRPC status.",
+            ["code"],
+            registry=self.registry,
+        )
         self.registry.register(self._values)
 
     def start(self, host: str, port: int) -> tuple[str, int]:

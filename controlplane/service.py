@@ -71,6 +71,7 @@ class ControlPlaneService:
             await self._serve(context)
         except _StreamEndError as end:
             if end.code is not None:
+                self._loop.stream_ended(context.peer(), end.code.name.lower(), end.details)
                 await context.abort(end.code, end.details)
 
     async def _serve(self, context: Context) -> NoReturn:
@@ -100,7 +101,7 @@ class ControlPlaneService:
             raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
         result = self._loop.register(registration)
         if isinstance(result, Refusal):
-            raise _StreamEndError(_REFUSAL_CODES[result], result.value)
+            raise _StreamEndError(_REFUSAL_CODES[result], f"{registration.name}: {result.value}")
         return result
 
     @staticmethod

@@ -193,9 +193,7 @@ class Histogram:
         previous = -1
         for index, count in zip(indices, counts, strict=True):
             if not previous < index < BUCKETS:
-                raise DecodeError(
-                    f"histogram index {index} does not follow {previous} within 0..{BUCKETS - 1}"
-                )
+                raise DecodeError(f"histogram index {index} does not follow {previous} within 0..{BUCKETS - 1}")
             if not 1 <= count <= MAX_COUNT:
                 raise DecodeError(f"histogram count {count} is not within 1..{MAX_COUNT}")
             histogram._counts[index] = count

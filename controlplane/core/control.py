@@ -32,6 +32,7 @@ from protos.model import (
     Heartbeat,
     Nack,
     Registration,
+    RemovalReason,
     Report,
     ResourceKind,
     Role,
@@ -118,7 +119,15 @@ class NackNotice:
     nack: Nack
 
 
-Event = Send | Close | NackNotice
+@dataclass(frozen=True, slots=True)
+class DepartureNotice:
+    """A sidecar is not there any more, for the log."""
+
+    sidecar: NodeName
+    reason: RemovalReason
+
+
+Event = Send | Close | NackNotice | DepartureNotice
 """What the driver has to do, in this order."""
 
 
@@ -237,7 +246,7 @@ class ControlCore:
         """A stream ended, whoever ended it."""
         name = self._streams.pop(stream, None)
         if name is not None and self.registry.disconnect(name, stream) is not None:
-            self._forget(name)
+            self._forget(name, RemovalReason.LEFT)
             self._members_changed(now)
 
     # ── time ──
@@ -254,7 +263,7 @@ class ControlCore:
             if sidecar.stream is not None:
                 self._streams.pop(sidecar.stream, None)
                 self._events.append(Close(sidecar.stream, CloseReason.LEASE_EXPIRED))
-            self._forget(sidecar.name)
+            self._forget(sidecar.name, RemovalReason.LEASE_EXPIRED)
             self._members_changed(now)
         if self._held_back and now >= self._warm_until:
             self._held_back.clear()
@@ -262,7 +271,8 @@ class ControlCore:
         if self._publish_at is not None and self._publish_at <= now:
             self._publish()
 
-    def _forget(self, name: NodeName) -> None:
+    def _forget(self, name: NodeName, reason: RemovalReason) -> None:
+        self._events.append(DepartureNotice(name, reason))
         self.estimator.forget_paths(name)
         self._held_back.pop(name, None)
         self._gone_snapshots[name] = self._snapshots.pop(name)

@@ -137,9 +137,7 @@ def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessag
         case Report():
             return control_pb2.SidecarMessage(report=report_to_proto(value))
         case Ack():
-            ack = control_pb2.Ack(
-                resource=_RESOURCE_NUMBERS[value.resource], version=value.version, nonce=value.nonce
-            )
+            ack = control_pb2.Ack(resource=_RESOURCE_NUMBERS[value.resource], version=value.version, nonce=value.nonce)
             return control_pb2.SidecarMessage(ack=ack)
         case Nack():
             nack = control_pb2.Nack(
@@ -232,9 +230,7 @@ def _peer_set_from_proto(message: control_pb2.PeerSet) -> PeerSet:
     peers = each(message.peers, MAX_PEERS, "peers", peer_from_proto)
     removed = each(message.removed, MAX_REMOVED, "removed", _removed_from_proto)
     unique([*(peer.name for peer in peers), *(gone.name for gone in removed)], "peers")
-    return PeerSet(
-        version=version(message.version, "peers version"), nonce=message.nonce, peers=peers, removed=removed
-    )
+    return PeerSet(version=version(message.version, "peers version"), nonce=message.nonce, peers=peers, removed=removed)
 
 
 def _peer_set_to_proto(value: PeerSet) -> control_pb2.PeerSet:

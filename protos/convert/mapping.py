@@ -23,9 +23,7 @@ def mapping_set_from_proto(message: control_pb2.MappingSet) -> MappingSet:
     """Check a mapping set."""
     services = each(message.services, MAX_MAPPED_SERVICES, "services", service_mapping_from_proto)
     unique((mapping.service for mapping in services), "services")
-    return MappingSet(
-        version=version(message.version, "mapping version"), nonce=message.nonce, services=services
-    )
+    return MappingSet(version=version(message.version, "mapping version"), nonce=message.nonce, services=services)
 
 
 def mapping_set_to_proto(mapping: MappingSet) -> control_pb2.MappingSet:
@@ -53,9 +51,7 @@ def service_mapping_to_proto(mapping: ServiceMapping) -> control_pb2.ServiceMapp
     """Encode the mapping of one service."""
     return control_pb2.ServiceMapping(
         service=mapping.service,
-        assignments=(
-            control_pb2.Assignment(interface=a.interface, server=a.server) for a in mapping.assignments
-        ),
+        assignments=(control_pb2.Assignment(interface=a.interface, server=a.server) for a in mapping.assignments),
         predicted_miss=mapping.predicted_miss,
         reason=clean_text(mapping.reason),
     )

@@ -86,6 +86,13 @@ class ControlPlaneProcess:
         assert self._process.stderr is not None
         self.lines.extend(line.rstrip() for line in self._process.stderr)
 
+    def wait_for_line(self, *parts: str) -> None:
+        """Wait until a line with all these parts is logged."""
+        end = time.monotonic() + PATIENCE_S
+        while not any(all(part in line for part in parts) for line in list(self.lines)):
+            assert time.monotonic() < end, f"{parts} not in {self.lines}"
+            time.sleep(0.02)
+
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send a signal and return the exit code."""
         self._process.send_signal(number)

@@ -134,7 +134,7 @@ def test_ack_nack_and_stale_nonces(plane: ControlPlaneProcess) -> None:
             assert wait_for_state(plane, "robot", SyncState.STALE).peers.version_acked == 7
             r.ack(second)
             assert wait_for_state(plane, "robot", SyncState.SYNCED).peers.version_acked == second.version
-    assert any("robot refuses its peers" in line and "two peers share a session" in line for line in plane.lines)
+    plane.wait_for_line("robot refuses its peers", "two peers share a session")
 
 
 def test_sidecars_that_fall_silent_or_are_killed_disappear(alone: ControlPlaneProcess) -> None:
@@ -232,6 +232,7 @@ def test_garbage_after_a_good_registration_ends_that_stream_only(alone: ControlP
             code, text = twice.end()
             assert code is grpc.StatusCode.INVALID_ARGUMENT
             assert "second registration" in text
+        alone.wait_for_line("ended: invalid_argument: resource has no meaning")
         assert good.quiet_for(0.1) or status(alone)["cloud-g"].connected
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.control import Close, CloseReason, ControlCore, NackNotice, Send, Settings
+from controlplane.core.control import Close, CloseReason, ControlCore, DepartureNotice, NackNotice, Send, Settings
 from controlplane.core.registry import Refusal, StreamId
 from controlplane.solver import solve
 from protos.model import (
@@ -98,6 +98,7 @@ class World:
         self.core = ControlCore(self.settings, version_epoch=epoch, now=now)
         self.sidecars: dict[NodeName, SimSidecar] = {}
         self.nacks: list[NackNotice] = []
+        self.departed: list[NodeName] = []
         self.closings: list[tuple[StreamId, CloseReason]] = []
         self.on_receive: Callable[[SimSidecar, PeerSet | MappingSet], None] = lambda sidecar, message: None
         self.solvings = 0
@@ -199,6 +200,8 @@ class World:
                         self.core.disconnected(stream, self.now)
                 case NackNotice():
                     self.nacks.append(event)
+                case DepartureNotice(sidecar=name):
+                    self.departed.append(name)
 
     def _owner(self, stream: StreamId) -> SimSidecar | None:
         return next((sidecar for sidecar in self.sidecars.values() if sidecar.stream == stream), None)

@@ -156,6 +156,7 @@ def test_a_silent_cloud_disappears_with_its_lease(world: World) -> None:
     a.silent = True
     world.run(world.settings.lease_s + SETTLED_S)
     assert a.closed == [CloseReason.LEASE_EXPIRED]
+    assert world.departed == ["a"]
     assert robot.peer_names == {"b"}
     assert robot.removed == {"a": RemovalReason.LEASE_EXPIRED}
     assert set(robot.pairs().values()) == {"b"}

@@ -192,9 +192,7 @@ def mapping(**changes: Any) -> control_pb2.ControlMessage:
         (mapping(predicted_miss=-0.1), "predicted_miss"),
         (mapping(assignments=[control_pb2.Assignment(interface="w", server="a")] * 2), "assignments"),
         (
-            control_pb2.ControlMessage(
-                peers=control_pb2.PeerSet(removed=[control_pb2.RemovedPeer(name="a")])
-            ),
+            control_pb2.ControlMessage(peers=control_pb2.PeerSet(removed=[control_pb2.RemovedPeer(name="a")])),
             "removal reason",
         ),
         (

@@ -53,9 +53,7 @@ def test_quantiles_are_those_of_the_sorted_values(values: list[float], q: float)
 
 
 @given(samples, st.integers(0, 5), st.floats(min_value=0, max_value=100))
-def test_count_over_lies_between_the_neighbouring_buckets(
-    values: list[float], lost: int, limit: float
-) -> None:
+def test_count_over_lies_between_the_neighbouring_buckets(values: list[float], lost: int, limit: float) -> None:
     over = histogram_of(values, lost).count_over(limit)
     surely = sum(value > limit * 1.04 + MIN_S for value in values) + lost
     at_most = sum(value > limit / 1.04 - MIN_S for value in values) + lost
