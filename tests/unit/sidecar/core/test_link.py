@@ -42,7 +42,11 @@ OTHER_SESSION = SessionId(99)
 
 
 def frames(datagrams: list[bytes]) -> list[frame.Frame]:
-    return [item for datagram in datagrams for item in frame.decode_frames(memoryview(datagram)[frame.HEADER_BYTES :])]
+    return [
+        item
+        for datagram in datagrams
+        for item in frame.decode_frames(memoryview(datagram)[frame.HEADER_BYTES :])
+    ]
 
 
 def numbers(datagrams: list[bytes]) -> list[int]:
@@ -159,7 +163,9 @@ def test_the_peers_newest_address_is_followed() -> None:
     bench = up()
     moved = ("198.51.100.1", 5)
     bench.link.receive_datagram(bench.datagram(frame.encode_probe(Probe(1)), number=50), moved, bench.now)
-    bench.link.receive_datagram(bench.datagram(frame.encode_probe(Probe(2)), number=40), PEER_ADDRESS, bench.now)
+    bench.link.receive_datagram(
+        bench.datagram(frame.encode_probe(Probe(2)), number=40), PEER_ADDRESS, bench.now
+    )
     ((address, _),) = bench.link.datagrams_to_send(bench.now)
     assert address == moved
 
@@ -345,7 +351,9 @@ def test_a_restarted_peer_starts_afresh_and_our_numbers_go_on() -> None:
     assert PathChanged(PATH, PathState.DOWN, "peer left or restarted") in events
     assert FragmentsLost(PATH, outbound, (0, 1, 2)) in events
     assert numbers(bench.sent())[0] > before[-1]
-    bench.link.receive_datagram(bench.datagram(PROBE, number=0, session=OTHER_SESSION), PEER_ADDRESS, bench.now)
+    bench.link.receive_datagram(
+        bench.datagram(PROBE, number=0, session=OTHER_SESSION), PEER_ADDRESS, bench.now
+    )
     assert ProbeReply(1) in frames(bench.sent())
 
 

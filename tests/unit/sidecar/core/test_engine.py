@@ -1,0 +1,320 @@
+from __future__ import annotations
+
+import pytest
+
+from protos.model import (
+    Assignment,
+    InterfaceName,
+    MappingSet,
+    NodeName,
+    Peer,
+    PeerSet,
+    Role,
+    ServiceMapping,
+    ServiceName,
+    ServiceOffer,
+    ServiceUse,
+    SessionId,
+    Version,
+)
+from sidecar.core.engine import SWEEP_EVERY_S, Engine, EngineConfig
+from sidecar.core.events import (
+    AbandonExecution,
+    ApplicationEvent,
+    ExecuteRequest,
+    OfferService,
+    RejectReason,
+    RequestFailed,
+)
+from sidecar.core.frame import MAX_SYMBOL_BYTES, Fragment
+from sidecar.core.link_events import (
+    FragmentReceived,
+    LinkCommand,
+    PathChanged,
+    PathId,
+    PathMeasured,
+    PathState,
+    PeerClosed,
+    PeerRestarted,
+    Send,
+    SendFinished,
+    SetPeers,
+)
+from sidecar.core.messages import (
+    Message,
+    RejectionMessage,
+    RequestMessage,
+    ResponseMessage,
+    decode_message,
+    encode_message,
+)
+from tests.unit.sidecar.core.builders import (
+    ECHO,
+    TYPE,
+    WLAN,
+    WWAN,
+    A,
+    B,
+    path,
+    peer,
+    request,
+    request_id,
+    rule,
+)
+
+ROBOT = NodeName("robot")
+
+
+class Sidecar:
+    """An engine with one interface, whose peer the test plays."""
+
+    def __init__(self, role: Role, peer_name: str) -> None:
+        self.engine = Engine(EngineConfig(role, (rule("/*"),)), 0.0)
+        self.engine.set_interfaces([WLAN], 0.0)
+        self.path = path(WLAN, peer_name)
+        self.number = 0
+        self.view(peer(peer_name))
+        self.change(PathState.UP)
+        self.take()
+
+    def view(self, *peers: Peer, version: int = 1) -> None:
+        assert self.engine.apply_peers(PeerSet(Version(version), 1, peers), 0.0) is None
+
+    def change(self, state: PathState, now: float = 0.0) -> None:
+        self.engine.on_link_event(PathChanged(self.path, state, ""), now)
+
+    def receive(self, message: Message | bytes, *, session: int = 1, now: float = 0.1) -> None:
+        data = message if isinstance(message, bytes) else encode_message(message)
+        assert len(data) <= MAX_SYMBOL_BYTES
+        self.number += 1
+        fragment = Fragment(self.number, len(data), MAX_SYMBOL_BYTES, 0, memoryview(data))
+        self.engine.on_link_event(FragmentReceived(self.path, SessionId(session), fragment), now)
+
+    def take(self) -> tuple[list[LinkCommand], list[ApplicationEvent]]:
+        return [command for _, command in self.engine.take_commands()], self.engine.take_events()
+
+    def replies(self) -> list[Message]:
+        """What is sent to the peer, decoded."""
+        sends = [command for command in self.take()[0] if isinstance(command, Send)]
+        return [decode_message(memoryview(bytes(send.message.data))) for send in sends]
+
+
+def cloud() -> Sidecar:
+    sidecar = Sidecar(Role.CLOUD, ROBOT)
+    sidecar.engine.set_offers([ServiceOffer(ECHO, TYPE)])
+    return sidecar
+
+
+def robot() -> Sidecar:
+    sidecar = Sidecar(Role.ROBOT, A)
+    sidecar.engine.set_carried(frozenset({ECHO}))
+    return sidecar
+
+
+def test_a_request_is_told_finished_and_handed_to_the_application_and_its_answer_sent() -> None:
+    sidecar = cloud()
+    sidecar.receive(request())
+    commands, (execution,) = sidecar.take()
+    assert commands == [SendFinished(sidecar.path, 1)]
+    assert isinstance(execution, ExecuteRequest)
+    assert sidecar.engine.busy == 1
+    sidecar.engine.complete(execution.execution, b"answer", 0.5, 0.2)
+    assert sidecar.replies() == [ResponseMessage(request_id(1), 0, 0.5, b"answer")]
+
+
+def test_an_answer_takes_another_path_when_the_requests_own_is_down() -> None:
+    sidecar = cloud()
+    sidecar.receive(request())
+    _, (execution,) = sidecar.take()
+    assert isinstance(execution, ExecuteRequest)
+    sidecar.engine.set_interfaces([WLAN, WWAN], 0.2)
+    other = path(WWAN, ROBOT)
+    sidecar.engine.on_link_event(PathChanged(other, PathState.UP, ""), 0.2)
+    sidecar.change(PathState.DOWN)
+    sidecar.take()
+    sidecar.engine.complete(execution.execution, b"answer", 0.5, 0.2)
+    (send,) = sidecar.take()[0]
+    assert isinstance(send, Send)
+    assert send.path == other
+
+
+REFUSALS = {
+    "no such service": (request(service=ServiceName("/none")), RejectReason.NOT_OFFERED),
+    "another type": (
+        RequestMessage(request_id(1), 0, 1.0, ECHO, "t/srv/Other", b""),
+        RejectReason.WRONG_TYPE,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSALS)
+def test_requests_that_cannot_run_are_refused_with_the_reason(kind: str) -> None:
+    message, reason = REFUSALS[kind]
+    sidecar = cloud()
+    sidecar.receive(message)
+    (reply,) = sidecar.replies()
+    assert isinstance(reply, RejectionMessage)
+    assert reply.reason is reason
+
+
+def test_a_draining_cloud_refuses_the_new_and_answers_the_old() -> None:
+    sidecar = cloud()
+    sidecar.receive(request(1))
+    _, (execution,) = sidecar.take()
+    assert isinstance(execution, ExecuteRequest)
+    sidecar.engine.drain()
+    sidecar.receive(request(2))
+    sidecar.receive(request(1, copy=1))
+    (refused,) = sidecar.replies()
+    assert isinstance(refused, RejectionMessage)
+    assert refused.reason is RejectReason.DRAINING
+    sidecar.engine.complete(execution.execution, b"", 0.0, 0.3)
+    assert len(sidecar.replies()) == 2
+
+
+def test_messages_of_the_wrong_direction_or_broken_ones_are_dropped_and_counted() -> None:
+    for sidecar, message, reason in (
+        (robot(), request(), "request_to_a_robot"),
+        (cloud(), ResponseMessage(request_id(1), 0, 0.0, b""), "response_to_a_cloud"),
+        (cloud(), b"\xff" * 40, "malformed_message"),
+        (robot(), b"", "malformed_message"),
+    ):
+        sidecar.receive(message)
+        assert sidecar.engine.stats.dropped == {reason: 1}
+        commands, events = sidecar.take()
+        assert [type(command) for command in commands] == [SendFinished]
+        assert events == []
+
+
+def test_fragments_of_a_session_that_is_over_are_dropped() -> None:
+    sidecar = cloud()
+    sidecar.receive(request(), session=2)
+    sidecar.engine.on_link_event(PeerRestarted(ROBOT, SessionId(2), 2), 0.1)
+    sidecar.receive(request(), session=1)
+    assert sidecar.engine.stats.dropped["fragment_of_old_session"] == 2
+    sidecar.take()
+    sidecar.number = 0
+    sidecar.receive(request(), session=2)
+    assert [type(event) for event in sidecar.take()[1]] == [ExecuteRequest]
+
+
+def test_news_of_paths_to_peers_or_over_interfaces_that_are_gone_leave_no_trace() -> None:
+    sidecar = robot()
+    known = dict(sidecar.engine.routes._routes)
+    for stray in (path(WLAN, "gone"), path("eth9", A)):
+        sidecar.engine.on_link_event(PathMeasured(stray, 0.1, (0.1,), 1, 0), 0.1)
+        sidecar.engine.on_link_event(PathChanged(stray, PathState.UP, ""), 0.1)
+    assert sidecar.engine.routes._routes == known
+    assert len(sidecar.engine.take_report().paths) == 1
+
+
+def test_the_same_news_of_a_path_twice_costs_nothing() -> None:
+    sidecar = robot()
+    sidecar.engine.submit(request_id(1), ECHO, b"", 0.1)
+    sidecar.change(PathState.DOWN)
+    sidecar.take()
+    for _ in range(3):
+        sidecar.change(PathState.DOWN)
+    assert sidecar.take() == ([], [])
+
+
+def test_the_robot_offers_what_a_reachable_cloud_offers_and_says_what_it_carries() -> None:
+    engine = Engine(EngineConfig(Role.ROBOT, (rule(ECHO),)), 0.0)
+    engine.set_interfaces([WLAN], 0.0)
+    engine.apply_peers(PeerSet(Version(1), 1, (peer(A),)), 0.0)
+    assert engine.take_events() == []
+    engine.on_link_event(PathChanged(path(), PathState.UP, ""), 0.1)
+    assert engine.take_events() == [OfferService(ECHO, TYPE)]
+    assert engine.uses() == ()
+    engine.set_carried(frozenset({ECHO}))
+    assert engine.uses() == (ServiceUse(ECHO, TYPE, 0.1, idempotent=True),)
+
+
+def test_a_request_for_a_service_that_is_not_offered_fails_at_once() -> None:
+    sidecar = robot()
+    sidecar.engine.submit(request_id(1), ServiceName("/none"), b"", 0.1)
+    (failed,) = sidecar.take()[1]
+    assert isinstance(failed, RequestFailed)
+    assert failed.outcome == "rejected"
+
+
+def test_a_goodbye_ends_the_requests_there_and_leaves_nothing_in_the_outbox() -> None:
+    sidecar = robot()
+    sidecar.engine.submit(request_id(1), ECHO, b"", 0.1)
+    assert sidecar.engine.busy == 2
+    sidecar.engine.on_link_event(PeerClosed(A), 0.2)
+    assert len(sidecar.engine._outbox) == 0
+    assert not sidecar.engine.routes.reaches(A)
+
+
+def test_a_peer_kept_only_for_its_paths_goes_with_the_last_of_them() -> None:
+    for goes in (PathChanged(path(), PathState.DOWN, ""), PeerClosed(A)):
+        sidecar = robot()
+        sidecar.view(version=2)
+        assert A in sidecar.engine.peers
+        sidecar.take()
+        sidecar.engine.on_link_event(goes, 0.2)
+        assert A not in sidecar.engine.peers
+        assert SetPeers(()) in sidecar.take()[0]
+
+
+def test_a_flood_of_restarts_makes_little_work() -> None:
+    sidecar = cloud()
+    for incarnation in range(2, 1000):
+        sidecar.engine.on_link_event(
+            PeerRestarted(ROBOT, SessionId(incarnation), incarnation), 0.001 * incarnation
+        )
+    assert len([command for command in sidecar.take()[0] if isinstance(command, SetPeers)]) == 1
+
+
+def test_versions_and_refusals_are_counted() -> None:
+    sidecar = robot()
+    sidecar.view(peer(A), version=5)
+    same = (peer(A, session=7), peer(B, session=7))
+    assert sidecar.engine.apply_peers(PeerSet(Version(6), 1, same), 0.0)
+    bad = ServiceMapping(ECHO, (Assignment(InterfaceName("eth9"), A),))
+    assert sidecar.engine.apply_mapping(MappingSet(Version(3), 1, (bad,)))
+    good = ServiceMapping(ECHO, (Assignment(WLAN, A),))
+    assert sidecar.engine.apply_mapping(MappingSet(Version(4), 1, (good,))) is None
+    stats = sidecar.engine.stats
+    assert (stats.peers_version, stats.mapping_version, stats.nacks) == (5, 4, 2)
+    assert sidecar.engine.service_mappings == (good,)
+
+
+def test_timers_always_move_on() -> None:
+    for sidecar in (robot(), cloud()):
+        if sidecar.path.peer == ROBOT:
+            sidecar.receive(request(lifetime_s=3.0))
+        else:
+            sidecar.engine.submit(request_id(1), ECHO, b"", 0.1)
+            sidecar.change(PathState.DOWN, 0.15)
+        now, turns = 0.15, 0
+        while now < 30.0:
+            timer = sidecar.engine.next_timer()
+            assert timer > now, "the timer spins"
+            now = timer
+            sidecar.engine.handle_timer(now)
+            turns += 1
+        assert turns <= 30.0 / SWEEP_EVERY_S + 5
+        assert sidecar.engine._requests.unanswered == sidecar.engine._executions.running == 0
+
+
+def test_an_execution_that_never_answers_is_abandoned() -> None:
+    sidecar = cloud()
+    sidecar.receive(request(lifetime_s=3.0))
+    _, (execution,) = sidecar.take()
+    assert isinstance(execution, ExecuteRequest)
+    sidecar.engine.handle_timer(3.2)
+    assert sidecar.take()[1] == [AbandonExecution(execution.execution)]
+    sidecar.engine.complete(execution.execution, b"late", 3.0, 3.3)
+    assert sidecar.replies() == []
+
+
+def test_an_interface_that_goes_takes_its_routes_along() -> None:
+    sidecar = robot()
+    sidecar.engine.submit(request_id(1), ECHO, b"", 0.1)
+    sidecar.engine.set_interfaces([WWAN], 0.2)
+    assert not sidecar.engine.routes.reaches(A)
+    sidecar.take()
+    sidecar.engine.on_link_event(PathChanged(PathId(WWAN, A, path().remote), PathState.UP, ""), 0.3)
+    assert sidecar.take()[0], "the request travels over the other interface"

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+from protos.model import Peer, ServiceName, ServiceOffer
+from sidecar.core.events import OfferService, WithdrawService
+from sidecar.core.link_events import PathState
+from sidecar.core.offers import WITHDRAW_AFTER_S, Offers
+from sidecar.core.routes import Routes
+from tests.unit.sidecar.core.builders import ECHO, TYPE, A, B, path, peer, rule
+
+OTHER_TYPE = (ServiceOffer(ECHO, "t/srv/Other"),)
+
+
+class Robot:
+    """Offers over routes that the test sets."""
+
+    def __init__(self, *peers: Peer) -> None:
+        self.routes = Routes()
+        self.offers = Offers((rule(ECHO),))
+        for known in (A, B):
+            self.reach(known)
+        self.offers.set_peers(list(peers))
+
+    def reach(self, name: str, state: PathState = PathState.UP) -> None:
+        self.routes.set_state(path(peer=name), state)
+
+    def update(self, now: float = 1.0) -> list[OfferService | WithdrawService]:
+        return self.offers.update(self.routes, now)
+
+
+def test_a_service_is_offered_with_its_first_reachable_server_and_once() -> None:
+    robot = Robot(peer(A), peer(B, session=2))
+    assert robot.update() == [OfferService(ECHO, TYPE)]
+    assert robot.update() == []
+    assert robot.offers.servers(ECHO) == (A, B)
+    assert robot.offers.offered == {ECHO: TYPE}
+
+
+def test_an_unreachable_server_offers_nothing_yet() -> None:
+    robot = Robot(peer(A))
+    robot.reach(A, PathState.DOWN)
+    assert robot.update() == []
+    robot.reach(A, PathState.UNSTABLE)
+    assert robot.update() == [OfferService(ECHO, TYPE)]
+
+
+def test_services_without_a_rule_are_not_carried() -> None:
+    robot = Robot(peer(A, offers=(ServiceOffer(ServiceName("/secret"), TYPE),)))
+    assert robot.update() == []
+    assert robot.offers.servers(ServiceName("/secret")) == ()
+
+
+def test_darkness_is_outlasted_for_a_while_then_ends_the_offer() -> None:
+    robot = Robot(peer(A))
+    robot.update()
+    assert robot.offers.next_timer() is None
+    robot.reach(A, PathState.DOWN)
+    assert robot.update(10.0) == []
+    assert robot.offers.next_timer() == 10.0 + WITHDRAW_AFTER_S
+    assert robot.update(10.0 + WITHDRAW_AFTER_S - 0.1) == []
+    (withdrawn,) = robot.update(10.0 + WITHDRAW_AFTER_S)
+    assert isinstance(withdrawn, WithdrawService)
+    assert robot.offers.next_timer() is None, "a timer that nothing clears would spin"
+    robot.reach(A)
+    assert robot.update(99.0) == [OfferService(ECHO, TYPE)]
+
+
+def test_light_in_between_starts_the_wait_anew() -> None:
+    robot = Robot(peer(A))
+    robot.update()
+    for now, state in (
+        (10.0, PathState.DOWN),
+        (20.0, PathState.UP),
+        (24.0, PathState.DOWN),
+        (30.0, PathState.DOWN),
+    ):
+        robot.reach(A, state)
+        assert robot.update(now) == []
+    assert robot.offers.next_timer() == 24.0 + WITHDRAW_AFTER_S
+
+
+def test_when_the_servers_leave_the_offer_goes_at_once() -> None:
+    robot = Robot(peer(A))
+    robot.update()
+    robot.offers.set_peers([])
+    assert robot.update(1.1) == [WithdrawService(ECHO, "the last server is gone")]
+
+
+def test_a_draining_server_gets_requests_only_where_there_is_no_other() -> None:
+    assert Robot(peer(A, draining=True), peer(B, session=2)).offers.servers(ECHO) == (B,)
+    assert Robot(peer(A, draining=True)).offers.servers(ECHO) == (A,)
+
+
+def test_the_type_of_most_servers_wins_and_the_odd_one_is_named() -> None:
+    robot = Robot(peer(A), peer(B, session=2), peer("odd", session=3, offers=OTHER_TYPE))
+    assert robot.update() == [OfferService(ECHO, TYPE)]
+    assert robot.offers.servers(ECHO) == (A, B)
+    assert robot.offers.conflicts == {(ECHO, "odd", "t/srv/Other")}
+    robot.offers.set_peers([peer(A)])
+    assert robot.offers.conflicts == set(), "settled conflicts are forgotten"
+
+
+def test_in_a_tie_the_type_already_offered_stays() -> None:
+    for first, second in (
+        (ServiceOffer(ECHO, "a"), ServiceOffer(ECHO, "b")),
+        (ServiceOffer(ECHO, "b"), ServiceOffer(ECHO, "a")),
+    ):
+        robot = Robot(peer(A, offers=(first,)))
+        robot.update()
+        robot.offers.set_peers([peer(A, offers=(first,)), peer(B, session=2, offers=(second,))])
+        assert robot.update() == []
+        assert robot.offers.servers(ECHO) == (A,)
+
+
+def test_when_the_type_changes_the_old_offer_goes_and_the_new_one_comes() -> None:
+    robot = Robot(peer(A))
+    robot.update()
+    robot.offers.set_peers([peer(A, offers=OTHER_TYPE)])
+    withdrawn, offered = robot.update()
+    assert isinstance(withdrawn, WithdrawService)
+    assert offered == OfferService(ECHO, "t/srv/Other")

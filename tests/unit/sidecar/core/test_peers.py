@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+from protos.model import (
+    Candidate,
+    CandidateKind,
+    InterfaceId,
+    InterfaceName,
+    NodeName,
+    Peer,
+    PeerSet,
+    RemovalReason,
+    RemovedPeer,
+    SessionId,
+    Version,
+)
+from sidecar.core.link_events import PeerRestarted
+from sidecar.core.peers import MAX_PEERS, RESTART_GAP_S, Peers
+from tests.unit.sidecar.core.builders import A, B, peer
+
+HELD = peer(A, session=1), peer(B, session=2)
+
+
+def view(*listed: Peer, removed: tuple[RemovedPeer, ...] = ()) -> PeerSet:
+    return PeerSet(Version(1), 1, listed, removed)
+
+
+def known(*listed: Peer) -> Peers:
+    peers = Peers()
+    assert peers.apply(view(*listed), nobody) is None
+    return peers
+
+
+def nobody(_: NodeName) -> bool:
+    return False
+
+
+def everybody(_: NodeName) -> bool:
+    return True
+
+
+def test_a_peer_that_vanished_is_kept_while_a_path_to_it_lives() -> None:
+    peers = known(*HELD)
+    peers.apply(view(), lambda name: name == A)
+    assert peers.names() == [A]
+    assert peers.drop_if_unlisted(A)
+    assert A not in peers
+
+
+def test_a_listed_peer_survives_the_death_of_its_paths() -> None:
+    peers = known(*HELD)
+    assert not peers.drop_if_unlisted(A)
+    assert A in peers
+
+
+def test_a_peer_that_is_listed_again_is_no_longer_on_sufferance() -> None:
+    peers = known(*HELD)
+    peers.apply(view(), everybody)
+    peers.apply(view(HELD[0]), everybody)
+    assert not peers.drop_if_unlisted(A)
+
+
+def test_one_whose_lease_expired_is_kept_one_that_left_or_was_revoked_goes_at_once() -> None:
+    for reason, kept in (
+        (RemovalReason.LEASE_EXPIRED, True),
+        (RemovalReason.LEFT, False),
+        (RemovalReason.REVOKED, False),
+    ):
+        peers = known(*HELD)
+        peers.apply(view(removed=(RemovedPeer(A, reason),)), everybody)
+        assert (A in peers) is kept
+        assert B in peers
+
+
+def restart(name: NodeName = A, session: int = 9, incarnation: int = 2) -> PeerRestarted:
+    return PeerRestarted(name, SessionId(session), incarnation)
+
+
+def test_a_restart_is_believed_when_it_is_newer() -> None:
+    peers = known(*HELD)
+    assert peers.restarted(restart(), 1.0)
+    assert peers.session(A) == 9
+    for stale in (restart(session=10, incarnation=2), restart(session=10, incarnation=1)):
+        assert not peers.restarted(stale, 99.0)
+    assert not peers.restarted(restart(NodeName("stranger")), 1.0)
+
+
+def test_restarts_are_rate_limited_for_each_peer() -> None:
+    peers = known(*HELD)
+    assert peers.restarted(restart(), 1.0)
+    assert not peers.restarted(restart(session=10, incarnation=3), 1.0 + RESTART_GAP_S / 2)
+    assert peers.restarted(restart(B, session=20), 1.0 + RESTART_GAP_S / 2)
+    assert peers.restarted(restart(session=10, incarnation=3), 1.0 + RESTART_GAP_S)
+
+
+def test_a_peer_cannot_take_the_session_of_another() -> None:
+    peers = known(*HELD)
+    assert not peers.restarted(restart(session=2), 1.0)
+    newcomer = peer("cloud-c", session=9)
+    assert peers.restarted(restart(session=9), 1.0)
+    assert peers.apply(view(*HELD, newcomer), everybody) is None
+    assert peers.session(NodeName("cloud-c")) == 9
+    assert peers.session(A) == 1
+    peers.apply(view(peer("cloud-d", session=2)), everybody)
+    assert B not in peers, "kept for its paths, but its session is another's now"
+
+
+def test_a_view_older_than_the_restart_does_not_bring_the_old_session_back() -> None:
+    peers = known(*HELD)
+    peers.restarted(restart(), 1.0)
+    peers.apply(view(*HELD), everybody)
+    assert peers.session(A) == 9
+    peers.apply(view(peer(A, session=30, incarnation=3), HELD[1]), everybody)
+    assert peers.session(A) == 30
+
+
+def test_refused_views_change_nothing() -> None:
+    peers = known(*HELD)
+    assert "share a session" in (peers.apply(view(peer(A, session=5), peer(B, session=5)), everybody) or "")
+    many = tuple(peer(f"n{number}", session=number) for number in range(MAX_PEERS + 1))
+    assert str(MAX_PEERS) in (peers.apply(view(*many), everybody) or "")
+    assert peers.all() == list(HELD)
+
+
+def test_links_get_each_address_of_an_interface_once() -> None:
+    def candidate(number: int, host: str, kind: CandidateKind = CandidateKind.HOST) -> Candidate:
+        return Candidate(InterfaceId(number), InterfaceName("eth"), kind, (host, 1))
+
+    reflexive = CandidateKind.SERVER_REFLEXIVE
+    subject = Peer(
+        A, HELD[0].role, SessionId(1), bytes(16), 1,
+        (candidate(1, "b"), candidate(0, "a"), candidate(1, "c"), candidate(1, "b", reflexive)),
+    )  # fmt: skip
+    (link_peer,) = known(subject).for_links()
+    assert link_peer.addresses == ((0, (("a", 1),)), (1, (("b", 1), ("c", 1))))
