@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from controlplane import config_file
-from controlplane.core.control import Settings
+from controlplane.core.control_events import Settings
 
 if TYPE_CHECKING:
     from pathlib import Path

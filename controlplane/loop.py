@@ -9,7 +9,8 @@ import time
 from typing import TYPE_CHECKING
 
 from controlplane.core.assignment import Plan, Problem
-from controlplane.core.control import Close, CloseReason, ControlCore, DepartureNotice, NackNotice, Send
+from controlplane.core.control import ControlCore
+from controlplane.core.control_events import Close, CloseReason, DepartureNotice, NackNotice, Send
 from controlplane.core.registry import Refusal
 from controlplane.mailbox import Mailbox
 

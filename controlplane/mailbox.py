@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from protos.model import MappingSet, PeerSet, Welcome
 
 if TYPE_CHECKING:
-    from controlplane.core.control import CloseReason
+    from controlplane.core.control_events import CloseReason
     from protos.model import ControlMessage
 
 _ORDER = (Welcome, PeerSet, MappingSet)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NoReturn
 import grpc
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 
-from controlplane.core.control import CloseReason
+from controlplane.core.control_events import CloseReason
 from controlplane.core.registry import Refusal
 from protos.convert import control_message_to_proto, parse_sidecar_message
 from protos.errors import DecodeError

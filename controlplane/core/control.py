@@ -12,13 +12,21 @@ nothing, and clouds (they find their robots by the robots' own probes), are serv
 
 from __future__ import annotations
 
-import enum
-from collections import Counter, OrderedDict, deque
-from dataclasses import dataclass, field
+from collections import OrderedDict, deque
 from typing import TYPE_CHECKING, assert_never
 
 from controlplane.core import reconcile
 from controlplane.core.assignment import Plan, Problem
+from controlplane.core.control_events import (
+    Close,
+    CloseReason,
+    Counters,
+    DepartureNotice,
+    Event,
+    NackNotice,
+    Send,
+    Settings,
+)
 from controlplane.core.debounce import Change, Debounce, settle
 from controlplane.core.estimator import Estimator
 from controlplane.core.picture import Picture, draw
@@ -45,7 +53,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from controlplane.core.registry import Sidecar
-    from protos.model import ControlMessage, NodeName, Peer, ServiceName, SidecarMessage, SyncState
+    from protos.model import NodeName, Peer, ServiceName, SidecarMessage, SyncState
 
 PUBLISH_DELAY_S = 0.02
 """From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two
@@ -53,82 +61,6 @@ messages, and these should make one version."""
 
 MAX_GONE_SNAPSHOTS = MAX_SIDECARS
 """Sidecars that are gone and whose last set is remembered, for the notices when they return; the oldest go."""
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What the configuration decides."""
-
-    lease_s: float = 5.0
-    report_interval_s: float = 0.5
-    warm_up_s: float = 12.0
-    half_life_s: float = 60.0
-    default_capacity_interfaces: int = 1
-    stun_servers: tuple[str, ...] = ()
-
-
-class CloseReason(enum.Enum):
-    """Why the control plane ends a stream."""
-
-    REPLACED = "replaced by a newer stream of this sidecar"
-    LEASE_EXPIRED = "silent for longer than the lease"
-    STOPPING = "the control plane is stopping"
-
-
-@dataclass(frozen=True, slots=True)
-class Send:
-    """A message for one stream; a newer one of the same type makes an unsent older one pointless."""
-
-    stream: StreamId
-    message: ControlMessage
-
-
-@dataclass(frozen=True, slots=True)
-class Close:
-    """End this stream."""
-
-    stream: StreamId
-    reason: CloseReason
-
-
-@dataclass(slots=True)
-class Counters:
-    """What happened, for the metrics."""
-
-    nacks: Counter[ResourceKind] = field(default_factory=Counter)
-    acks: Counter[ResourceKind] = field(default_factory=Counter)
-    stale_answers: int = 0
-    """Acks and nacks with a nonce that is not the last one's."""
-    reports: int = 0
-    reports_ignored: int = 0
-    """Reports of clouds, which measure nothing."""
-    old_stream_messages: int = 0
-    """Messages on a stream that is not the sidecar's any more."""
-    solved: int = 0
-    relaxations: int = 0
-    """Plans taken that exceed a capacity."""
-    unproven: int = 0
-    """Groups of blocks whose optimum was not proven in time."""
-
-
-@dataclass(frozen=True, slots=True)
-class NackNotice:
-    """A sidecar refused what it was sent, for the log."""
-
-    sidecar: NodeName
-    nack: Nack
-
-
-@dataclass(frozen=True, slots=True)
-class DepartureNotice:
-    """A sidecar is not there any more, for the log."""
-
-    sidecar: NodeName
-    reason: RemovalReason
-
-
-Event = Send | Close | NackNotice | DepartureNotice
-"""What the driver has to do, in this order."""
 
 
 class ControlCore:

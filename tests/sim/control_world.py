@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.control import Close, CloseReason, ControlCore, DepartureNotice, NackNotice, Send, Settings
+from controlplane.core.control import ControlCore
+from controlplane.core.control_events import Close, CloseReason, DepartureNotice, NackNotice, Send, Settings
 from controlplane.core.registry import Refusal, StreamId
 from controlplane.solver import solve
 from protos.model import (

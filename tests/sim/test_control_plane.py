@@ -14,7 +14,7 @@ import zlib
 
 import pytest
 
-from controlplane.core.control import Settings
+from controlplane.core.control_events import Settings
 from protos.model import (
     CandidateSet,
     MappingSet,

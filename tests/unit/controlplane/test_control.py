@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from controlplane.core.control import CloseReason, Settings
+from controlplane.core.control_events import CloseReason, Settings
 from controlplane.core.registry import Refusal
 from protos.errors import DecodeError
 from protos.model import (
@@ -306,6 +306,23 @@ def test_reports_alone_solve_once_a_second_and_push_nothing_new(world: World) ->
         world.run(0.5)
     assert world.solvings - solvings <= 11
     assert len(robot.mapping_sets) == pushed
+
+
+def test_a_failed_solving_leaves_the_plan_and_is_tried_again(world: World) -> None:
+    world.cloud("a")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    before = robot.pairs()
+    world.all_up(robot, ("a",))
+    world.now += 0.1
+    assert world.core.start_solving(world.now) is not None
+    assert world.core.start_solving(world.now) is None
+    world.core.solving_failed(world.now)
+    assert robot.pairs() == before
+    solvings = world.solvings
+    world.run(SETTLED_S)
+    assert world.solvings == solvings + 1
+    assert "no path is up" not in robot.reason()
 
 
 def test_a_service_no_longer_used_leaves_the_mapping(world: World) -> None:

@@ -1,0 +1,88 @@
+"""What goes into the core beside messages, and what comes out of it."""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from controlplane.core.registry import StreamId
+    from protos.model import ControlMessage, Nack, NodeName, RemovalReason, ResourceKind
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the configuration decides."""
+
+    lease_s: float = 5.0
+    report_interval_s: float = 0.5
+    warm_up_s: float = 12.0
+    half_life_s: float = 60.0
+    default_capacity_interfaces: int = 1
+    stun_servers: tuple[str, ...] = ()
+
+
+class CloseReason(enum.Enum):
+    """Why the control plane ends a stream."""
+
+    REPLACED = "replaced by a newer stream of this sidecar"
+    LEASE_EXPIRED = "silent for longer than the lease"
+    STOPPING = "the control plane is stopping"
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """A message for one stream; a newer one of the same type makes an unsent older one pointless."""
+
+    stream: StreamId
+    message: ControlMessage
+
+
+@dataclass(frozen=True, slots=True)
+class Close:
+    """End this stream."""
+
+    stream: StreamId
+    reason: CloseReason
+
+
+@dataclass(slots=True)
+class Counters:
+    """What happened, for the metrics."""
+
+    nacks: Counter[ResourceKind] = field(default_factory=Counter)
+    acks: Counter[ResourceKind] = field(default_factory=Counter)
+    stale_answers: int = 0
+    """Acks and nacks with a nonce that is not the last one's."""
+    reports: int = 0
+    reports_ignored: int = 0
+    """Reports of clouds, which measure nothing."""
+    old_stream_messages: int = 0
+    """Messages on a stream that is not the sidecar's any more."""
+    solved: int = 0
+    relaxations: int = 0
+    """Plans taken that exceed a capacity."""
+    unproven: int = 0
+    """Groups of blocks whose optimum was not proven in time."""
+
+
+@dataclass(frozen=True, slots=True)
+class NackNotice:
+    """A sidecar refused what it was sent, for the log."""
+
+    sidecar: NodeName
+    nack: Nack
+
+
+@dataclass(frozen=True, slots=True)
+class DepartureNotice:
+    """A sidecar is not there any more, for the log."""
+
+    sidecar: NodeName
+    reason: RemovalReason
+
+
+Event = Send | Close | NackNotice | DepartureNotice
+"""What the driver has to do, in this order."""
