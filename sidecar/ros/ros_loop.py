@@ -1,7 +1,7 @@
 """The sidecar's ROS node and a small loop that waits on its entities: one thread owns everything of ROS.
 
 rclpy's own executors are not used: the standard ones build their lists anew in Python for each event, and the
-experimental EventsExecutor starves the other threads of the process (docs/adr/ros-bridge.md has the figures).
+experimental EventsExecutor starves the other threads of the process (docs/adr/0007-one-thread-owns-ros.md).
 """
 
 from __future__ import annotations
@@ -53,7 +53,13 @@ class RosLoop:
     def __init__(self, node_name: str, domain_id: int | None) -> None:
         self._context = Context()
         # Its own context, without rclpy's signal handlers and without the command line: both are the program's.
-        rclpy.init(args=[], context=self._context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
+        # No log file of ROS's own either: it would need a writable home.
+        rclpy.init(
+            args=["--ros-args", "--disable-external-lib-logs"],
+            context=self._context,
+            domain_id=domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
         self.node = Node(
             node_name,
             context=self._context,

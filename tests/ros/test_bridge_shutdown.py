@@ -67,3 +67,4 @@ def test_signals_are_the_programs_own(by: signal.Signals, ros_domain: int, tmp_p
         wait_until(lambda: "ready" in host.output(), f"the host: {host.output()}")
         assert host.stop(by) == 0, host.output()
         assert host.output().split() == ["ready", by.name, "stopped"]
+    assert not (tmp_path / "ros-logs").exists(), "ROS wrote a log of its own"
