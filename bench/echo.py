@@ -1,4 +1,4 @@
-"""A ROS application for tests and benchmarks: a service of a custom type that proves which request its answer belongs to.
+"""A ROS application for tests and benchmarks: its answers, of a custom type, prove which request they belong to.
 
 `python -m bench.echo serve` and `python -m bench.echo call --size 1000 --rate 50 --json FILE`.
 """
@@ -9,6 +9,7 @@ import argparse
 import json
 import random
 import sys
+import time
 import zlib
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,8 @@ SERVICE = "/echo"
 
 
 def answer(request: Any, response: Any) -> dict[str, Any]:
-    """Answer with a checksum of the payload."""
+    """Answer with a checksum of the payload, after as many milliseconds as `format` says."""
+    time.sleep(float(request.image.format or 0) / 1e3)
     data = bytes(request.image.data)
     response.header = request.image.header
     response.success = True
@@ -35,8 +37,9 @@ def answer(request: Any, response: Any) -> dict[str, Any]:
 class EchoRequests:
     """Requests of one size, each with other bytes."""
 
-    def __init__(self, size: int, rng: random.Random) -> None:
+    def __init__(self, size: int, delay_ms: float, rng: random.Random) -> None:
         self._size = size
+        self._delay_ms = delay_ms
         self._rng = rng
         self._count = 0
 
@@ -45,6 +48,7 @@ class EchoRequests:
         request.image.header.stamp = stamp
         request.image.header.frame_id = f"{self._count}"
         self._count += 1
+        request.image.format = f"{self._delay_ms:g}"
         request.image.data = self._rng.randbytes(self._size)
         return request
 
@@ -63,10 +67,11 @@ def main() -> int:
     call = commands.add_parser("call")
     robot_client.add_arguments(call, rate_hz=50.0, deadline_ms=500.0)
     call.add_argument("--size", type=int, default=1000)
+    call.add_argument("--ask-delay-ms", type=float, default=0.0, help="how long the server shall take")
     options = parser.parse_args()
     if options.command == "serve":
         return service_server.run("echo", DetectPeople, SERVICE, answer, options)
-    workload = EchoRequests(options.size, random.Random(options.seed))
+    workload = EchoRequests(options.size, options.ask_delay_ms, random.Random(options.seed))
     return robot_client.run("caller", DetectPeople, SERVICE, workload, options)
 
 
