@@ -29,8 +29,11 @@ METRICS_INTERVAL_S = 1.0
 
 
 def wall_clock_epoch() -> int:
-    """Where versions start: milliseconds since 1970, with 2^20 versions left for each."""
-    return time.time_ns() // 1_000_000 << 20
+    """Where versions start: seconds since 1970, with 2^20 versions left for each.
+
+    Below 2^53, so that metrics (doubles) tell one version from the next.
+    """
+    return time.time_ns() // 1_000_000_000 << 20
 
 
 def _solve(problem: Problem, time_limit_s: float, hint: Plan) -> Plan:

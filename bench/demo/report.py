@@ -121,14 +121,15 @@ def plot(path: Path, runs: dict[str, dict[str, Any]], marks: list[Mark], zero_s:
         sent = [r["sent_s"] - zero_s for r in run["requests"]]
         latency = [UNANSWERED_MS if r["latency_ms"] is None else r["latency_ms"] for r in run["requests"]]
         late = [value > deadline_ms for value in latency]
-        panel.scatter(sent, latency, s=5, c=["#c0392b" if is_late else "#1f618d" for is_late in late])
+        colours = ["#c0392b" if is_late else "#1f618d" for is_late in late]
+        panel.scatter(sent, latency, s=5, c=colours, zorder=3)
         panel.axhline(deadline_ms, color="#c0392b", linewidth=0.8, linestyle="--")
         panel.set_yscale("log")
         panel.set_ylabel("ms")
         panel.set_title(f"{name}: {sum(late)} of {len(late)} late", loc="left", fontsize=10)
         ends = [mark.start_s for mark in marks[1:]] + [max(sent)]
         for mark, end in zip(marks, ends, strict=True):
-            panel.axvspan(mark.start_s, end, color=mark.shade, linewidth=0)
+            panel.axvspan(mark.start_s, end, color=mark.shade, linewidth=0, zorder=0)
     for mark in marks:
         panels[0].annotate(
             mark.name,
