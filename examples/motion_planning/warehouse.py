@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RESOLUTION_M = 0.2
-WIDTH_M, HEIGHT_M = 40.0, 25.0
+WIDTH_M, HEIGHT_M = 24.0, 15.0
 # The robot's centre keeps this far from anything, in cells: a robot of 0.4 m diameter.
 ROBOT_RADIUS_CELLS = 1
 RACK_DEPTH_CELLS = 4
 AISLE_CELLS = 8
 CROSS_AISLE_EVERY_CELLS = 40
-PALLETS = 60
+PALLETS = 22
 PALLET_CELLS = 4
 
 Cell = tuple[int, int]
