@@ -1,0 +1,119 @@
+"""A link that is fed garbage and mangled datagrams never raises, stays bounded and goes on serving."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protos.model import InterfaceId, SessionId
+from sidecar.core import frame
+from sidecar.core.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
+from sidecar.core.link import MAX_PENDING_FRAMES
+from sidecar.core.link_events import PathId, Send
+from tests.unit.sidecar.core.builders import (
+    OUR_TOKEN,
+    PEER_ADDRESS,
+    PEER_SESSION,
+    PEER_TOKEN,
+    WLAN,
+    A,
+    Bench,
+    message,
+)
+
+numbers = st.integers(0, 60) | st.integers(0, 2**64 - 1)
+acks = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=40)
+
+
+def encode_ack(largest: int, shape: list[tuple[int, int]]) -> bytes:
+    body = b"".join(length.to_bytes(2, "big") + gap.to_bytes(2, "big") for length, gap in shape)
+    return b"\x03" + largest.to_bytes(8, "big") + bytes(4) + bytes([len(shape)]) + body
+
+
+fragments = st.builds(
+    lambda number, total, symbol, index, size: (
+        frame.encode_fragment_head(number, total, symbol, index) + bytes(size)
+    ),
+    numbers,
+    st.integers(0, 2**32 - 1) | st.just(3000),
+    st.integers(0, 2**16 - 1) | st.just(300),
+    st.integers(0, 12),
+    st.integers(0, 1000) | st.just(300),
+)
+tokens = st.sampled_from([PEER_TOKEN, OUR_TOKEN])
+frames = st.one_of(
+    st.integers(0, 70).map(lambda n: frame.encode_probe(Probe(n))),
+    st.integers(0, 70).map(lambda n: frame.encode_probe_reply(ProbeReply(n))),
+    st.builds(encode_ack, numbers, acks),
+    fragments,
+    numbers.map(lambda n: frame.encode_finished(frame.Finished(n))),
+    st.just(frame.encode_close()),
+    st.builds(lambda token, n: frame.encode_hello(frame.Hello(token, n)), tokens, numbers),
+    st.binary(max_size=20),
+)
+headers = st.builds(
+    Header,
+    st.sampled_from([0, 0, 0, 1]).map(InterfaceId),
+    st.sampled_from([3, 3, 3, 4]).map(InterfaceId),
+    st.sampled_from([PEER_SESSION, PEER_SESSION, PEER_SESSION, SessionId(5)]),
+    numbers,
+)
+datagrams = st.binary(max_size=60) | st.builds(
+    lambda header, body: frame.encode_header(header) + b"".join(body), headers, st.lists(frames, max_size=5)
+)
+ops = st.tuples(datagrams, st.sampled_from([0.0, 0.0, 0.001, 0.05, 1.0]), st.booleans())
+mutations = st.lists(st.tuples(st.integers(0, 1200), st.integers(0, 255)), max_size=3)
+
+
+def assert_bounded(bench: Bench) -> None:
+    link = bench.link
+    assert len(link._paths) == 1
+    for path in link._paths.values():
+        assert len(path.pending) <= MAX_PENDING_FRAMES
+        assert len(path.received._ranges) <= MAX_ACK_RANGES
+        assert 0 <= path.recovery.in_flight == sum(sent.size for sent in path.recovery.sent.values())
+        assert path.window.bytes > 0
+    assert len(link.stats.dropped) < 20
+
+
+@given(st.lists(ops, max_size=30))
+def test_whatever_comes_the_link_stands_and_answers_honest_probes(
+    steps: list[tuple[bytes, float, bool]],
+) -> None:
+    bench = Bench()
+    path = PathId(WLAN, A, InterfaceId(0))
+    for number, (data, pause, send) in enumerate(steps):
+        if send:
+            bench.execute(Send(path, message(number, expires=1e9)))
+        bench.link.receive_datagram(data, PEER_ADDRESS, bench.now)
+        bench.events()
+        bench.sent()
+        bench.wait(pause)
+        assert_bounded(bench)
+    bench.wait(120.0)  # a round trip of seconds makes silence mean little for a while
+    bench.events()
+    assert bench.link.next_timer() > bench.now
+    assert all(not path.recovery.sent for path in bench.link._paths.values()), (
+        "everything is acknowledged or lost"
+    )
+    bench.know(session=SessionId(77), incarnation=2)
+    probe = frame.encode_probe(Probe(4242))
+    bench.link.receive_datagram(bench.datagram(probe, session=SessionId(77)), PEER_ADDRESS, bench.now)
+    assert frame.encode_probe_reply(ProbeReply(4242)) in b"".join(bench.sent())
+
+
+@given(st.lists(st.tuples(mutations, st.booleans()), min_size=1, max_size=20), st.integers(0, 5000))
+def test_real_datagrams_mangled_on_the_way(plan: list[tuple[list[tuple[int, int]], bool]], size: int) -> None:
+    """The datagrams of a link come back to it as if its peer had sent them, some bytes of them changed."""
+    bench = Bench()
+    path = PathId(WLAN, A, InterfaceId(0))
+    for number, (changes, send) in enumerate(plan):
+        if send:
+            bench.execute(Send(path, message(number, size, expires=1e9)))
+        for sent in bench.sent() + bench.wait(0.02):
+            body = bytearray(bench.datagram(sent[frame.HEADER_BYTES :]))
+            for position, value in changes:
+                body[position % len(body)] = value
+            bench.link.receive_datagram(bytes(body), PEER_ADDRESS, bench.now)
+        bench.events()
+        assert_bounded(bench)

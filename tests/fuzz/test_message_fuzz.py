@@ -1,0 +1,66 @@
+"""Whatever a peer puts into a message, the codec gives a value or its one error."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protos.errors import DecodeError
+from protos.model import ServiceName
+from sidecar.core.events import RejectReason, RequestId
+from sidecar.core.messages import (
+    MAX_NAME_BYTES,
+    Message,
+    RejectionMessage,
+    RequestMessage,
+    ResponseMessage,
+    decode_message,
+    encode_message,
+)
+
+ids = st.binary(min_size=16, max_size=16).map(RequestId)
+u8, u32 = st.integers(0, 255), st.integers(0, 2**32 - 1)
+names = st.text(st.characters(codec="utf-8"), max_size=60)
+payloads = st.binary(max_size=200)
+messages = st.one_of(
+    st.builds(RequestMessage, ids, u8, u32.map(lambda n: n / 1e3), names.map(ServiceName), names, payloads),
+    st.builds(ResponseMessage, ids, u8, u32.map(lambda n: n / 1e6), payloads),
+    st.builds(RejectionMessage, ids, u8, st.sampled_from(RejectReason), names),
+)
+framed = st.builds(lambda kind, rest: bytes([kind]) + rest, st.integers(0, 5), st.binary(max_size=400))
+
+
+@given(messages)
+def test_messages_come_back(message: Message) -> None:
+    decoded = decode_message(memoryview(encode_message(message)))
+    assert type(decoded) is type(message)
+    for name in message.__slots__:
+        before, after = getattr(message, name), getattr(decoded, name)
+        # Times lose less than their unit.
+        assert after == (pytest.approx(before, abs=1e-3) if isinstance(before, float) else before)
+
+
+@given(st.binary(max_size=100) | framed)
+def test_a_message_or_the_one_error(data: bytes) -> None:
+    try:
+        message = decode_message(memoryview(data))
+    except DecodeError:
+        return
+    assert encode_message(message)[:18] == data[:18]
+    if isinstance(message, RequestMessage):
+        assert len(message.service.encode()) <= MAX_NAME_BYTES
+        assert encode_message(message)[22:] == data[22:]
+
+
+@given(messages, st.integers(0, 300), st.binary(min_size=1, max_size=3))
+def test_a_message_with_changed_bytes_is_a_message_or_the_one_error(
+    message: Message, at: int, new: bytes
+) -> None:
+    data = bytearray(encode_message(message))
+    position = at % len(data)
+    data[position : position + len(new)] = new
+    try:
+        decode_message(memoryview(bytes(data)))
+    except DecodeError:
+        return
