@@ -1,0 +1,184 @@
+"""Threads, sockets and engines together over loopback: the real drivers, no namespaces."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from protos.model import (
+    Candidate,
+    CandidateKind,
+    InterfaceId,
+    InterfaceName,
+    NodeName,
+    Peer,
+    PeerSet,
+    Role,
+    ServiceName,
+    ServiceOffer,
+    SessionId,
+    Version,
+)
+from sidecar.core.engine import EngineConfig
+from sidecar.core.events import (
+    ApplicationEvent,
+    ExecuteRequest,
+    OfferService,
+    RequestId,
+    ResponseArrived,
+)
+from sidecar.core.link import Link, LinkIdentity
+from sidecar.core.link_events import SetReady
+from sidecar.core.rules import ServiceRule
+from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SERVICE, TYPE = ServiceName("/echo"), "t/srv/Echo"
+PATIENCE_S = 20.0
+"""For a loaded machine; nothing here takes long."""
+
+
+class Node:
+    """A sidecar's data plane on one loopback socket; its application echoes and takes notes."""
+
+    def __init__(self, name: str, role: Role, session: int) -> None:
+        self.name, self.role, self.session = NodeName(name), role, SessionId(session)
+        self.token = session.to_bytes(16, "big")
+        self.offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
+        self.events: list[ApplicationEvent] = []
+        self.news = threading.Condition()
+        config = EngineConfig(role, (ServiceRule(SERVICE, 5.0, 20.0, idempotent=True),))
+        hooks = DataPlaneHooks(self, lambda *_: None, lambda: None)
+        self.plane = ThreadedDataPlane(config, self.session, hooks)
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        sock.bind(("127.0.0.1", 0))
+        now = time.monotonic()
+        identity = LinkIdentity(InterfaceName("lo"), InterfaceId(0), self.session, self.token, 1)
+        self.thread = InterfaceThread(sock, Link(identity, random.Random(session), now), None, self.plane)
+
+    def handle(self, event: ApplicationEvent) -> None:
+        if isinstance(event, ExecuteRequest):
+            # On a thread of its own, as a server's answer comes; never from within `handle`.
+            arguments = (event.execution, b"echo:" + event.payload, 0.0)
+            threading.Thread(target=self.plane.complete, args=arguments).start()
+        with self.news:
+            self.events.append(event)
+            self.news.notify_all()
+
+    def as_peer(self) -> Peer:
+        candidate = Candidate(
+            InterfaceId(0), InterfaceName("lo"), CandidateKind.HOST, ("127.0.0.1", self.thread.port)
+        )
+        return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers)
+
+    def start(self, other: Node) -> None:
+        self.plane.start()
+        self.thread.start()
+        self.plane.set_links({InterfaceName("lo"): self.thread})
+        self.thread.post(SetReady(ready=True))
+        self.plane.set_offers(self.offers)
+        assert self.plane.apply_peers(PeerSet(Version(1), 1, (other.as_peer(),))) is None
+
+    def stop(self) -> None:
+        self.plane.stop()
+        self.thread.stop(PATIENCE_S)
+
+    def wait_for(self, kind: type[ApplicationEvent], count: int = 1) -> list[ApplicationEvent]:
+        def found() -> list[ApplicationEvent]:
+            return [event for event in self.events if isinstance(event, kind)]
+
+        with self.news:
+            assert self.news.wait_for(lambda: len(found()) >= count, PATIENCE_S), self.events
+        return found()
+
+
+@pytest.fixture
+def nodes() -> Iterator[tuple[Node, Node]]:
+    robot, cloud = Node("robot", Role.ROBOT, 1), Node("cloud", Role.CLOUD, 2)
+    with contextlib.ExitStack() as stack:
+        for node, other in ((robot, cloud), (cloud, robot)):
+            stack.callback(node.stop)
+            node.start(other)
+        robot.wait_for(OfferService)
+        yield robot, cloud
+
+
+def submit(robot: Node, number: int, payload: bytes) -> None:
+    robot.plane.submit(RequestId(number.to_bytes(16, "big")), SERVICE, payload)
+
+
+def test_requests_of_all_sizes_are_answered_once_each(nodes: tuple[Node, Node]) -> None:
+    robot, _ = nodes
+    payloads = [random.Random(size).randbytes(size) for size in (0, 1, 1000, 5000, 150_000, 2_000_000)]
+    for number, payload in enumerate(payloads):
+        submit(robot, number, payload)
+    answers = robot.wait_for(ResponseArrived, len(payloads))
+    got = {event.request_id: event.payload for event in answers if isinstance(event, ResponseArrived)}
+    assert [got[RequestId(number.to_bytes(16, "big"))] for number in range(len(payloads))] == [
+        b"echo:" + payload for payload in payloads
+    ]
+    assert len(answers) == len(payloads)
+
+
+def test_garbage_into_the_socket_is_counted_and_the_rest_is_served(nodes: tuple[Node, Node]) -> None:
+    robot, cloud = nodes
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for garbage in (b"", b"\x00", b"\xd1", b"\xd2" + bytes(40), b"\xd1" + bytes(1500), bytes(2000)):
+            stranger.sendto(garbage, ("127.0.0.1", cloud.thread.port))
+    submit(robot, 1, b"still here")
+    robot.wait_for(ResponseArrived)
+    dropped = cloud.thread.link.stats.dropped
+    deadline = time.monotonic() + PATIENCE_S
+    while dropped.total() < 6 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert (dropped["malformed"], dropped["version"]) == (5, 1)
+
+
+def test_an_internal_error_silences_neither_the_timers_nor_the_interface(
+    nodes: tuple[Node, Node], caplog: pytest.LogCaptureFixture
+) -> None:
+    robot, _ = nodes
+    for owner, name in ((robot.plane._engine, "handle_timer"), (robot.thread.link, "handle_timer")):
+        fail_once(owner, name)
+    robot.plane._wake_timer.set()
+    submit(robot, 1, b"still here")
+    robot.wait_for(ResponseArrived)
+    deadline = time.monotonic() + PATIENCE_S
+    while len(caplog.records) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert {record.message.split(";")[-1].strip() for record in caplog.records} == {
+        "the timers go on",
+        "the interface goes on",
+    }
+    assert robot.plane._timer.is_alive()
+    assert robot.thread._thread.is_alive()
+
+
+def fail_once(owner: object, name: str) -> None:
+    real = getattr(owner, name)
+
+    def failing(now: float) -> None:
+        setattr(owner, name, real)
+        raise RuntimeError("a bug")
+
+    setattr(owner, name, failing)
+
+
+def test_timers_do_not_spin_while_the_socket_takes_nothing() -> None:
+    node = Node("robot", Role.ROBOT, 1)
+    thread = node.thread
+    thread._clock = lambda: thread.link.next_timer() + 1.0
+    assert thread._timeout() == 0.0
+    thread._unsent.append((("127.0.0.1", 9), b"x"))
+    assert thread._timeout() == BLOCKED_TIMER_S
+    thread._socket.close()
