@@ -70,3 +70,12 @@ class GridPlanner:
         while parent[path[-1]] != path[-1]:
             path.append(parent[path[-1]])
         return [divmod(cell, self._columns) for cell in reversed(path)]
+
+
+def corners(path: list[Cell]) -> list[Cell]:
+    """The cells of a path at which it begins, turns and ends; between them it runs straight."""
+    kept = path[:1]
+    for before, here, ahead in zip(path, path[1:], path[2:], strict=False):
+        if (here[0] - before[0], here[1] - before[1]) != (ahead[0] - here[0], ahead[1] - here[1]):
+            kept.append(here)
+    return kept + path[1:][-1:]

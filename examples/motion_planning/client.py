@@ -23,8 +23,6 @@ from examples import robot_client
 from examples.motion_planning import warehouse
 
 SERVICE = "/plan_path"
-# The ends of a path stand anywhere in their cells, so the first step may be up to twice a diagonal one.
-LONGEST_STEP_CELLS = 2 * math.sqrt(2.0)
 
 
 class PlanRequests:
@@ -51,12 +49,18 @@ class PlanRequests:
         detail = {"path_poses": float(len(poses)), "path_m": _length_m(poses)}
         if poses[0] != request.start or poses[-1] != request.goal:
             return "path of another request", detail
-        if not all(self._floor.is_free(pose.pose.position.x, pose.pose.position.y) for pose in poses):
+        if not all(self._clear(here, ahead) for here, ahead in itertools.pairwise(poses)):
             return "path through an obstacle", detail
-        longest_m = LONGEST_STEP_CELLS * self._floor.resolution_m
-        if any(_step_m(here, ahead) > longest_m for here, ahead in itertools.pairwise(poses)):
-            return "path with a gap", detail
         return None, detail
+
+    def _clear(self, here: Any, ahead: Any) -> bool:
+        """Whether the straight way between two poses is free, looked at every half cell."""
+        a, b = here.pose.position, ahead.pose.position
+        looks = math.ceil(_step_m(here, ahead) / (0.5 * self._floor.resolution_m)) + 1
+        return all(
+            self._floor.is_free(a.x + (b.x - a.x) * look / looks, a.y + (b.y - a.y) * look / looks)
+            for look in range(looks + 1)
+        )
 
 
 def _step_m(here: Any, ahead: Any) -> float:

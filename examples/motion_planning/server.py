@@ -18,7 +18,7 @@ from nav_msgs.srv import GetPlan
 
 from examples import service_server
 from examples.motion_planning import warehouse
-from examples.motion_planning.astar import GridPlanner
+from examples.motion_planning.astar import GridPlanner, corners
 
 SERVICE = "/plan_path"
 
@@ -46,9 +46,10 @@ class PlanService:
         }
 
     def _poses(self, cells: list[warehouse.Cell], header: Any) -> list[Any]:
-        """The inner cells of a path, each facing the next."""
+        """The cells between start and goal at which the path turns, each facing the next."""
+        turns = corners(cells)
         poses = []
-        for here, ahead in itertools.pairwise(cells[1:]):
+        for here, ahead in itertools.pairwise(turns[1:]):
             pose = PoseStamped(header=header)
             pose.pose.position.x, pose.pose.position.y = self._floor.point_of(here)
             yaw = math.atan2(ahead[0] - here[0], ahead[1] - here[1])

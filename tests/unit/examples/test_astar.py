@@ -12,7 +12,7 @@ import pytest
 from scipy.sparse import lil_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from examples.motion_planning.astar import GridPlanner
+from examples.motion_planning.astar import GridPlanner, corners
 from examples.motion_planning.warehouse import generate
 
 if TYPE_CHECKING:
@@ -95,3 +95,17 @@ def test_points_and_cells_agree() -> None:
     assert floor.cell_at(-0.01, 1.0) is None
     assert floor.cell_at(1.0, 1e6) is None
     assert not floor.is_free(0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ([], []),
+        ([(1, 1)], [(1, 1)]),
+        ([(1, 1), (1, 2)], [(1, 1), (1, 2)]),
+        ([(1, 1), (1, 2), (1, 3), (1, 4)], [(1, 1), (1, 4)]),
+        ([(1, 1), (1, 2), (2, 3), (3, 4), (4, 4)], [(1, 1), (1, 2), (3, 4), (4, 4)]),
+    ],
+)
+def test_a_path_is_kept_where_it_turns(path: list[tuple[int, int]], expected: list[tuple[int, int]]) -> None:
+    assert corners(path) == expected
