@@ -208,14 +208,14 @@ def test_news_of_paths_to_peers_or_over_interfaces_that_are_gone_leave_no_trace(
     assert len(sidecar.engine.take_report().paths) == 1
 
 
-def test_the_same_news_of_a_path_twice_costs_nothing() -> None:
+def test_the_same_news_of_a_path_twice_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     sidecar = robot()
-    sidecar.engine.submit(request_id(1), ECHO, b"", 0.1)
-    sidecar.change(PathState.DOWN)
-    sidecar.take()
-    for _ in range(3):
-        sidecar.change(PathState.DOWN)
-    assert sidecar.take() == ([], [])
+    looked_at: list[PathState] = []
+    requests = sidecar.engine._requests
+    monkeypatch.setattr(requests, "on_path_changed", lambda _path, state, _now: looked_at.append(state))
+    for state in (PathState.UNSTABLE, PathState.UNSTABLE, PathState.DOWN, PathState.DOWN, PathState.UP):
+        sidecar.change(state)
+    assert looked_at == [PathState.UNSTABLE, PathState.DOWN, PathState.UP]
 
 
 def test_the_robot_offers_what_a_reachable_cloud_offers_and_says_what_it_carries() -> None:

@@ -143,6 +143,16 @@ def test_an_interface_that_goes_leaves_none_of_its_messages_behind() -> None:
     assert not elsewhere.over
 
 
+def test_what_moved_to_another_interface_is_not_left_behind_there_either() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = box.send(OVER_WLAN)
+    box.lost(message, 0, timed_out=True)
+    assert box.commands.pop() == Resend(OVER_WWAN, message, (0,))
+    box.routes.forget_interface(WWAN)
+    box.outbox.on_interface_gone(WWAN, 1.0)
+    assert box.commands == [Resend(OVER_WLAN, message, (0, 1, 2))]
+
+
 def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
     box = Box(OVER_WLAN, TO_B)
     taken = 0

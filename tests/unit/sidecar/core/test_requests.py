@@ -167,6 +167,18 @@ def test_after_a_win_the_loser_is_called_off_at_the_deadline_and_counts_once() -
     assert (latencies[B].lost, sum(latencies[B].counts)) == (1, 0)
 
 
+def test_an_answer_from_a_server_given_up_still_counts_but_is_not_measured_twice() -> None:
+    table = Table()
+    table.submit()
+    table.table.on_peer_gone(A, 0.1)
+    table.respond(A, copy=0)
+    assert isinstance(table.events[0], ResponseArrived)
+    latencies = {
+        report.server: report.latency for report in table.measurements.take(table.routes, []).latencies
+    }
+    assert (latencies[A].lost, sum(latencies[A].counts)) == (1, 0)
+
+
 def test_with_no_path_the_request_waits_for_the_first_one_that_comes_up() -> None:
     table = Table()
     for known in SERVERS.values():
