@@ -11,6 +11,7 @@ is small and the same in all rows.
     executor     rclpy.spin; the callback serialises and deserialises request and response, as a bridge does
     wait-set     the same in a loop over one wait set
     wait-set-2   the same; a second thread answers
+    wait-set-rcl the loop over one wait set, with rcl's C functions instead of rclpy's messages: what the bridge does
     two-bridges  a robot's and a cloud's bridge in one process, before a `direct` server in a second
 """
 
@@ -29,13 +30,14 @@ from typing import TYPE_CHECKING, Any
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_for_type_support
 from std_srvs.srv import Empty
 
 from protos.model import NodeName, Role, ServiceName, SessionId
 from sidecar.core.events import ExecuteRequest, ExecutionId, OfferService, RequestFailed, ResponseArrived
 from sidecar.core.rules import ServiceRule
-from sidecar.ros.types import deserialize, serialize
+from sidecar.ros import rcl
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -58,8 +60,8 @@ def say(line: str) -> None:
 
 def bounce(request: Any) -> Any:
     """What a pair of bridges does to an empty request and its response."""
-    deserialize(serialize(request, Empty.Request), Empty.Request)
-    return deserialize(serialize(Empty.Response(), Empty.Response), Empty.Response)
+    deserialize_message(serialize_message(request), Empty.Request)
+    return deserialize_message(serialize_message(Empty.Response()), Empty.Response)
 
 
 def service_names(count: int) -> list[str]:
@@ -96,23 +98,25 @@ def serve(kind: str, services: int) -> None:
     if kind in ("direct", "executor"):
         rclpy.spin(node)
     else:
-        spin_wait_set(handles, rclpy.get_default_context(), second_thread=kind == "wait-set-2")
+        spin_wait_set(kind, handles, rclpy.get_default_context())
 
 
-def spin_wait_set(handles: list[Any], context: Any, *, second_thread: bool) -> None:
+def spin_wait_set(kind: str, handles: list[Any], context: Any) -> None:
     by_pointer = {handle.pointer: handle for handle in handles}
     wait_set = _rclpy.WaitSet(0, 1, 0, 0, len(handles), 0, context.handle)
     guard = _rclpy.GuardCondition(context.handle)
     answers: queue.SimpleQueue[tuple[Any, bytes, Any]] = queue.SimpleQueue()
+    request_type, response_type = rcl.MessageType(Empty.Request), rcl.MessageType(Empty.Response)
+    empty_response = serialize_message(Empty.Response())
 
     def answer_all() -> None:
         while True:
             handle, payload, request_id = answers.get()
-            deserialize(payload, Empty.Request)
-            response = deserialize(serialize(Empty.Response(), Empty.Response), Empty.Response)
+            deserialize_message(payload, Empty.Request)
+            response = deserialize_message(serialize_message(Empty.Response()), Empty.Response)
             handle.service_send_response(response, request_id)
 
-    if second_thread:
+    if kind == "wait-set-2":
         threading.Thread(target=answer_all, daemon=True).start()
     while True:
         wait_set.clear_entities()
@@ -121,13 +125,19 @@ def spin_wait_set(handles: list[Any], context: Any, *, second_thread: bool) -> N
             wait_set.add_service(handle)
         wait_set.wait(10**9)
         for pointer in wait_set.get_ready_entities("service"):
+            if kind == "wait-set-rcl":
+                while (taken := rcl.take_request(pointer, request_type)) is not None:
+                    request_type.deserialize(taken[1])
+                    answer = response_type.serialize(response_type.deserialize(empty_response))
+                    rcl.send_response(pointer, taken[0], response_type.deserialize(answer))
+                continue
             handle = by_pointer[pointer]
             while True:
                 request, header = handle.service_take_request(Empty.Request)
                 if header is None:
                     break
-                if second_thread:
-                    answers.put((handle, serialize(request, Empty.Request), header.request_id))
+                if kind == "wait-set-2":
+                    answers.put((handle, serialize_message(request), header.request_id))
                 else:
                     handle.service_send_response(bounce(request), header.request_id)
 
@@ -272,11 +282,11 @@ def measure(kind: str, services: int, calls: int, period_s: float) -> str:
     took.sort()
     figures = (took[calls // 2], took[int(calls * 0.99)], took[-1], cpu_s / calls)
     cells = " | ".join(f"{figure * 1e6:6.0f}" for figure in figures)
-    return f"| {kind:11} | {services:8} | {period_s * 1e3:9g} | {cells} |"
+    return f"| {kind:12} | {services:8} | {period_s * 1e3:9g} | {cells} |"
 
 
 INTERFACE: Any = "lo"
-KINDS = ("direct", "executor", "wait-set", "wait-set-2", "two-bridges")
+KINDS = ("direct", "executor", "wait-set", "wait-set-2", "wait-set-rcl", "two-bridges")
 
 
 def main() -> None:
@@ -293,8 +303,8 @@ def main() -> None:
     elif options.serve:
         serve(options.serve, options.services[0])
     else:
-        say("| kind        | services | period ms | median us | P99 us | max us | CPU us |")
-        say("| ----------- | -------- | --------- | ------ | ------ | ------ | ------ |")
+        say("| kind         | services | period ms | median us | P99 us | max us | CPU us |")
+        say("| ------------ | -------- | --------- | ------ | ------ | ------ | ------ |")
         for period_ms in options.period_ms:
             for services in options.services:
                 for kind in options.only:

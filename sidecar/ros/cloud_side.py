@@ -11,7 +11,7 @@ from sidecar.core.rules import find_rule
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.service_runner import Execution, ServiceRunner
-from sidecar.ros.types import TypeNotInstalledError, deserialize, load_service_type
+from sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:
     from protos.model import ServiceName
@@ -84,7 +84,7 @@ class CloudSide:
             self.refuse(event, RejectReason.OVERLOADED, f"{MAX_EXECUTIONS} requests are running", now)
             return
         try:
-            request = deserialize(event.payload, runner.type.request)
+            request = runner.type.request.deserialize(event.payload)
         except RosBridgeError as error:
             self.refuse(event, RejectReason.BAD_PAYLOAD, str(error), now)
             return
@@ -123,20 +123,14 @@ class CloudSide:
 
     # -- what the local servers answer -----------------------------------------------------------------------------
 
-    def _answered(
-        self, runner: ServiceRunner, execution: Execution, payload: bytes | RosBridgeError, now: float
-    ) -> None:
+    def _answered(self, runner: ServiceRunner, execution: Execution, payload: bytes, now: float) -> None:
         self._executions.pop(execution.id, None)
         self._stats.pending = len(self._executions)
         self._stats.answers_taken[runner.name] += 1
-        if isinstance(payload, RosBridgeError):
-            self._refuse_executions([execution], runner.name, RejectReason.SERVER_LOST, str(payload))
-            return
         self._data_plane.complete(execution.id, payload, now - execution.arrived_at)
 
-    def _expired(self, runner: ServiceRunner, execution: Execution) -> None:
-        """Its time was over before the server had room for it."""
-        self._refuse_executions([execution], runner.name, RejectReason.OVERLOADED, "expired in the server's queue")
+    def _unsent(self, runner: ServiceRunner, execution: Execution, why: str) -> None:
+        self._refuse_executions([execution], runner.name, RejectReason.OVERLOADED, why)
 
     def _stray(self, _runner: ServiceRunner) -> None:
         """An answer to an abandoned request, or a second answer because two nodes serve one name."""
@@ -210,7 +204,7 @@ class CloudSide:
             return
         try:
             runner = ServiceRunner(
-                self._loop.node, name, load_service_type(type_name), self._answered, self._stray, self._expired
+                self._loop.node, name, load_service_type(type_name), self._answered, self._stray, self._unsent
             )
         except RosBridgeError as error:
             if name not in self._missing_types:

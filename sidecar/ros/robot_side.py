@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from typing import TYPE_CHECKING
 
 from sidecar.core.events import DeadlineMissed, OfferService, RequestFailed, ResponseArrived, WithdrawService
 from sidecar.core.rules import find_rule
@@ -14,7 +12,7 @@ from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.notices import NoticePublisher
 from sidecar.ros.reply_pacer import ReplyPacer
-from sidecar.ros.request_header import RequestNumbering
+from sidecar.ros.request_numbering import RequestNumbering
 from sidecar.ros.service_proxy import ServiceProxy
 from sidecar.ros.types import TypeNotInstalledError, load_service_type
 
@@ -24,6 +22,7 @@ if TYPE_CHECKING:
     from sidecar.core.rules import ServiceRule
     from sidecar.ports import DataPlane
     from sidecar.ros.log_limit import LimitedLog
+    from sidecar.ros.rcl import Message, RmwRequestId
     from sidecar.ros.ros_loop import RosLoop
     from sidecar.ros.stats import BridgeStats
 
@@ -33,6 +32,9 @@ MAX_OFFERED_SERVICES = 512
 """Services that peers may offer; each costs DDS endpoints and a slot in every wait."""
 DISCOVERY_SETTLES_S = 1.0
 """After joining the domain, nothing is offered for so long: servers that run here already must be discovered first."""
+NAME_IS_FREE_S = 0.15
+"""Nobody else must have served a name for so long: two looks. In the cloud's own domain, where robot and cloud may both
+be, the server whose service we are offered was perhaps discovered by the cloud's sidecar a moment before ours."""
 TYPE_RETRY_S = 30.0
 """How often a type that is not installed is looked for again: someone may be installing it."""
 
@@ -42,15 +44,15 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class _Pending:
     proxy: ServiceProxy
-    rmw_request_id: Any
+    rmw_request_id: RmwRequestId
     client: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class _PacedAnswer:
     proxy: ServiceProxy
-    rmw_request_id: Any
-    response: Any
+    rmw_request_id: RmwRequestId
+    response: Message
 
 
 class RobotSide:
@@ -81,6 +83,7 @@ class RobotSide:
         self._pending: dict[RequestId, _Pending] = {}
         self._missing_types: dict[ServiceName, str] = {}
         self._left_alone: dict[ServiceName, frozenset[str]] = {}
+        self._free_since: dict[ServiceName, float] = {}
         self._types_retried_at = 0.0
         self._settled_at = now + DISCOVERY_SETTLES_S
         self.look_is_due = False
@@ -138,19 +141,19 @@ class RobotSide:
             return
         answer = _PacedAnswer(pending.proxy, pending.rmw_request_id, response)
         if self._pacer.offer(pending.client, answer, now):
-            self._send(answer)
+            self._send(answer, now)
         else:
             self._stats.answers_paced += 1
 
-    def _send(self, answer: _PacedAnswer) -> None:
+    def _send(self, answer: _PacedAnswer, now: float) -> None:
         service = answer.proxy.name
         if not answer.proxy.open:
             self._stats.dropped["response_without_request"] += 1
             return
         try:
             answer.proxy.answer(answer.rmw_request_id, answer.response)
-        except _rclpy.RCLError:
-            log.exception("%s: rmw could not send an answer", service)
+        except RosBridgeError as error:
+            self._limited.log(logging.ERROR, ("rmw_error", service), now, "%s: answer lost: %s", service, error)
             self._stats.unanswered[service, "rmw_error"] += 1
             return
         self._stats.answers_sent[service] += 1
@@ -194,13 +197,14 @@ class RobotSide:
             return
         self._missing_types.pop(event.name, None)
         self._left_alone.pop(event.name, None)
+        self._free_since.pop(event.name, None)
         if self._close_proxy(event.name):
             log.info("service %s is withdrawn: %s", event.name, event.reason)
         self._publish_state()
 
     # -- what applications ask -----------------------------------------------------------------------------------
 
-    def _submit(self, proxy: ServiceProxy, rmw_request_id: Any, payload: bytes, now: float) -> None:
+    def _submit(self, proxy: ServiceProxy, rmw_request_id: RmwRequestId, payload: bytes, now: float) -> None:
         self._stats.requests_taken[proxy.name] += 1
         request_id, client = self._numbering.identify(rmw_request_id)
         self._pacer.request_taken(client, now)
@@ -229,7 +233,7 @@ class RobotSide:
     def look(self, now: float) -> None:
         """Compare the graph with what is offered; create and withdraw proxies accordingly."""
         self.look_is_due = False
-        if not self._offers or now < self._settled_at:
+        if not self._offers:
             return
         served = graph.scan(self._loop.node)
         self._stats.scans += 1
@@ -239,7 +243,11 @@ class RobotSide:
         for name, type_name in self._offers.items():
             others = self._servers_in_our_way(name, served.get(name))
             if others:
+                self._free_since.pop(name, None)
                 self._leave_alone(name, others)
+                continue
+            free_since = self._free_since.setdefault(name, now)
+            if now < self._settled_at or now - free_since < NAME_IS_FREE_S:
                 continue
             if self._left_alone.pop(name, None):
                 log.info("service %s: no other node serves it any more", name)
@@ -314,7 +322,7 @@ class RobotSide:
         """Send the answers that were held back for their clients' sake."""
         if self._pacer.queued:
             for answer in self._pacer.take_due(now):
-                self._send(answer)
+                self._send(answer, now)
 
     def close(self) -> None:
         """Withdraw every proxy."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.rcl import Message, RmwRequestId, send_response, take_request
 from sidecar.ros.ros_loop import service_qos
-from sidecar.ros.types import deserialize, serialize
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,7 +26,7 @@ class ServiceProxy:
         node: Any,
         name: ServiceName,
         service_type: ServiceType,
-        on_request: Callable[[ServiceProxy, Any, bytes, float], None],
+        on_request: Callable[[ServiceProxy, RmwRequestId, bytes, float], None],
         on_bad_request: Callable[[ServiceProxy, RosBridgeError, float], None],
     ) -> None:
         self.name = name
@@ -40,6 +40,7 @@ class ServiceProxy:
         # rclpy validates names with exceptions of several unrelated classes.
         except Exception as error:
             raise RosBridgeError(f"rmw refuses service {name} of type {service_type.name}: {error}") from error
+        self._pointer: int = self._service.handle.pointer
 
     @property
     def handle(self) -> Any:
@@ -48,31 +49,29 @@ class ServiceProxy:
 
     def take(self, now: float) -> None:
         """Take the requests that have arrived."""
-        request_type = self.type.request
         for _ in range(TAKEN_AT_ONCE):
-            request, header = self._service.handle.service_take_request(request_type)
-            if header is None:
-                return
             try:
-                payload = serialize(request, request_type)
+                taken = take_request(self._pointer, self.type.request)
             except RosBridgeError as error:
                 self._on_bad_request(self, error, now)
                 continue
-            self._on_request(self, header.request_id, payload, now)
+            if taken is None:
+                return
+            self._on_request(self, *taken, now)
 
-    def parse_answer(self, payload: bytes) -> Any:
+    def parse_answer(self, payload: bytes) -> Message:
         """Return the response in `payload`, or raise RosBridgeError."""
-        return deserialize(payload, self.type.response)
+        return self.type.response.deserialize(payload)
 
-    def answer(self, request_id: Any, response: Any) -> None:
-        """Answer the request with this rmw id; raises rclpy's RCLError when rmw cannot."""
-        self._service.handle.service_send_response(response, request_id)
+    def answer(self, request_id: RmwRequestId, response: Message) -> None:
+        """Answer the request with this rmw id, or raise RosBridgeError."""
+        send_response(self._pointer, request_id, response)
 
     def close(self) -> int:
         """Withdraw the service; return how many requests lay there unseen."""
         self.open = False
         unseen = 0
-        while self._service.handle.service_take_request(self.type.request)[1] is not None:
+        while take_request(self._pointer, self.type.request) is not None:
             unseen += 1
         self._node.destroy_service(self._service)
         return unseen

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.rcl import Message, send_request, take_response
 from sidecar.ros.request_window import RequestWindow
 from sidecar.ros.ros_loop import service_qos
-from sidecar.ros.types import serialize
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,17 +21,16 @@ TAKEN_AT_ONCE = 32
 """Answers taken from one server before the others have their turn."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Execution:
     """One request on its way through a local server."""
 
     id: ExecutionId
-    request: Any
+    request: Message | None
     arrived_at: float
     expires_at: float
     number: int | None = None
     """rmw's sequence number, once it is at the server."""
-    abandoned: bool = False
 
 
 class ServiceRunner:
@@ -42,16 +41,16 @@ class ServiceRunner:
         node: Any,
         name: ServiceName,
         service_type: ServiceType,
-        on_answer: Callable[[ServiceRunner, Execution, bytes | RosBridgeError, float], None],
+        on_answer: Callable[[ServiceRunner, Execution, bytes, float], None],
         on_stray_answer: Callable[[ServiceRunner], None],
-        on_expired: Callable[[ServiceRunner, Execution], None],
+        on_unsent: Callable[[ServiceRunner, Execution, str], None],
     ) -> None:
         self.name = name
         self.type = service_type
         self._node = node
         self._on_answer = on_answer
         self._on_stray_answer = on_stray_answer
-        self._on_expired = on_expired
+        self._on_unsent = on_unsent
         self._at_server: dict[int, Execution] = {}
         """By rmw's sequence number."""
         self.window: RequestWindow[Execution] = RequestWindow()
@@ -62,6 +61,7 @@ class ServiceRunner:
         # rclpy validates names with exceptions of several unrelated classes.
         except Exception as error:
             raise RosBridgeError(f"rmw refuses a client of {name}, type {service_type.name}: {error}") from error
+        self._pointer: int = self._client.handle.pointer
 
     @property
     def handle(self) -> Any:
@@ -86,47 +86,45 @@ class ServiceRunner:
     def release(self, now: float) -> None:
         """Send what may be sent now."""
         for execution in self.window.release(now):
-            if execution.abandoned:
+            request, execution.request = execution.request, None  # it may be a large image, and is not needed again
+            if request is None or execution.expires_at <= now:
+                self._on_unsent(self, execution, "its time was over before the server had room for it")
                 continue
-            if execution.expires_at <= now:
-                self._on_expired(self, execution)
+            try:
+                number = send_request(self._pointer, request)
+            except RosBridgeError as error:
+                self._on_unsent(self, execution, str(error))
                 continue
-            number = self._client.handle.send_request(execution.request)
-            execution.request = None  # it may be a large image, and is not needed again
             execution.number = number
             self._at_server[number] = execution
             self.window.sent(number, now)
 
     def take(self, now: float) -> None:
         """Take the answers that have arrived."""
-        response_type = self.type.response
         for _ in range(TAKEN_AT_ONCE):
-            header, response = self._client.handle.take_response(response_type)
-            if header is None:
+            taken = take_response(self._pointer, self.type.response)
+            if taken is None:
                 break
-            number = header.request_id.sequence_number
+            number, payload = taken
             self.window.answered(number, now)
             execution = self._at_server.pop(number, None)
             if execution is None:
                 self._on_stray_answer(self)
-                continue
-            try:
-                payload: bytes | RosBridgeError = serialize(response, response_type)
-            except RosBridgeError as error:
-                payload = error
-            self._on_answer(self, execution, payload, now)
+            else:
+                self._on_answer(self, execution, payload, now)
         self.release(now)
 
     def abandon(self, execution: Execution) -> None:
         """Forget `execution`; an answer to it is stray from now on."""
-        execution.abandoned = True
         if execution.number is not None:
             self._at_server.pop(execution.number, None)
+        else:
+            self.window.waiting.remove(execution)
 
     def take_back(self) -> tuple[list[Execution], list[Execution]]:
         """Forget everything; return (executions that may have run, executions that certainly have not)."""
         sent = list(self._at_server.values())
-        unsent = [execution for execution in self.window.waiting if not execution.abandoned]
+        unsent = list(self.window.waiting)
         self._at_server.clear()
         self.window = RequestWindow()
         return sent, unsent

@@ -1,4 +1,4 @@
-"""Service types by name, and messages to and from bytes (CDR with its 4-byte encapsulation header).
+"""Service types by name.
 
 The name of a type comes from another machine, so only the form `package/srv/Name` is looked up: never a module of
 any other kind.
@@ -11,10 +11,10 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.type_support import check_for_type_support
 
 from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.rcl import MessageType
 
 _SERVICE_TYPE = re.compile(r"([a-z][a-z0-9_]{0,254})/srv/([A-Z][A-Za-z0-9]{0,254})")
 
@@ -29,8 +29,9 @@ class ServiceType:
 
     name: str
     service: Any
-    request: Any
-    response: Any
+    """The class that rclpy makes services and clients of."""
+    request: MessageType
+    response: MessageType
 
 
 def load_service_type(name: str) -> ServiceType:
@@ -56,25 +57,4 @@ def load_service_type(name: str) -> ServiceType:
         raise TypeNotInstalledError(
             f"service type {name} is installed without usable type support ({error}): reinstall the package {package!r}"
         ) from error
-    return ServiceType(name, service, service.Request, service.Response)
-
-
-def serialize(message: Any, message_type: Any) -> bytes:
-    """Return the bytes of `message`, or raise RosBridgeError when a field holds what cannot be serialised."""
-    try:
-        payload: bytes = _rclpy.rclpy_serialize(message, message_type)
-    except (_rclpy.RMWError, _rclpy.RCLError, TypeError, ValueError) as error:
-        raise RosBridgeError(f"cannot serialise {message_type.__name__}: {error}") from error
-    return payload
-
-
-def deserialize(payload: bytes, message_type: Any) -> Any:
-    """Return the message in `payload`, or raise RosBridgeError.
-
-    The type support checks lengths against the bytes that are there, so hostile bytes neither crash nor make it
-    allocate more than a small multiple of their size (tests/ros/test_hostile_bytes.py).
-    """
-    try:
-        return _rclpy.rclpy_deserialize(payload, message_type)
-    except (_rclpy.RMWError, _rclpy.RCLError, TypeError, ValueError) as error:
-        raise RosBridgeError(f"the bytes are not a {message_type.__name__}: {error}") from error
+    return ServiceType(name, service, MessageType(service.Request), MessageType(service.Response))

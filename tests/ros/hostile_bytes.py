@@ -15,12 +15,13 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.serialization import serialize_message
 from rclpy.type_support import check_for_type_support
 from sensor_msgs.msg import CompressedImage, PointCloud2
 from std_srvs.srv import Empty, SetBool, Trigger
 
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.types import deserialize, serialize
+from sidecar.ros.rcl import MessageType
 
 ADDRESS_SPACE_BYTES = 3 << 30
 """Generous for rclpy's libraries, and less than one array of 2**32 - 1 poses."""
@@ -69,14 +70,13 @@ def main() -> None:
     rng = random.Random(seed)
     originals = []
     for message in samples():
-        kind = type(message)
-        check_for_type_support(kind)
-        originals.append((kind, serialize(message, kind)))
+        check_for_type_support(type(message))
+        originals.append((MessageType(type(message)), serialize_message(message)))
     accepted = 0
     for _ in range(count):
         kind, payload = rng.choice(originals)
         try:
-            deserialize(damage(payload, rng), kind)
+            kind.deserialize(damage(payload, rng))
         except RosBridgeError:
             continue
         accepted += 1

@@ -1,0 +1,239 @@
+"""Requests and answers as bytes, through rcl's public C functions.
+
+rclpy hands services' messages over as Python objects only, and makes and reads them field by field: 20 to 50
+microseconds for each pose of a path, with the interpreter lock held. The bridge wants bytes. So it lets rclpy create
+the services and clients, and takes and sends through the C functions that rclpy itself calls, with the C messages that
+each type's own type support makes. What is used of the C structures, the same since ROS 2 Humble:
+
+    rmw_request_id_t       { uint8_t writer_guid[16]; int64_t sequence_number; }
+    rcutils_uint8_array_t  { uint8_t * buffer; size_t length, capacity; rcutils_allocator_t allocator; }
+
+Functions are called with the interpreter lock held where that takes microseconds, and without it where they may block
+or move much memory. All of this belongs to one thread: rcl keeps its error text per thread.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from typing import Any
+
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+
+from sidecar.ros.errors import RosBridgeError
+
+_OK = 0
+_CLIENT_TAKE_FAILED = 501
+_SERVICE_TAKE_FAILED = 601
+_ERROR_TEXT_BYTES = 1024
+"""RCUTILS_ERROR_MESSAGE_MAX_LENGTH"""
+LARGE_MESSAGE_BYTES = 65_536
+"""From here on a copy takes longer than handing the interpreter lock to another thread and back (tens of µs)."""
+
+FIRST_BUFFER_BYTES = 4096
+"""Enough for most requests; it doubles as it must."""
+
+
+class RclError(RosBridgeError):
+    """rcl or rmw could not do what it was asked, for a reason other than the bytes."""
+
+
+class RmwRequestId(ctypes.Structure):
+    """Which client asked, and its number there."""
+
+    _fields_ = (("writer_guid", ctypes.c_uint8 * 16), ("sequence_number", ctypes.c_int64))
+
+
+class _Allocator(ctypes.Structure):
+    _fields_ = tuple(
+        (name, ctypes.c_void_p) for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")
+    )
+
+
+class _Bytes(ctypes.Structure):
+    _fields_ = (
+        ("buffer", ctypes.c_void_p),
+        ("length", ctypes.c_size_t),
+        ("capacity", ctypes.c_size_t),
+        ("allocator", _Allocator),
+    )
+
+
+class _ErrorText(ctypes.Structure):
+    _fields_ = (("text", ctypes.c_char * _ERROR_TEXT_BYTES),)
+
+
+class _Functions:
+    """The C functions, by a loader that holds (PyDLL) or releases (CDLL) the interpreter lock."""
+
+    def __init__(self, loader: Any) -> None:
+        # The very library that rclpy has loaded, never another; its symbols include those of rmw and rcutils below it.
+        rcl = loader("librcl.so", mode=os.RTLD_NOW | os.RTLD_NOLOAD)
+        pointer, status = ctypes.c_void_p, ctypes.c_int
+        request_id = ctypes.POINTER(RmwRequestId)
+        self.take_request = _prototype(rcl.rcl_take_request, status, pointer, request_id, pointer)
+        self.take_response = _prototype(rcl.rcl_take_response, status, pointer, request_id, pointer)
+        self.send_response = _prototype(rcl.rcl_send_response, status, pointer, request_id, pointer)
+        self.send_request = _prototype(rcl.rcl_send_request, status, pointer, pointer, ctypes.POINTER(ctypes.c_int64))
+        self.serialize = _prototype(rcl.rmw_serialize, status, pointer, pointer, ctypes.POINTER(_Bytes))
+        self.deserialize = _prototype(rcl.rmw_deserialize, status, ctypes.POINTER(_Bytes), pointer, pointer)
+        self.default_allocator = _prototype(rcl.rcutils_get_default_allocator, _Allocator)
+        self.bytes_init = _prototype(
+            rcl.rcutils_uint8_array_init,
+            status,
+            ctypes.POINTER(_Bytes),
+            ctypes.c_size_t,
+            ctypes.POINTER(_Allocator),
+        )
+        self.bytes_resize = _prototype(rcl.rcutils_uint8_array_resize, status, ctypes.POINTER(_Bytes), ctypes.c_size_t)
+        self.bytes_fini = _prototype(rcl.rcutils_uint8_array_fini, status, ctypes.POINTER(_Bytes))
+        self.error_text = _prototype(rcl.rcutils_get_error_string, _ErrorText)
+        self.reset_error = _prototype(rcl.rcutils_reset_error, None)
+
+
+def _prototype(function: Any, result: Any, *arguments: Any) -> Any:
+    function.restype = result
+    function.argtypes = arguments
+    return function
+
+
+_rclpy.rclpy_get_rmw_implementation_identifier()  # loads rclpy's C part, and librcl with it
+_holding = _Functions(ctypes.PyDLL)
+_releasing = _Functions(ctypes.CDLL)
+
+_capsule_name = _prototype(ctypes.pythonapi.PyCapsule_GetName, ctypes.c_char_p, ctypes.py_object)
+_capsule_pointer = _prototype(ctypes.pythonapi.PyCapsule_GetPointer, ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)
+_Create = ctypes.PYFUNCTYPE(ctypes.c_void_p)
+_Destroy = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)
+
+
+def _unwrap(capsule: Any) -> int:
+    return int(_capsule_pointer(capsule, _capsule_name(capsule)))
+
+
+def _take_error() -> str:
+    text: bytes = _holding.error_text().text
+    _holding.reset_error()
+    return text.decode(errors="replace")
+
+
+class Message:
+    """A C message; freed with this object."""
+
+    __slots__ = ("_destroy", "pointer")
+
+    def __init__(self, pointer: int, destroy: Any) -> None:
+        self.pointer = pointer
+        self._destroy = destroy
+
+    def __del__(self) -> None:
+        self._destroy(self.pointer)
+
+
+class MessageType:
+    """A generated message class whose type support is loaded, to and from bytes (CDR with its 4-byte header)."""
+
+    __slots__ = ("_buffer", "_clean_capacity", "_create", "_destroy", "_last_length", "_type_support", "name")
+
+    def __init__(self, message_class: Any) -> None:
+        self.name: str = message_class.__name__
+        meta = type(message_class)
+        self._type_support = _unwrap(meta._TYPE_SUPPORT)
+        self._create = _Create(_unwrap(meta._CREATE_ROS_MESSAGE))
+        self._destroy = _Destroy(_unwrap(meta._DESTROY_ROS_MESSAGE))
+        self._last_length = 0
+        self._buffer = _Bytes()
+        if _holding.bytes_init(self._buffer, 0, _holding.default_allocator()) != _OK:
+            raise RclError(f"cannot make a buffer: {_take_error()}")
+        self._clean_capacity = 0
+        self._grow_buffer(FIRST_BUFFER_BYTES)
+
+    def __del__(self) -> None:
+        _holding.bytes_fini(self._buffer)
+
+    def functions(self) -> _Functions:
+        """The variant to call with the next message of this type, judged by the last one."""
+        return _releasing if self._last_length >= LARGE_MESSAGE_BYTES else _holding
+
+    def new(self) -> Message:
+        """Return an empty message."""
+        pointer = self._create()
+        if not pointer:
+            raise RclError(f"cannot make a {self.name}")
+        return Message(pointer, self._destroy)
+
+    def serialize(self, message: Message) -> bytes:
+        """Return the bytes of `message`."""
+        # Fast CDR does not write padding: what lay in the buffer, an earlier message or other memory of this process,
+        # must not go to a peer in it. So the buffer is clean before, and what made it grow is done again.
+        buffer = self._buffer
+        ctypes.memset(buffer.buffer, 0, buffer.length)
+        self._fill_buffer(message)
+        if buffer.capacity != self._clean_capacity:
+            self._grow_buffer(2 * buffer.capacity)
+            self._fill_buffer(message)
+        self._last_length = buffer.length
+        return ctypes.string_at(buffer.buffer, buffer.length)
+
+    def _fill_buffer(self, message: Message) -> None:
+        if self.functions().serialize(message.pointer, self._type_support, self._buffer) != _OK:
+            raise RclError(f"cannot serialise {self.name}: {_take_error()}")
+
+    def _grow_buffer(self, capacity: int) -> None:
+        if _holding.bytes_resize(self._buffer, capacity) != _OK:
+            raise RclError(f"no memory for {capacity} bytes: {_take_error()}")
+        ctypes.memset(self._buffer.buffer, 0, capacity)
+        self._clean_capacity = capacity
+
+    def deserialize(self, payload: bytes) -> Message:
+        """Return the message in `payload`, or raise RosBridgeError.
+
+        The type support checks lengths against the bytes that are there, so hostile bytes neither crash nor make it
+        allocate more than a small multiple of their size (tests/ros/hostile_bytes.py).
+        """
+        message = self.new()
+        self._last_length = len(payload)
+        view = _Bytes(ctypes.cast(ctypes.c_char_p(payload), ctypes.c_void_p), len(payload), len(payload))
+        if self.functions().deserialize(view, self._type_support, message.pointer) != _OK:
+            raise RosBridgeError(f"the bytes are not a {self.name}: {_take_error()}")
+        return message
+
+
+def take_request(service: int, request_type: MessageType) -> tuple[RmwRequestId, bytes] | None:
+    """Take the next request from the rcl service at this address, if there is one."""
+    request_id = RmwRequestId()
+    message = request_type.new()
+    status = request_type.functions().take_request(service, request_id, message.pointer)
+    if status == _SERVICE_TAKE_FAILED:
+        return None
+    if status != _OK:
+        raise RclError(f"cannot take a request ({status}): {_take_error()}")
+    return request_id, request_type.serialize(message)
+
+
+def take_response(client: int, response_type: MessageType) -> tuple[int, bytes] | None:
+    """Take the next response to the rcl client at this address: (number of its request, bytes)."""
+    request_id = RmwRequestId()
+    message = response_type.new()
+    status = response_type.functions().take_response(client, request_id, message.pointer)
+    if status == _CLIENT_TAKE_FAILED:
+        return None
+    if status != _OK:
+        raise RclError(f"cannot take a response ({status}): {_take_error()}")
+    return request_id.sequence_number, response_type.serialize(message)
+
+
+def send_response(service: int, request_id: RmwRequestId, response: Message) -> None:
+    """Answer a request; rmw may wait up to 0.1 s for a client it has only just discovered."""
+    status = _releasing.send_response(service, request_id, response.pointer)
+    if status != _OK:
+        raise RclError(f"cannot send a response ({status}): {_take_error()}")
+
+
+def send_request(client: int, request: Message) -> int:
+    """Send a request; return the number that rmw gave it."""
+    number = ctypes.c_int64()
+    status = _releasing.send_request(client, request.pointer, number)
+    if status != _OK:
+        raise RclError(f"cannot send a request ({status}): {_take_error()}")
+    return number.value

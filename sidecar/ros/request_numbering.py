@@ -1,0 +1,33 @@
+"""The identity of each request that a local application makes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.request_id import make_request_id
+
+if TYPE_CHECKING:
+    from protos.model import SessionId
+    from sidecar.core.events import RequestId
+    from sidecar.ros.rcl import RmwRequestId
+
+
+class RequestNumbering:
+    """Names each request by session, writer guid and sequence number, so that no name comes twice.
+
+    Fast DDS makes its guids of host, process number and 16 random bits, so a client that is restarted for ever in a
+    container may meet one of its own old ones. The number of arrival in this session therefore goes into the name too.
+    """
+
+    __slots__ = ("_arrivals", "_session")
+
+    def __init__(self, session: SessionId) -> None:
+        self._session = session
+        self._arrivals = 0
+
+    def identify(self, rmw_request_id: RmwRequestId) -> tuple[RequestId, bytes]:
+        """Return (id of the request, guid of its client)."""
+        self._arrivals += 1
+        guid = bytes(rmw_request_id.writer_guid)
+        identity = guid + self._arrivals.to_bytes(8, "big")
+        return make_request_id(self._session, identity, rmw_request_id.sequence_number), guid
