@@ -1,0 +1,320 @@
+"""The documentation says what the programs do: keys, metrics, log lines, limits, links."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from controlplane.config import ControlPlaneConfig
+from controlplane.core.control import ControlCore
+from controlplane.metrics import Metrics
+from protos.histogram import Histogram
+from protos.model import InterfaceName, ServiceName
+from sidecar.config import SidecarConfig
+from sidecar.core.control_session import ControlStats
+from sidecar.core.stats import EngineStats, LinkStats
+from sidecar.metrics import MetricSources, SidecarCollector
+from sidecar.ros.stats import BridgeStats
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from prometheus_client import Metric
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(
+    path
+    for pattern in ("README.md", "docs/**/*.md", "deploy/**/*.md", "examples/**/*.md")
+    for path in ROOT.glob(pattern)
+)
+
+
+def read(page: str) -> str:
+    return (DOCS / page).read_text(encoding="utf-8")
+
+
+def section(text: str, heading: str) -> str:
+    """What stands under a second-level heading."""
+    return text.split(f"\n## {heading}\n", 1)[1].split("\n## ", 1)[0]
+
+
+def rows(text: str) -> Iterator[list[str]]:
+    """Yield the cells of every table row."""
+    for line in text.splitlines():
+        if line.startswith("| ") and not line.startswith("| ---"):
+            yield [cell.strip() for cell in line.strip("|").split(" | ")]
+
+
+# -- configuration ------------------------------------------------------------------------------------------------
+
+
+def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every key as the page writes it, with its default."""
+    for name, field in model.model_fields.items():
+        yield prefix + name, field.default
+        nested, mark = _nested(field.annotation)
+        if nested is not None:
+            yield from keys_of(nested, f"{prefix}{name}{mark}.")
+
+
+def _nested(annotation: Any) -> tuple[type[BaseModel] | None, str]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation, ""
+    for inner in getattr(annotation, "__args__", ()):
+        found, _ = _nested(inner)
+        if found is not None:
+            return found, "[]"
+    return None, ""
+
+
+def documented_keys(program: str) -> dict[str, list[str]]:
+    table = rows(section(read("configuration.md"), f"`{program}`"))
+    return {cells[0].strip("`"): cells for cells in table if cells[0].startswith("`")}
+
+
+@pytest.mark.parametrize(
+    ("program", "model"), [("plr-sidecar", SidecarConfig), ("plr-controlplane", ControlPlaneConfig)]
+)
+def test_every_key_is_documented_and_no_other(program: str, model: type[BaseModel]) -> None:
+    assert sorted(documented_keys(program)) == sorted(key for key, _ in keys_of(model))
+
+
+@pytest.mark.parametrize(
+    ("program", "model", "column"),
+    [("plr-sidecar", SidecarConfig, 3), ("plr-controlplane", ControlPlaneConfig, 2)],
+)
+def test_documented_defaults_are_the_real_ones(program: str, model: type[BaseModel], column: int) -> None:
+    documented = documented_keys(program)
+    checked = 0
+    for key, default in keys_of(model):
+        if isinstance(default, (bool, int, float, str)):
+            cell = documented[key][column]
+            shown = str(default).lower() if isinstance(default, bool) else str(default)
+            assert cell == f"`{shown}`", key
+            checked += 1
+        elif default is PydanticUndefined and model.model_fields.get(key, None) is not None:
+            required = model.model_fields[key].is_required()
+            assert (documented[key][column] == "required") == required, key
+    assert checked >= 2
+
+
+# -- metrics ------------------------------------------------------------------------------------------------------
+
+
+def _sidecar_metrics() -> Iterator[Metric]:
+    engine = EngineStats(durations={ServiceName("/s"): Histogram()})
+    sources = MetricSources(
+        name="robot",
+        role="robot",
+        version="0",
+        engine=lambda: engine,
+        links=lambda: [LinkStats(InterfaceName("wlan0"), paths={})],
+        control=ControlStats,
+        connected=lambda: True,
+        bridge=lambda: BridgeStats(unanswered=Counter({(ServiceName("/s"), "failed"): 1})),
+        state_failures=dict,
+    )
+    yield from SidecarCollector(sources).collect()
+
+
+def _control_metrics() -> Iterator[Metric]:
+    from controlplane.core.control_events import Settings
+
+    metrics = Metrics()
+    metrics.update(ControlCore(Settings(), version_epoch=1, now=0.0), (), 0, 0.0)
+    yield from metrics.registry.collect()
+
+
+def exported_names(metrics: Iterator[Metric]) -> set[str]:
+    suffix = {"counter": "_total", "info": "_info"}
+    return {metric.name + suffix.get(metric.type, "") for metric in metrics}
+
+
+def exported() -> set[str]:
+    return exported_names(_sidecar_metrics()) | exported_names(_control_metrics())
+
+
+def test_every_metric_is_documented() -> None:
+    in_tables = {cells[0].strip("`") for cells in rows(read("metrics.md")) if cells[0].startswith("`plr_")}
+    assert in_tables == exported()
+
+
+def test_no_page_names_a_metric_that_does_not_exist() -> None:
+    known = exported() | {name + end for name in exported() for end in ("_bucket", "_sum", "_count")}
+    for page in PAGES:
+        for name in re.findall(
+            r"\bplr_[a-z_]+_(?:total|seconds|bucket|version|info|up|ratio)\b", page.read_text()
+        ):
+            assert name in known, f"{page}: {name}"
+
+
+def test_every_alert_is_named() -> None:
+    rules = (ROOT / "deploy/prometheus/plr-rules.yml").read_text()
+    alerts = re.findall(r"- alert: (\w+)", rules)
+    assert alerts
+    assert [name for name in alerts if f"`{name}`" not in section(read("metrics.md"), "Alerts")] == []
+
+
+# -- log lines ----------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _program_texts() -> tuple[str, ...]:
+    """All string constants of the programs; an f-string gives one for each of its parts."""
+    return tuple(
+        node.value
+        for package in ("sidecar", "controlplane", "protos")
+        for path in (ROOT / package).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
+
+
+@functools.cache
+def _whole_texts() -> frozenset[str]:
+    return frozenset(text.strip(PUNCTUATION) for text in _program_texts())
+
+
+PUNCTUATION = " :;,()"
+
+
+def is_written(text: str) -> bool:
+    """Whether constants hold the text: as a whole, or in pieces of several words or whole constants."""
+    words = text.split()
+    while words:
+        for count in range(len(words), 0, -1):
+            piece = " ".join(words[:count]).strip(PUNCTUATION)
+            if piece in _whole_texts() or (count > 1 and any(piece in known for known in _program_texts())):
+                break
+        else:
+            return False
+        del words[:count]
+    return True
+
+
+def log_lines() -> list[str]:
+    """The lines that troubleshooting.md quotes: the first column of its tables with the heading "log line"."""
+    found = []
+    inside = False
+    for line in read("troubleshooting.md").splitlines():
+        if line.startswith("| log line"):
+            inside = True
+        elif not line.startswith("|"):
+            inside = False
+        elif inside and not line.startswith("| ---"):
+            cell = line.split(" | ")[0].removeprefix("| ")
+            if cell.startswith("`"):
+                found.append(cell.strip("`"))
+    return found
+
+
+@pytest.mark.parametrize("line", log_lines())
+def test_the_programs_write_the_quoted_line(line: str) -> None:
+    fragments = [fragment for fragment in line.split("…") if len(fragment.strip(PUNCTUATION)) > 2]
+    assert fragments
+    assert [fragment for fragment in fragments if not is_written(fragment)] == []
+
+
+def test_a_line_that_nobody_writes_is_noticed() -> None:
+    assert not is_written("control plane quietly eaten by wolves")
+
+
+# -- limits -------------------------------------------------------------------------------------------------------
+
+
+def _constants(path: Path) -> dict[str, object]:
+    """Module-level constants that are numbers, or products and shifts of numbers."""
+    found: dict[str, object] = {}
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            # Only literals and arithmetic on them: names would need the module.
+            if not any(isinstance(part, (ast.Name, ast.Call)) for part in ast.walk(node.value)):
+                found[node.targets[0].id] = eval(compile(ast.Expression(node.value), str(path), "eval"))
+    return found
+
+
+def limit_rows() -> list[tuple[str, str, str]]:
+    found = []
+    for cells in rows(read("limits.md")):
+        match = re.fullmatch(r"`([a-z_/]+\.py)` `([A-Z_0-9]+)`", cells[-1])
+        if match:
+            found.append((match[1], match[2], cells[1]))
+    return found
+
+
+UNITS = {"B": 1, "kB": 1000, "KiB": 1024, "MiB": 1 << 20, "s": 1, "ms": 1e-3}
+
+
+@pytest.mark.parametrize(("path", "name", "shown"), limit_rows())
+def test_limits_have_the_documented_value(path: str, name: str, shown: str) -> None:
+    number, _, unit = shown.partition(" ")
+    assert _constants(ROOT / path)[name] == float(number) * UNITS.get(unit, 1)
+
+
+# -- links --------------------------------------------------------------------------------------------------------
+
+
+def anchor(heading: str) -> str:
+    """The anchor that forges make of a heading."""
+    text = re.sub(r"[`*]", "", heading).strip().lower()
+    return re.sub(r"[^\w\- ]", "", text).replace(" ", "-")
+
+
+def links() -> Iterator[tuple[Path, str]]:
+    for page in PAGES:
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            if "://" not in target:
+                yield page, target
+
+
+def test_internal_links_resolve() -> None:
+    broken = []
+    for page, target in links():
+        path, _, fragment = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        if not file.exists():
+            broken.append(f"{page.relative_to(ROOT)}: {target}")
+        elif fragment:
+            headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            if fragment not in {anchor(heading) for heading in headings}:
+                broken.append(f"{page.relative_to(ROOT)}: {target}")
+    assert broken == []
+
+
+def test_every_page_is_linked_from_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert [page.name for page in DOCS.glob("*.md") if f"(docs/{page.name})" not in readme] == []
+
+
+def test_architecture_names_files_that_exist() -> None:
+    named = re.findall(
+        r"`((?:sidecar|controlplane|protos|bench|tests|deploy)/[\w./]+)`", read("architecture.md")
+    )
+    assert len(named) > 20
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_sources_name_pages_that_exist() -> None:
+    sources = [
+        path
+        for folder in ("sidecar", "controlplane", "protos", "bench", "deploy")
+        for path in (ROOT / folder).rglob("*")
+    ]
+    broken = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sources
+        if path.suffix in {".py", ".sh", ".yaml", ".yml", ".service", ".proto"}
+        for name in re.findall(r"docs/[\w./-]+\.md", path.read_text(encoding="utf-8"))
+        if not (ROOT / name).exists()
+    ]
+    assert broken == []
