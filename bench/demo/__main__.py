@@ -37,7 +37,7 @@ ROBOTS = {"wlan0 alone": ("wlan0",), "wwan0 alone": ("wwan0",), "PLR, both": ("w
 CLOUDS = ("cloud_a", "cloud_b")
 _PROGRESS = re.compile(r"sent\s+(\d+)\s+unanswered\s+(\d+).*late\s+(\d+).*median\s+(\S+)(?: ms)?, worst\s+(\S+)")
 
-console = Console(highlight=False)
+console = Console(highlight=False, soft_wrap=True)
 
 
 class DemoStage(Stage):

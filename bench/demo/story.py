@@ -70,8 +70,11 @@ def _wwan_dark(stage: Stage) -> None:
     stage.blackhole("wwan0")
 
 
-def _cloud_killed(stage: Stage) -> None:
+def _wwan_back(stage: Stage) -> None:
     stage.restore("wwan0")
+
+
+def _cloud_killed(stage: Stage) -> None:
     stage.kill_cloud()
 
 
@@ -85,12 +88,14 @@ def _control_back(stage: Stage) -> None:
 
 
 PHASES = (
-    Phase("both links good", 10, _nothing),
+    Phase("both links good", 8, _nothing),
     Phase("wlan0 dark", 10, _wlan_dark, "#d8d8e8"),
     Phase("both links good", 5, _wlan_back),
     Phase("wwan0 dark", 10, _wwan_dark, "#e8d8d8"),
-    Phase("cloud_b killed -9", 10, _cloud_killed, "#f4e3c4"),
-    Phase("control plane killed -9", 10, _control_killed, "#dcecd8"),
+    Phase("both links good", 5, _wwan_back),
+    Phase("cloud_b killed -9", 9, _cloud_killed, "#f4e3c4"),
+    Phase("control plane killed -9", 8, _control_killed, "#dcecd8"),
     Phase("control plane back", 5, _control_back),
 )
-"""A minute at the default length."""
+"""A minute at the default length. A rest follows each darkness: the robot with that carrier only then hands a backlog to
+the servers that all three share."""

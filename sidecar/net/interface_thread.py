@@ -17,6 +17,8 @@ from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
 from sidecar.core.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
+from sidecar.core.link_events import PathChanged
+from sidecar.net.path_log import PathLog
 from sidecar.net.sockets import normalise, to_sockaddr
 
 if TYPE_CHECKING:
@@ -76,6 +78,7 @@ class InterfaceThread:
         # file that got the same number.
         weakref.finalize(self, os.close, self._wake_fd)
         self._unsent: deque[tuple[Address, bytes]] = deque()
+        self._path_log = PathLog()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=f"plr-{link.identity.interface}", daemon=True)
 
@@ -204,6 +207,9 @@ class InterfaceThread:
                 events.append(event)
             if events:
                 self._owner.on_link_events(events)
+                for event in events:
+                    if isinstance(event, PathChanged):
+                        self._path_log.note(event)
             if not self._inbox and not events:
                 return
             self._execute()

@@ -1,0 +1,33 @@
+"""Says in the log when a path goes down and when it comes (back) up; the short wobbles between go to debug."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from sidecar.core.link_events import PathState
+
+if TYPE_CHECKING:
+    from sidecar.core.link_events import PathChanged, PathId
+
+log = logging.getLogger(__name__)
+
+
+class PathLog:
+    """Remembers what was last said of each path of one interface; one thread uses it."""
+
+    def __init__(self) -> None:
+        self._said: dict[PathId, PathState] = {}
+
+    def note(self, event: PathChanged) -> None:
+        """Log the change if it is one between up and down."""
+        path, state = event.path, event.state
+        if state is PathState.UNSTABLE or self._said.get(path, PathState.DOWN) is state:
+            log.debug("path %s to %s: %s (%s)", path.interface, path.peer, state.value, event.reason)
+            return
+        level = logging.WARNING if state is PathState.DOWN else logging.INFO
+        log.log(level, "path %s to %s is %s: %s", path.interface, path.peer, state.value, event.reason)
+        if state is PathState.DOWN:
+            del self._said[path]
+        else:
+            self._said[path] = state
