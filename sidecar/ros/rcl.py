@@ -59,6 +59,17 @@ class _Bytes(ctypes.Structure):
     )
 
 
+class _View(ctypes.Structure):
+    """The same, over the memory of a Python bytes object."""
+
+    _fields_ = (
+        ("buffer", ctypes.c_char_p),
+        ("length", ctypes.c_size_t),
+        ("capacity", ctypes.c_size_t),
+        ("allocator", _Allocator),
+    )
+
+
 class _ErrorText(ctypes.Structure):
     _fields_ = (("text", ctypes.c_char * _ERROR_TEXT_BYTES),)
 
@@ -76,7 +87,7 @@ class _Functions:
         self.send_response = _prototype(rcl.rcl_send_response, status, pointer, request_id, pointer)
         self.send_request = _prototype(rcl.rcl_send_request, status, pointer, pointer, ctypes.POINTER(ctypes.c_int64))
         self.serialize = _prototype(rcl.rmw_serialize, status, pointer, pointer, ctypes.POINTER(_Bytes))
-        self.deserialize = _prototype(rcl.rmw_deserialize, status, ctypes.POINTER(_Bytes), pointer, pointer)
+        self.deserialize = _prototype(rcl.rmw_deserialize, status, ctypes.POINTER(_View), pointer, pointer)
         self.default_allocator = _prototype(rcl.rcutils_get_default_allocator, _Allocator)
         self.bytes_init = _prototype(
             rcl.rcutils_uint8_array_init,
@@ -193,7 +204,7 @@ class MessageType:
         """
         message = self.new()
         self._last_length = len(payload)
-        view = _Bytes(ctypes.cast(ctypes.c_char_p(payload), ctypes.c_void_p), len(payload), len(payload))
+        view = _View(payload, len(payload), len(payload))
         if self.functions().deserialize(view, self._type_support, message.pointer) != _OK:
             raise RosBridgeError(f"the bytes are not a {self.name}: {_take_error()}")
         return message

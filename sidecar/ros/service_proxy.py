@@ -73,6 +73,7 @@ class ServiceProxy:
         unseen = 0
         while take_request(self._pointer, self.type.request) is not None:
             unseen += 1
+        self._pointer = 0  # rcl refuses a null pointer, and would crash on the old one
         self._node.destroy_service(self._service)
         return unseen
 

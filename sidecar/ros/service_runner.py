@@ -131,4 +131,5 @@ class ServiceRunner:
 
     def close(self) -> None:
         """Destroy the client."""
+        self._pointer = 0  # rcl refuses a null pointer, and would crash on the old one
         self._node.destroy_client(self._client)
