@@ -97,5 +97,5 @@ PHASES = (
     Phase("control plane killed -9", 8, _control_killed, "#dcecd8"),
     Phase("control plane back", 5, _control_back),
 )
-"""A minute at the default length. A rest follows each darkness: the robot with that carrier only then hands a backlog to
-the servers that all three share."""
+"""A minute at the default length. A rest follows each darkness: the robot with that carrier only then hands a backlog
+to the servers that all three share."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
-
-import pytest
+from typing import TYPE_CHECKING
 
 from protos.model import InterfaceId, InterfaceName, NodeName
 from sidecar.core.link_events import PathChanged, PathId, PathState
 from sidecar.net.path_log import PathLog
+
+if TYPE_CHECKING:
+    import pytest
 
 PATH = PathId(InterfaceName("wwan0"), NodeName("cloud-a"), InterfaceId(0))
 
