@@ -44,7 +44,8 @@ def load_service_type(name: str) -> ServiceType:
     try:
         module = importlib.import_module(f"{package}.srv")
         service = getattr(module, short_name)
-    except (ImportError, AttributeError) as error:
+    # Importing runs the package's own code, which may fail in any way.
+    except Exception as error:
         raise TypeNotInstalledError(
             f"service type {name} is not installed here ({error}): install the ROS package {package!r}"
             f" (Debian: ros-<distribution>-{package.replace('_', '-')}) or source the workspace that builds it"
