@@ -28,10 +28,11 @@ from protos.model import (
     SessionId,
     Version,
 )
+from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ExecuteRequest, RequestFailed, RequestId, ResponseArrived
 from sidecar.core.frame import MAX_SYMBOL_BYTES, symbol_count
-from sidecar.core.link import Link, LinkIdentity
+from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
 
@@ -176,9 +177,7 @@ def measure(traffic: Traffic, batch: int) -> str:
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--profile", action="store_true", help="show the functions that cost most")
     parser.add_argument("--only", default="", help="run only the kinds of traffic whose name contains this")
     parser.add_argument(
@@ -186,9 +185,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     chosen = [traffic for traffic in TRAFFIC if arguments.only in traffic.name]
-    print(
-        f"{'both cores together':24s} {'us/request':>12s} {'datagrams':>12s} {'fragments/s':>14s} {'MB/s':>10s}"
-    )
+    print(f"{'both cores together':24s} {'us/request':>12s} {'datagrams':>12s} {'fragments/s':>14s} {'MB/s':>10s}")
     for traffic in chosen:
         if arguments.profile:
             with cProfile.Profile() as profile:

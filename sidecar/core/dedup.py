@@ -19,8 +19,8 @@ from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
-    from sidecar.core.link_events import PathId
     from sidecar.core.messages import RequestMessage
+    from sidecar.core.path_id import PathId
     from sidecar.core.stats import EngineStats
 
 MAX_RUNNING = 8192
@@ -64,12 +64,20 @@ class _Execution:
     robot: NodeName
     service: ServiceName
     expires: float
+    """When no robot waits any more."""
+    patience_ends: float
+    """When the local server is given up, whoever waits."""
     lifetime_s: float
     """The longest that a copy asked for."""
     waiters: list[Waiter] = field(default_factory=list)
     payload: bytes | None = None
     processing_s: float = 0.0
     refusal: tuple[RejectReason, str] | None = None
+
+    @property
+    def ends(self) -> float:
+        """When this execution is given up."""
+        return min(self.expires, self.patience_ends)
 
 
 class ExecutionTable:
@@ -100,8 +108,13 @@ class ExecutionTable:
         """Whether a copy of this request came before."""
         return request_id in self._by_request or request_id in self._finished
 
-    def on_request(self, path: PathId, message: RequestMessage, now: float) -> ExecuteRequest | Reply | None:
-        """Take one copy: run the request, answer from the cache, refuse, or (None) let it wait for the result."""
+    def on_request(
+        self, path: PathId, message: RequestMessage, now: float, *, patience_s: float = MAX_LIFETIME_S
+    ) -> ExecuteRequest | Reply | None:
+        """Take one copy: run the request, answer from the cache, refuse, or (None) let it wait for the result.
+
+        The local server is waited for as long as the robot waits, but at most `patience_s`.
+        """
         waiter = Waiter(path, message.copy)
         running = self._by_request.get(message.request_id)
         execution = running or self._finished.get(message.request_id)
@@ -130,6 +143,7 @@ class ExecutionTable:
             path.peer,
             message.service,
             now + lifetime,
+            now + patience_s,
             lifetime,
             [waiter],
         )
@@ -140,10 +154,13 @@ class ExecutionTable:
         self._arm(execution)
         count[message.service, "run"] += 1
         # bytes(): the buffer is the reassembler's and rmw wants bytes.
-        return ExecuteRequest(execution.id, message.service, message.type, bytes(message.payload), path.peer, lifetime)
+        payload = bytes(message.payload)
+        return ExecuteRequest(
+            execution.id, message.service, message.type, payload, path.peer, min(lifetime, patience_s)
+        )
 
     def _arm(self, execution: _Execution) -> None:
-        heapq.heappush(self._timers, (execution.expires, execution.id))
+        heapq.heappush(self._timers, (execution.ends, execution.id))
         if len(self._timers) > 2 * len(self._running) + TIMER_SLACK:
             self._timers = [timer for timer in self._timers if timer[1] in self._running]
             heapq.heapify(self._timers)
@@ -191,23 +208,29 @@ class ExecutionTable:
             heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
-    def handle_timer(self, now: float) -> list[AbandonExecution]:
-        """Give up executions nobody waits for any more; they may have run, so their ids stay."""
+    def handle_timer(self, now: float) -> tuple[list[AbandonExecution], list[Reply]]:
+        """Give up executions that took too long; they may have run, so their ids stay.
+
+        Returns them, and what those robots are told that still wait.
+        """
         abandoned = []
+        replies = []
         while self._timers and self._timers[0][0] <= now:
             _, execution_id = heapq.heappop(self._timers)
             execution = self._running.get(execution_id)
             if execution is None:
                 continue
-            if execution.expires > now:
-                heapq.heappush(self._timers, (execution.expires, execution_id))
+            if execution.ends > now:
+                heapq.heappush(self._timers, (execution.ends, execution_id))
                 continue
             self._finish(execution_id)
             self._remember(execution, now)
             execution.refusal = (RejectReason.SERVER_LOST, "the server gave no answer in time")
             self._stats.executions[execution.service, "abandoned"] += 1
             abandoned.append(AbandonExecution(execution_id))
-        return abandoned
+            if execution.expires > now:
+                replies += [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
+        return abandoned, replies
 
     def _finish(self, execution_id: ExecutionId) -> _Execution | None:
         """Take an execution out of the running ones; None when it is not one of them (any more)."""

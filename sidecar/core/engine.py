@@ -13,7 +13,6 @@ from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, Report, Role, ServiceUse
 from sidecar.core.dedup import ExecutionTable, Reply, Waiter
 from sidecar.core.events import (
-    AbandonExecution,
     ApplicationEvent,
     ExecuteRequest,
     ExecutionId,
@@ -29,9 +28,7 @@ from sidecar.core.link_events import (
     LinkEvent,
     MessageFinished,
     PathChanged,
-    PathId,
     PathMeasured,
-    PathState,
     PeerClosed,
     PeerRestarted,
     SendFinished,
@@ -47,10 +44,11 @@ from sidecar.core.messages import (
 )
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
+from sidecar.core.path_id import PathId, PathState
 from sidecar.core.peers import Peers
 from sidecar.core.requests import RequestParts, RequestTable
 from sidecar.core.routes import Routes
-from sidecar.core.rules import ServiceRule, find_rule
+from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
 from sidecar.core.stats import EngineStats
 
 if TYPE_CHECKING:
@@ -214,6 +212,11 @@ class Engine:
         self.stats.mapping_version = self.mapping.version
         return None
 
+    @property
+    def offer_conflicts(self) -> frozenset[tuple[ServiceName, NodeName, str]]:
+        """Robot: (service, server, type) of servers left out because the others offer another type."""
+        return frozenset(self._offers.conflicts)
+
     def take_report(self) -> Report:
         """Return what was measured since the last report."""
         return self._measurements.take(self.routes, self.peers.names())
@@ -294,7 +297,9 @@ class Engine:
         if refusal and not self._executions.knows(message.request_id):
             self._reply([self._executions.refuse_unseen(waiter, message, *refusal, now)])
             return
-        outcome = self._executions.on_request(path, message, now)
+        rule = find_rule(self._config.rules, message.service)
+        patience_s = rule.lifetime_s if rule else MAX_LIFETIME_S
+        outcome = self._executions.on_request(path, message, now, patience_s=patience_s)
         if isinstance(outcome, ExecuteRequest):
             self._events.append(outcome)
         elif isinstance(outcome, Reply):
@@ -359,8 +364,9 @@ class Engine:
     def handle_timer(self, now: float) -> None:
         """Do what is due by now."""
         self._requests.handle_timer(now)
-        abandoned: list[AbandonExecution] = self._executions.handle_timer(now)
+        abandoned, replies = self._executions.handle_timer(now)
         self._events.extend(abandoned)
+        self._reply(replies)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
             self._outbox.expire(now)

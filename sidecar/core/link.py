@@ -5,15 +5,13 @@ The driver feeds `receive_datagram`, `execute` and `handle_timer`, then drains `
 
 from __future__ import annotations
 
-import heapq
 from collections import deque
-from dataclasses import dataclass
-from itertools import count
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core import frame
-from sidecar.core.frame import HEADER_BYTES, MAX_FRAMES_BYTES, Header
+from sidecar.core.datagrams import BURST_DATAGRAMS, DatagramBuilder
+from sidecar.core.frame import HEADER_BYTES, Header
 from sidecar.core.link_events import (
     FragmentReceived,
     FragmentsLost,
@@ -21,9 +19,7 @@ from sidecar.core.link_events import (
     LinkEvent,
     MessageFinished,
     PathChanged,
-    PathId,
     PathMeasured,
-    PathState,
     PeerClosed,
     PeerRestarted,
     Resend,
@@ -33,35 +29,25 @@ from sidecar.core.link_events import (
     SetPeers,
     SetReady,
 )
+from sidecar.core.path_id import PathId, PathState
 from sidecar.core.paths import Path
 from sidecar.core.stats import LinkStats, PathStats
+from sidecar.core.timers import Timers
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Iterable
 
-    from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
+    from protos.model import Address, InterfaceId, NodeName, SessionId
+    from sidecar.core.datagrams import LinkIdentity
     from sidecar.core.link_events import LinkPeer
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.recovery import Sent
 
-BURST_DATAGRAMS = 64
-"""Datagrams built in one go before the driver looks at the socket again (about 70 kB, under a millisecond)."""
 MEASURE_EVERY_S = 0.25
 """How often a path's round-trip times go to the engine."""
 MAX_PENDING_FRAMES = 256
 """Control frames waiting on one path; a peer that makes us owe more is not honest."""
-
-
-@dataclass(frozen=True, slots=True)
-class LinkIdentity:
-    """Who we are on this interface."""
-
-    interface: InterfaceName
-    interface_id: InterfaceId
-    session: SessionId
-    token: bytes
-    incarnation: int
 
 
 class Link:
@@ -70,7 +56,7 @@ class Link:
     def __init__(self, identity: LinkIdentity, rng: random.Random, now: float) -> None:
         self.identity = identity
         self.stats = LinkStats(identity.interface)
-        self._rng = rng
+        self._builder = DatagramBuilder(identity, self.stats, rng)
         self._by_session: dict[SessionId, LinkPeer] = {}
         self._by_token: dict[bytes, LinkPeer] = {}
         self._paths: dict[tuple[NodeName, InterfaceId], Path] = {}
@@ -78,9 +64,7 @@ class Link:
         self._closing = False
         self._events: deque[LinkEvent] = deque()
         self._dirty: dict[PathId, Path] = {}
-        self._timers: list[tuple[float, int, Path]] = []
-        self._timer_of: dict[PathId, float] = {}
-        self._order = count()
+        self._timers: Timers[PathId] = Timers()
         self._measure_at = now + MEASURE_EVERY_S
         self._first_number = 0
 
@@ -153,12 +137,9 @@ class Link:
     def handle_timer(self, now: float) -> None:
         """Do what is due by now."""
         self._rearm()
-        while self._timers and self._timers[0][0] <= now:
-            due, _, path = heapq.heappop(self._timers)
-            if self._timer_of.get(path.id) != due or self._paths.get((path.peer, path.remote_id)) is not path:
-                continue
-            del self._timer_of[path.id]
-            self._dirty[path.id] = path
+        while (path_id := self._timers.pop_due(now)) is not None:
+            path = self._paths[path_id.peer, path_id.remote]
+            self._dirty[path_id] = path
             self._path_timer(path, now)
         if now >= self._measure_at:
             self._measure_at = now + MEASURE_EVERY_S
@@ -167,11 +148,8 @@ class Link:
     def next_timer(self) -> float:
         """When `handle_timer` is wanted next."""
         self._rearm()
-        while self._timers and self._timer_of.get(self._timers[0][2].id) != self._timers[0][0]:
-            heapq.heappop(self._timers)
-        if self._timers:
-            return min(self._timers[0][0], self._measure_at)
-        return self._measure_at
+        timer = self._timers.next()
+        return self._measure_at if timer is None else min(timer, self._measure_at)
 
     def next_event(self) -> LinkEvent | None:
         """Return the oldest event not taken yet."""
@@ -180,13 +158,13 @@ class Link:
     def datagrams_to_send(self, now: float) -> list[tuple[Address, bytes]]:
         """Build what may leave now, at most about BURST_DATAGRAMS; call again until nothing comes."""
         out: list[tuple[Address, bytes]] = []
+        probing = self._ready and not self._closing
         for path in list(self._dirty.values()):
-            self._build(path, out, now)
+            if self._builder.build(path, out, now, probing=probing):
+                del self._dirty[path.id]
+                self._arm(path)
             if len(out) >= BURST_DATAGRAMS:
                 break
-        stats = self.stats
-        for _, datagram in out:
-            stats.bytes["sent"] += len(datagram)
         return out
 
     # -- receiving ------------------------------------------------------------------------------------------------
@@ -280,89 +258,6 @@ class Link:
             return
         path.pending.append(encoded)
         self._dirty[path.id] = path
-
-    def _build(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
-        """Build the path's datagrams; leaves it dirty only when the burst limit cut it short."""
-        self._flush_control(path, out, now)
-        if path.state is PathState.DOWN or path.remote is None:
-            self._rearm_one(path)
-            return
-        recovery = path.recovery
-        stats = self.stats
-        expired_before = path.queue.expired
-        while recovery.in_flight < path.window.bytes:
-            if len(out) >= BURST_DATAGRAMS:
-                return
-            item = path.queue.pop(now)
-            if item is None:
-                break
-            message, index = item
-            number = recovery.take_number()
-            datagram = b"".join(
-                (
-                    self._header(path, number),
-                    frame.encode_fragment_head(message.number, len(message.data), message.symbol, index),
-                    message.symbol_data(index),
-                )
-            )
-            recovery.on_sent(number, now, len(datagram), fragment=item)
-            path.bytes_sent += len(datagram)
-            path.waits_for_answer(now)
-            out.append((path.remote, datagram))
-            stats.datagrams["sent", "data"] += 1
-        if path.queue.expired != expired_before:
-            stats.dropped["expired"] += path.queue.expired - expired_before
-        self._rearm_one(path)
-
-    def _flush_control(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
-        pending = path.pending
-        if path.received.ack_at is not None and (pending or path.received.ack_at <= now or len(path.queue)):
-            ranges, delay = path.received.take_ack(now)
-            pending.append(frame.encode_ack(ranges, delay))
-        if path.probe_at is not None and path.probe_at <= now and self._ready and not self._closing:
-            self._send_probe(path, out, now)
-        if not pending:
-            return
-        if path.remote is None:
-            pending.clear()
-            return
-        path.pending = []
-        while pending:
-            size = 0
-            finished: int | None = None
-            taken: list[bytes] = []
-            while pending and size + len(pending[0]) <= MAX_FRAMES_BYTES and len(taken) < frame.MAX_FRAMES:
-                is_finished = pending[0][0] == frame.FINISHED_TYPE
-                if is_finished and finished is not None:
-                    break
-                encoded = pending.pop(0)
-                if is_finished:
-                    finished = frame.finished_number(encoded)
-                size += len(encoded)
-                taken.append(encoded)
-            number = path.recovery.take_number()
-            datagram = b"".join((self._header(path, number), *taken))
-            if finished is not None:
-                path.recovery.on_sent(number, now, len(datagram), finished=finished)
-                path.waits_for_answer(now)
-            path.bytes_sent += len(datagram)
-            out.append((path.remote, datagram))
-            self.stats.datagrams["sent", "control"] += 1
-
-    def _send_probe(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
-        probe = frame.encode_probe(frame.Probe(path.next_probe(now, self._rng)))
-        if path.state is PathState.DOWN:
-            me = self.identity
-            probe = frame.encode_hello(frame.Hello(me.token, me.incarnation)) + probe
-        for address in path.destinations():
-            datagram = self._header(path, path.recovery.take_number()) + probe
-            path.bytes_sent += len(datagram)
-            out.append((address, datagram))
-            self.stats.datagrams["sent", "control"] += 1
-
-    def _header(self, path: Path, number: int) -> bytes:
-        me = self.identity
-        return frame.encode_header(Header(me.interface_id, path.remote_id, me.session, number))
 
     # -- loss and liveness ----------------------------------------------------------------------------------------
 
@@ -464,7 +359,7 @@ class Link:
                 self._take_down(path, "peer left or restarted")
             if (path.peer, path.remote_id) not in self._paths:
                 self._dirty.pop(path.id, None)
-                self._timer_of.pop(path.id, None)
+                self._timers.arm(path.id, None)
 
     # -- timers ---------------------------------------------------------------------------------------------------
 
@@ -472,27 +367,12 @@ class Link:
         for path in self._dirty.values():
             self._arm(path)
 
-    def _rearm_one(self, path: Path) -> None:
-        self._dirty.pop(path.id, None)
-        self._arm(path)
-
     def _arm(self, path: Path) -> None:
         recovery = path.recovery
-        timer = min(
-            (
-                time
-                for time in (
-                    path.probe_at if self._ready and not self._closing else None,
-                    path.received.ack_at,
-                    recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
-                    path.silence_timer,
-                )
-                if time is not None
-            ),
-            default=None,
+        timers = (
+            path.probe_at if self._ready and not self._closing else None,
+            path.received.ack_at,
+            recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
+            path.silence_timer,
         )
-        if timer is None:
-            self._timer_of.pop(path.id, None)
-        elif self._timer_of.get(path.id) != timer:
-            self._timer_of[path.id] = timer
-            heapq.heappush(self._timers, (timer, next(self._order), path))
+        self._timers.arm(path.id, min((timer for timer in timers if timer is not None), default=None))

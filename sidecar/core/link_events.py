@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
+    from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.frame import Fragment
     from sidecar.core.outbound import OutboundMessage
-
-
-class PathId(NamedTuple):
-    """A path: our interface, the peer, and the peer's interface."""
-
-    interface: InterfaceName
-    peer: NodeName
-    remote: InterfaceId
-
-
-class PathState(enum.Enum):
-    """Liveness of a path."""
-
-    DOWN = "down"
-    """Not validated, or silent for long: only probes travel."""
-    UP = "up"
-    UNSTABLE = "unstable"
-    """Silent longer than its round-trip time explains: still used, but not relied on."""
+    from sidecar.core.path_id import PathId, PathState
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,13 +10,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from protos.model import MappingSet, ServiceMapping, Version
-from sidecar.core.link_events import PathState
+from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from protos.model import InterfaceName, NodeName, ServiceName
-    from sidecar.core.link_events import PathId
+    from sidecar.core.path_id import PathId
     from sidecar.core.routes import Route, Routes
 
 

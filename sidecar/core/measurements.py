@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from protos.histogram import Histogram
 from protos.model import LatencyReport, OutcomeReport, PathReport, Report
-from sidecar.core.link_events import PathState
+from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
-    from sidecar.core.link_events import PathId, PathMeasured
+    from sidecar.core.link_events import PathMeasured
+    from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
 
 

@@ -8,7 +8,7 @@ from sidecar.core.frame import MAX_SYMBOL_BYTES, symbol_count
 
 if TYPE_CHECKING:
     from protos.model import NodeName
-    from sidecar.core.link_events import PathId
+    from sidecar.core.path_id import PathId
 
 
 class OutboundMessage:

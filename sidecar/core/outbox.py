@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import InterfaceName, NodeName
-    from sidecar.core.link_events import LinkCommand, PathId
+    from sidecar.core.link_events import LinkCommand
+    from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
 

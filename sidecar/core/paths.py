@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.link_events import PathId, PathState
 from sidecar.core.pacing import SendQueue, Window
+from sidecar.core.path_id import PathId, PathState
 from sidecar.core.received import ReceivedPackets
 from sidecar.core.recovery import Recovery
 

@@ -22,7 +22,6 @@ from sidecar.core.events import (
     RequestId,
     ResponseArrived,
 )
-from sidecar.core.link_events import PathId, PathState
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
     MAX_PAYLOAD_BYTES,
@@ -31,6 +30,7 @@ from sidecar.core.messages import (
     ResponseMessage,
     encode_message,
 )
+from sidecar.core.path_id import PathId, PathState
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.link_events import PathId, PathState
+from sidecar.core.path_id import PathId, PathState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

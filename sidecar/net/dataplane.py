@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from protos.model import (
         InterfaceName,
         MappingSet,
+        NodeName,
         PeerSet,
         Report,
         ServiceMapping,
@@ -69,6 +70,7 @@ class ThreadedDataPlane:
         self._wake_timer = threading.Event()
         self._timer_due = 0.0
         self._stopping = False
+        self._logged_conflicts: frozenset[tuple[ServiceName, NodeName, str]] = frozenset()
         self._timer = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
 
     # -- life -----------------------------------------------------------------------------------------------------
@@ -158,7 +160,11 @@ class ThreadedDataPlane:
         with self._lock:
             error = self._engine.apply_peers(peer_set, self._clock())
             woken = self._queue_outputs()
+            conflicts = self._engine.offer_conflicts
         self._wake(woken)
+        for service, server, kind in sorted(conflicts - self._logged_conflicts):
+            log.warning("%s at %s has type %s, unlike the other servers: it gets no requests", service, server, kind)
+        self._logged_conflicts = conflicts
         return error
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 from protos.errors import ConfigError
 from protos.model import Candidate, CandidateKind, InterfaceId
 from sidecar.config_fields import split_host_port
-from sidecar.core.link import Link, LinkIdentity
+from sidecar.core.datagrams import LinkIdentity
+from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
 from sidecar.core.readiness import Readiness
 from sidecar.core.stun_client import StunClient
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from sidecar.config import SidecarConfig
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane
-    from sidecar.net.interfaces import Interface
+    from sidecar.net.interfaces import Interface, SkippedInterface
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +82,7 @@ class InterfaceManager:
         self._candidates: tuple[Candidate, ...] = ()
         self._readiness = Readiness(stun_enabled=config.stun.enabled)
         self._skipped: dict[InterfaceName, str] = {}
+        self._warned = False
         self._lock = threading.Lock()
         """Guards the addresses, which the interfaces' threads report."""
         self._look_now = threading.Event()
@@ -165,11 +167,20 @@ class InterfaceManager:
         if changed:
             links = {name: managed.thread for name, managed in self._managed.items()}
             self._data_plane.set_links(links)
+        self._warn_when_none(choice.skipped)
         with self._lock:
             for name in self._readiness.after_grace(time.monotonic()):
                 log.warning("%s: no STUN server answers; used without it, as far as probes succeed", name)
                 self._set_ready(self._managed[name], ready=True)
         self._publish_candidates()
+
+    def _warn_when_none(self, skipped: tuple[SkippedInterface, ...]) -> None:
+        """Without any interface nothing is carried, and nothing else would say so."""
+        none = not self._managed
+        if none and not self._warned:
+            reasons = "; ".join(f"{interface.name}: {interface.reason}" for interface in skipped) or "there are none"
+            log.warning("no interface is in use, nothing can be carried (%s)", reasons)
+        self._warned = none
 
     def _drop_gone(self, wanted: dict[InterfaceName, Interface]) -> None:
         gone = [managed for name, managed in self._managed.items() if name not in wanted]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.core.link_events import PathState
+from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
-    from sidecar.core.link_events import PathChanged, PathId
+    from sidecar.core.link_events import PathChanged
+    from sidecar.core.path_id import PathId
 
 log = logging.getLogger(__name__)
 

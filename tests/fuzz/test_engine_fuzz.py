@@ -14,9 +14,9 @@ from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.fragments import FINISHED_REMEMBERED, MAX_PEER_BYTES, MAX_PEER_MESSAGES
 from sidecar.core.frame import MAX_MESSAGE_BYTES, MAX_SYMBOL_BYTES, Header, Probe, ProbeReply
 from sidecar.core.link import MAX_PENDING_FRAMES
-from sidecar.core.link_events import PathState
 from sidecar.core.messages import Message, RejectionMessage, RequestMessage, ResponseMessage, encode_message
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES
+from sidecar.core.path_id import PathState
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
@@ -55,9 +55,7 @@ ATTACKS: dict[str, Callable[[random.Random], bytes]] = {
     "probes": lambda rng: frame.encode_probe(Probe(rng.getrandbits(32))) * 60,
     "unasked replies": lambda rng: frame.encode_probe_reply(ProbeReply(rng.randrange(100))),
     "forged acks": lambda rng: frame.encode_ack([(0, rng.choice([5, 50, 500, 2**63]))], 1.0),
-    "huge announcements": lambda rng: fragment(
-        rng.getrandbits(64), MAX_MESSAGE_BYTES, 1147, rng.randrange(9)
-    ),
+    "huge announcements": lambda rng: fragment(rng.getrandbits(64), MAX_MESSAGE_BYTES, 1147, rng.randrange(9)),
     "never finished": lambda rng: fragment(rng.getrandbits(64), 300, 256, 0),
     "mismatching symbols": lambda rng: fragment(1, rng.randrange(400, 9000), rng.randrange(256, 400), 0),
     "others' finished": lambda rng: frame.encode_finished(frame.Finished(rng.randrange(200))),
@@ -154,9 +152,7 @@ def test_a_hostile_robot_does_not_stop_an_honest_one(seed: int, plan: list[tuple
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32), attacks)
-def test_a_hostile_cloud_does_not_stop_the_robots_other_server(
-    seed: int, plan: list[tuple[str, int]]
-) -> None:
+def test_a_hostile_cloud_does_not_stop_the_robots_other_server(seed: int, plan: list[tuple[str, int]]) -> None:
     mesh, robot, _, _ = arena(seed)
     rogue_cloud = mesh.cloud("cloud-b")
     rogue_cloud.server_delay = lambda: None

@@ -44,9 +44,7 @@ whole_frames = st.one_of(
     u32.map(lambda n: (frame.encode_probe_reply(ProbeReply(n)), ProbeReply(n))),
     u64.map(lambda n: (frame.encode_finished(Finished(n)), Finished(n))),
     st.just((frame.encode_close(), frame.Close())),
-    st.builds(Hello, st.binary(min_size=16, max_size=16), u64).map(
-        lambda hello: (frame.encode_hello(hello), hello)
-    ),
+    st.builds(Hello, st.binary(min_size=16, max_size=16), u64).map(lambda hello: (frame.encode_hello(hello), hello)),
     fragments(),
 )
 typed_noise = st.builds(lambda kind, rest: bytes([kind]) + rest, st.integers(0, 12), st.binary(max_size=60))

@@ -9,7 +9,8 @@ from protos.model import InterfaceId, SessionId
 from sidecar.core import frame
 from sidecar.core.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
 from sidecar.core.link import MAX_PENDING_FRAMES
-from sidecar.core.link_events import PathId, Send
+from sidecar.core.link_events import Send
+from sidecar.core.path_id import PathId
 from tests.unit.sidecar.core.builders import (
     OUR_TOKEN,
     PEER_ADDRESS,
@@ -31,9 +32,7 @@ def encode_ack(largest: int, shape: list[tuple[int, int]]) -> bytes:
 
 
 fragments = st.builds(
-    lambda number, total, symbol, index, size: (
-        frame.encode_fragment_head(number, total, symbol, index) + bytes(size)
-    ),
+    lambda number, total, symbol, index, size: frame.encode_fragment_head(number, total, symbol, index) + bytes(size),
     numbers,
     st.integers(0, 2**32 - 1) | st.just(3000),
     st.integers(0, 2**16 - 1) | st.just(300),
@@ -93,9 +92,7 @@ def test_whatever_comes_the_link_stands_and_answers_honest_probes(
     bench.wait(120.0)  # a round trip of seconds makes silence mean little for a while
     bench.events()
     assert bench.link.next_timer() > bench.now
-    assert all(not path.recovery.sent for path in bench.link._paths.values()), (
-        "everything is acknowledged or lost"
-    )
+    assert all(not path.recovery.sent for path in bench.link._paths.values()), "everything is acknowledged or lost"
     bench.know(session=SessionId(77), incarnation=2)
     probe = frame.encode_probe(Probe(4242))
     bench.link.receive_datagram(bench.datagram(probe, session=SessionId(77)), PEER_ADDRESS, bench.now)

@@ -54,9 +54,7 @@ def test_a_message_or_the_one_error(data: bytes) -> None:
 
 
 @given(messages, st.integers(0, 300), st.binary(min_size=1, max_size=3))
-def test_a_message_with_changed_bytes_is_a_message_or_the_one_error(
-    message: Message, at: int, new: bytes
-) -> None:
+def test_a_message_with_changed_bytes_is_a_message_or_the_one_error(message: Message, at: int, new: bytes) -> None:
     data = bytearray(encode_message(message))
     position = at % len(data)
     data[position : position + len(new)] = new

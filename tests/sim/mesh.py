@@ -23,9 +23,10 @@ from protos.model import (
     SessionId,
     Version,
 )
+from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestId, ResponseArrived
-from sidecar.core.link import Link, LinkIdentity
+from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
 from sidecar.core.request_id import make_request_id
 from sidecar.core.rules import ServiceRule

@@ -151,9 +151,7 @@ def test_every_metric_is_documented() -> None:
 def test_no_page_names_a_metric_that_does_not_exist() -> None:
     known = exported() | {name + end for name in exported() for end in ("_bucket", "_sum", "_count")}
     for page in PAGES:
-        for name in re.findall(
-            r"\bplr_[a-z_]+_(?:total|seconds|bucket|version|info|up|ratio)\b", page.read_text()
-        ):
+        for name in re.findall(r"\bplr_[a-z_]+_(?:total|seconds|bucket|version|info|up|ratio)\b", page.read_text()):
             assert name in known, f"{page}: {name}"
 
 
@@ -297,9 +295,7 @@ def test_every_page_is_linked_from_the_readme() -> None:
 
 
 def test_architecture_names_files_that_exist() -> None:
-    named = re.findall(
-        r"`((?:sidecar|controlplane|protos|bench|tests|deploy)/[\w./]+)`", read("architecture.md")
-    )
+    named = re.findall(r"`((?:sidecar|controlplane|protos|bench|tests|deploy)/[\w./]+)`", read("architecture.md"))
     assert len(named) > 20
     assert [name for name in named if not (ROOT / name).exists()] == []
 

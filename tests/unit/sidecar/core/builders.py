@@ -17,12 +17,20 @@ from protos.model import (
     ServiceOffer,
     SessionId,
 )
+from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.events import RequestId
 from sidecar.core.frame import Header, encode_header
-from sidecar.core.link import Link, LinkIdentity
-from sidecar.core.link_events import LinkCommand, LinkEvent, LinkPeer, PathId, SetPeers, SetReady
+from sidecar.core.link import Link
+from sidecar.core.link_events import (
+    LinkCommand,
+    LinkEvent,
+    LinkPeer,
+    SetPeers,
+    SetReady,
+)
 from sidecar.core.messages import RequestMessage
 from sidecar.core.outbound import OutboundMessage
+from sidecar.core.path_id import PathId
 from sidecar.core.rules import ServiceRule
 
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")
@@ -54,9 +62,7 @@ def request_id(number: int) -> RequestId:
     return RequestId(number.to_bytes(16, "big"))
 
 
-def request(
-    number: int = 1, copy: int = 0, *, lifetime_s: float = 10.0, service: ServiceName = ECHO
-) -> RequestMessage:
+def request(number: int = 1, copy: int = 0, *, lifetime_s: float = 10.0, service: ServiceName = ECHO) -> RequestMessage:
     return RequestMessage(request_id(number), copy, lifetime_s, service, TYPE, b"question")
 
 
@@ -74,9 +80,7 @@ def peer(
 ) -> Peer:
     candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, PEER_ADDRESS)
     token = NodeName(name).encode().ljust(16)[:16]
-    return Peer(
-        NodeName(name), Role.CLOUD, SessionId(session), token, incarnation, (candidate,), offers, draining
-    )
+    return Peer(NodeName(name), Role.CLOUD, SessionId(session), token, incarnation, (candidate,), offers, draining)
 
 
 @dataclass
@@ -88,9 +92,7 @@ class Bench:
     number: int = -1
 
     def __post_init__(self) -> None:
-        self.link = Link(
-            LinkIdentity(WLAN, InterfaceId(3), OUR_SESSION, OUR_TOKEN, 7), random.Random(1), self.now
-        )
+        self.link = Link(LinkIdentity(WLAN, InterfaceId(3), OUR_SESSION, OUR_TOKEN, 7), random.Random(1), self.now)
         self.know()
         self.link.execute(SetReady(ready=True), self.now)
 

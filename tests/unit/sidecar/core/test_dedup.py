@@ -96,9 +96,10 @@ def test_an_execution_nobody_waits_for_is_abandoned_and_never_run_again() -> Non
     execution = run(executions, request(lifetime_s=5.0)).execution
     assert executions.next_timer() == 6.0
     executions.on_request(ROBOT_2ND, request(copy=1, lifetime_s=7.0), 2.0)
-    assert executions.handle_timer(6.0) == [], "the second copy waits longer"
+    assert executions.handle_timer(6.0) == ([], []), "the second copy waits longer"
     assert executions.next_timer() == 9.0
-    (abandoned,) = executions.handle_timer(9.0)
+    (abandoned,), replies = executions.handle_timer(9.0)
+    assert replies == [], "nobody waits any more"
     assert abandoned.execution == execution
     assert executions.running == 0
     assert executions.next_timer() is None
@@ -205,3 +206,15 @@ def test_unknown_services_make_no_counters() -> None:
 def test_robots_are_told_apart_by_name() -> None:
     executions = table()
     assert run(executions, request()).robot == NodeName("robot")
+
+
+def test_a_server_is_given_up_before_the_robot_gives_up_and_the_robot_is_told() -> None:
+    executions = table()
+    outcome = executions.on_request(ROBOT, request(lifetime_s=20.0), 1.0, patience_s=3.0)
+    assert isinstance(outcome, ExecuteRequest)
+    assert outcome.expires_s == 3.0
+    assert executions.handle_timer(3.9) == ([], [])
+    (abandoned,), (reply,) = executions.handle_timer(4.0)
+    assert abandoned.execution == outcome.execution
+    assert isinstance(reply.message, RejectionMessage)
+    assert reply.message.reason is RejectReason.SERVER_LOST

@@ -31,9 +31,7 @@ from sidecar.core.link_events import (
     FragmentReceived,
     LinkCommand,
     PathChanged,
-    PathId,
     PathMeasured,
-    PathState,
     PeerClosed,
     PeerRestarted,
     Send,
@@ -48,6 +46,7 @@ from sidecar.core.messages import (
     decode_message,
     encode_message,
 )
+from sidecar.core.path_id import PathId, PathState
 from tests.unit.sidecar.core.builders import (
     ECHO,
     TYPE,
@@ -261,9 +260,7 @@ def test_a_peer_kept_only_for_its_paths_goes_with_the_last_of_them() -> None:
 def test_a_flood_of_restarts_makes_little_work() -> None:
     sidecar = cloud()
     for incarnation in range(2, 1000):
-        sidecar.engine.on_link_event(
-            PeerRestarted(ROBOT, SessionId(incarnation), incarnation), 0.001 * incarnation
-        )
+        sidecar.engine.on_link_event(PeerRestarted(ROBOT, SessionId(incarnation), incarnation), 0.001 * incarnation)
     assert len([command for command in sidecar.take()[0] if isinstance(command, SetPeers)]) == 1
 
 

@@ -41,9 +41,7 @@ def reassembler(dropped: Counter[str]) -> Reassembler:
 
 
 @pytest.mark.parametrize("size", [0, 1, SYMBOL, SYMBOL + 1, 10 * SYMBOL, 10 * SYMBOL + 7])
-def test_symbols_in_any_order_with_duplicates_give_the_message_once(
-    reassembler: Reassembler, size: int
-) -> None:
+def test_symbols_in_any_order_with_duplicates_give_the_message_once(reassembler: Reassembler, size: int) -> None:
     rng = random.Random(size)
     data = rng.randbytes(size)
     fragments = symbols(1, data) * 3
@@ -64,9 +62,7 @@ def test_interleaved_messages_do_not_mix(reassembler: Reassembler) -> None:
     assert [bytes(result) for result in results[-2:] if not isinstance(result, Progress)] == [one, two]
 
 
-def test_a_symbol_of_another_shape_is_dropped_and_counted(
-    reassembler: Reassembler, dropped: Counter[str]
-) -> None:
+def test_a_symbol_of_another_shape_is_dropped_and_counted(reassembler: Reassembler, dropped: Counter[str]) -> None:
     data = bytes(1000)
     first, *rest = symbols(1, data)
     reassembler.add(first, 1.0)
@@ -77,9 +73,7 @@ def test_a_symbol_of_another_shape_is_dropped_and_counted(
 
 
 def announce(reassembler: Reassembler, number: int, total: int, now: float = 1.0) -> None:
-    assert (
-        reassembler.add(Fragment(number, total, SYMBOL, 0, memoryview(bytes(SYMBOL))), now) is Progress.STORED
-    )
+    assert reassembler.add(Fragment(number, total, SYMBOL, 0, memoryview(bytes(SYMBOL))), now) is Progress.STORED
 
 
 def test_announced_bytes_are_capped_the_longest_without_news_goes(

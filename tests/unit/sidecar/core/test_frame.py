@@ -44,9 +44,7 @@ def test_the_bytes_of_a_datagram_of_each_kind(kind: str) -> None:
 
 
 def test_room_is_left_for_the_tag() -> None:
-    assert (
-        frame.HEADER_BYTES + 17 + frame.MAX_SYMBOL_BYTES + frame.TAG_BYTES == frame.MAX_DATAGRAM_BYTES == 1200
-    )
+    assert frame.HEADER_BYTES + 17 + frame.MAX_SYMBOL_BYTES + frame.TAG_BYTES == frame.MAX_DATAGRAM_BYTES == 1200
 
 
 def test_the_last_fragment_is_shorter_and_an_empty_message_has_one() -> None:

@@ -11,9 +11,7 @@ from sidecar.core.link_events import (
     LinkPeer,
     MessageFinished,
     PathChanged,
-    PathId,
     PathMeasured,
-    PathState,
     PeerClosed,
     PeerRestarted,
     Resend,
@@ -23,6 +21,7 @@ from sidecar.core.link_events import (
     SetPeers,
     SetReady,
 )
+from sidecar.core.path_id import PathId, PathState
 from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
 from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
@@ -42,11 +41,7 @@ OTHER_SESSION = SessionId(99)
 
 
 def frames(datagrams: list[bytes]) -> list[frame.Frame]:
-    return [
-        item
-        for datagram in datagrams
-        for item in frame.decode_frames(memoryview(datagram)[frame.HEADER_BYTES :])
-    ]
+    return [item for datagram in datagrams for item in frame.decode_frames(memoryview(datagram)[frame.HEADER_BYTES :])]
 
 
 def numbers(datagrams: list[bytes]) -> list[int]:
@@ -163,9 +158,7 @@ def test_the_peers_newest_address_is_followed() -> None:
     bench = up()
     moved = ("198.51.100.1", 5)
     bench.link.receive_datagram(bench.datagram(frame.encode_probe(Probe(1)), number=50), moved, bench.now)
-    bench.link.receive_datagram(
-        bench.datagram(frame.encode_probe(Probe(2)), number=40), PEER_ADDRESS, bench.now
-    )
+    bench.link.receive_datagram(bench.datagram(frame.encode_probe(Probe(2)), number=40), PEER_ADDRESS, bench.now)
     ((address, _),) = bench.link.datagrams_to_send(bench.now)
     assert address == moved
 
@@ -351,9 +344,7 @@ def test_a_restarted_peer_starts_afresh_and_our_numbers_go_on() -> None:
     assert PathChanged(PATH, PathState.DOWN, "peer left or restarted") in events
     assert FragmentsLost(PATH, outbound, (0, 1, 2)) in events
     assert numbers(bench.sent())[0] > before[-1]
-    bench.link.receive_datagram(
-        bench.datagram(PROBE, number=0, session=OTHER_SESSION), PEER_ADDRESS, bench.now
-    )
+    bench.link.receive_datagram(bench.datagram(PROBE, number=0, session=OTHER_SESSION), PEER_ADDRESS, bench.now)
     assert ProbeReply(1) in frames(bench.sent())
 
 
@@ -371,7 +362,7 @@ def test_a_peer_that_left_is_forgotten_with_its_timers() -> None:
     bench.execute(SetPeers(()))
     assert state_changes(bench) == [PathState.DOWN]
     assert bench.wait(5.0) == []
-    assert not bench.link._timer_of
+    assert bench.link.next_timer() > bench.now
     bench.receive(PROBE)
     assert bench.link.stats.dropped["unknown_session"] == 1
 

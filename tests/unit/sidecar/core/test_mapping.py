@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, ServiceMapping, Version
-from sidecar.core.link_events import PathId, PathState
 from sidecar.core.mapping import MappingTable
+from sidecar.core.path_id import PathId, PathState
 from sidecar.core.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 

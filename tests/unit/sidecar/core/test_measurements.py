@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 from protos.model import OutcomeReport
-from sidecar.core.link_events import PathMeasured, PathState
+from sidecar.core.link_events import PathMeasured
 from sidecar.core.measurements import Measurements
+from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, path
 
@@ -49,6 +50,4 @@ def test_outcomes_are_counted_and_a_rejection_is_a_failure() -> None:
     measurements = Measurements()
     for outcome in ("ok", "ok", "deadline_missed", "failed", "rejected"):
         measurements.outcome(ECHO, outcome)
-    assert measurements.take(Routes(), []).outcomes == (
-        OutcomeReport(ECHO, ok=2, deadline_missed=1, failed=2),
-    )
+    assert measurements.take(Routes(), []).outcomes == (OutcomeReport(ECHO, ok=2, deadline_missed=1, failed=2),)

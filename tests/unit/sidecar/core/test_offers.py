@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from protos.model import Peer, ServiceName, ServiceOffer
 from sidecar.core.events import OfferService, WithdrawService
-from sidecar.core.link_events import PathState
 from sidecar.core.offers import WITHDRAW_AFTER_S, Offers
+from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, TYPE, A, B, path, peer, rule
 

@@ -4,8 +4,9 @@ from typing import TYPE_CHECKING
 
 from sidecar.core import outbox as outbox_module
 from sidecar.core.fragments import MAX_PEER_BYTES
-from sidecar.core.link_events import FragmentsLost, LinkCommand, PathId, PathState, Resend, Send
+from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES, Outbox
+from sidecar.core.path_id import PathId, PathState
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
@@ -35,9 +36,7 @@ class Box:
         assert self.commands.pop() == Send(over, message)
         return message
 
-    def lost(
-        self, message: OutboundMessage, *indices: int, over: PathId = OVER_WLAN, timed_out: bool = False
-    ) -> None:
+    def lost(self, message: OutboundMessage, *indices: int, over: PathId = OVER_WLAN, timed_out: bool = False) -> None:
         self.outbox.on_lost(FragmentsLost(over, message, indices, timed_out), 1.0)
 
 

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from protos.model import SessionId
-from sidecar.core.link_events import PathState
+from sidecar.core.path_id import PathState
 from sidecar.core.paths import (
     DOWN_FACTOR,
     DOWN_FLOOR_S,

@@ -4,7 +4,7 @@ import pytest
 
 from sidecar.core import requests as requests_module
 from sidecar.core.events import ApplicationEvent, DeadlineMissed, RejectReason, RequestFailed, ResponseArrived
-from sidecar.core.link_events import LinkCommand, PathId, PathState, Send
+from sidecar.core.link_events import LinkCommand, Send
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
 from sidecar.core.messages import (
@@ -16,6 +16,7 @@ from sidecar.core.messages import (
 )
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
+from sidecar.core.path_id import PathId, PathState
 from sidecar.core.requests import MAX_COPIES, RequestParts, RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
@@ -81,9 +82,7 @@ def test_copies_are_numbered_and_carry_what_is_left_of_the_lifetime() -> None:
     table.submit()
     sends = [command for command in table.commands if isinstance(command, Send)]
     copies = [decode_message(memoryview(bytes(send.message.data))) for send in sends]
-    assert copies == [
-        RequestMessage(request_id(1), copy, 10.0, ECHO, TYPE, memoryview(b"question")) for copy in (0, 1)
-    ]
+    assert copies == [RequestMessage(request_id(1), copy, 10.0, ECHO, TYPE, memoryview(b"question")) for copy in (0, 1)]
     assert table.sent() == [WLAN_A, WWAN_B]
 
 
@@ -161,9 +160,7 @@ def test_after_a_win_the_loser_is_called_off_at_the_deadline_and_counts_once() -
     table.table.handle_timer(1.0)
     table.assert_empty()
     table.respond(B, copy=1, now=1.2)
-    latencies = {
-        report.server: report.latency for report in table.measurements.take(table.routes, []).latencies
-    }
+    latencies = {report.server: report.latency for report in table.measurements.take(table.routes, []).latencies}
     assert (latencies[B].lost, sum(latencies[B].counts)) == (1, 0)
 
 
@@ -173,9 +170,7 @@ def test_an_answer_from_a_server_given_up_still_counts_but_is_not_measured_twice
     table.table.on_peer_gone(A, 0.1)
     table.respond(A, copy=0)
     assert isinstance(table.events[0], ResponseArrived)
-    latencies = {
-        report.server: report.latency for report in table.measurements.take(table.routes, []).latencies
-    }
+    latencies = {report.server: report.latency for report in table.measurements.take(table.routes, []).latencies}
     assert (latencies[A].lost, sum(latencies[A].counts)) == (1, 0)
 
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from sidecar.core.link_events import PathState
+from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
 

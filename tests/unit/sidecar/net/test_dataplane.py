@@ -25,6 +25,7 @@ from protos.model import (
     SessionId,
     Version,
 )
+from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import (
     ApplicationEvent,
@@ -33,7 +34,7 @@ from sidecar.core.events import (
     RequestId,
     ResponseArrived,
 )
-from sidecar.core.link import Link, LinkIdentity
+from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
@@ -76,9 +77,7 @@ class Node:
             self.news.notify_all()
 
     def as_peer(self) -> Peer:
-        candidate = Candidate(
-            InterfaceId(0), InterfaceName("lo"), CandidateKind.HOST, ("127.0.0.1", self.thread.port)
-        )
+        candidate = Candidate(InterfaceId(0), InterfaceName("lo"), CandidateKind.HOST, ("127.0.0.1", self.thread.port))
         return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers)
 
     def start(self, other: Node) -> None:

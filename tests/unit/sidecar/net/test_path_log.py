@@ -6,7 +6,8 @@ import logging
 from typing import TYPE_CHECKING
 
 from protos.model import InterfaceId, InterfaceName, NodeName
-from sidecar.core.link_events import PathChanged, PathId, PathState
+from sidecar.core.link_events import PathChanged
+from sidecar.core.path_id import PathId, PathState
 from sidecar.net.path_log import PathLog
 
 if TYPE_CHECKING:

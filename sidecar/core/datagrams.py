@@ -1,0 +1,135 @@
+"""Builds one interface's datagrams: what a path owes, its probes, its queue of symbols."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sidecar.core import frame
+from sidecar.core.frame import MAX_FRAMES_BYTES, Header
+from sidecar.core.path_id import PathState
+
+if TYPE_CHECKING:
+    import random
+
+    from protos.model import Address, InterfaceId, InterfaceName, SessionId
+    from sidecar.core.paths import Path
+    from sidecar.core.stats import LinkStats
+
+BURST_DATAGRAMS = 64
+"""Datagrams built in one go before the driver looks at the socket again (about 70 kB, some milliseconds)."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkIdentity:
+    """Who we are on this interface."""
+
+    interface: InterfaceName
+    interface_id: InterfaceId
+    session: SessionId
+    token: bytes
+    incarnation: int
+
+
+class DatagramBuilder:
+    """Turns the state of a link's paths into datagrams, and notes in it what left."""
+
+    __slots__ = ("_identity", "_rng", "_stats")
+
+    def __init__(self, identity: LinkIdentity, stats: LinkStats, rng: random.Random) -> None:
+        self._identity = identity
+        self._stats = stats
+        self._rng = rng
+
+    def build(self, path: Path, out: list[tuple[Address, bytes]], now: float, *, probing: bool) -> bool:
+        """Append what the path may send now; False when BURST_DATAGRAMS cut it short. `probing` allows probes."""
+        before = len(out)
+        if probing and path.probe_at is not None and path.probe_at <= now:
+            self._add_probe(path, out, now)
+        self._add_control(path, out, now)
+        complete = self._add_fragments(path, out, now)
+        sent = sum(len(datagram) for _, datagram in out[before:])
+        path.bytes_sent += sent
+        self._stats.bytes["sent"] += sent
+        return complete
+
+    def _add_fragments(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> bool:
+        if path.state is PathState.DOWN or path.remote is None:
+            return True
+        recovery = path.recovery
+        stats = self._stats
+        expired_before = path.queue.expired
+        complete = True
+        while recovery.in_flight < path.window.bytes:
+            if len(out) >= BURST_DATAGRAMS:
+                complete = False
+                break
+            item = path.queue.pop(now)
+            if item is None:
+                break
+            message, index = item
+            number = recovery.take_number()
+            datagram = b"".join(
+                (
+                    self._header(path, number),
+                    frame.encode_fragment_head(message.number, len(message.data), message.symbol, index),
+                    message.symbol_data(index),
+                )
+            )
+            recovery.on_sent(number, now, len(datagram), fragment=item)
+            path.waits_for_answer(now)
+            out.append((path.remote, datagram))
+            stats.datagrams["sent", "data"] += 1
+        if path.queue.expired != expired_before:
+            stats.dropped["expired"] += path.queue.expired - expired_before
+        return complete
+
+    def _add_control(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+        pending = path.pending
+        if path.received.ack_at is not None and (pending or path.received.ack_at <= now or len(path.queue)):
+            ranges, delay = path.received.take_ack(now)
+            pending.append(frame.encode_ack(ranges, delay))
+        if path.remote is None:
+            pending.clear()
+            return
+        while pending:
+            taken, finished = _fill(pending)
+            number = path.recovery.take_number()
+            datagram = b"".join((self._header(path, number), *taken))
+            if finished is not None:
+                path.recovery.on_sent(number, now, len(datagram), finished=finished)
+                path.waits_for_answer(now)
+            out.append((path.remote, datagram))
+            self._stats.datagrams["sent", "control"] += 1
+
+    def _add_probe(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+        probe = frame.encode_probe(frame.Probe(path.next_probe(now, self._rng)))
+        if path.state is PathState.DOWN:
+            me = self._identity
+            probe = frame.encode_hello(frame.Hello(me.token, me.incarnation)) + probe
+        for address in path.destinations():
+            out.append((address, self._header(path, path.recovery.take_number()) + probe))
+            self._stats.datagrams["sent", "control"] += 1
+
+    def _header(self, path: Path, number: int) -> bytes:
+        me = self._identity
+        return frame.encode_header(Header(me.interface_id, path.remote_id, me.session, number))
+
+
+def _fill(pending: list[bytes]) -> tuple[list[bytes], int | None]:
+    """Take the frames of one datagram from `pending`, at most one FINISHED (its message number is returned)."""
+    size = 0
+    finished: int | None = None
+    count = 0
+    for encoded in pending:
+        if size + len(encoded) > MAX_FRAMES_BYTES or count == frame.MAX_FRAMES:
+            break
+        if encoded[0] == frame.FINISHED_TYPE:
+            if finished is not None:
+                break
+            finished = frame.finished_number(encoded)
+        size += len(encoded)
+        count += 1
+    taken = pending[:count]
+    del pending[:count]
+    return taken, finished

@@ -1,0 +1,45 @@
+"""One timer for each key."""
+
+from __future__ import annotations
+
+import random
+
+from sidecar.core.timers import Timers
+
+
+def test_the_earliest_comes_first_and_a_new_time_replaces_the_old() -> None:
+    timers: Timers[str] = Timers()
+    timers.arm("a", 2.0)
+    timers.arm("b", 1.0)
+    timers.arm("a", 0.5)
+    assert timers.next() == 0.5
+    assert timers.pop_due(0.4) is None
+    assert [timers.pop_due(2.0), timers.pop_due(2.0), timers.pop_due(2.0)] == ["a", "b", None]
+    assert timers.next() is None
+
+
+def test_disarmed_and_rearmed_to_the_same_time_fires_once() -> None:
+    timers: Timers[str] = Timers()
+    for due in (1.0, 2.0, 1.0, None, 1.0):
+        timers.arm("a", due)
+    assert [timers.pop_due(3.0), timers.pop_due(3.0)] == ["a", None]
+
+
+def test_behaves_as_a_dictionary_of_times() -> None:
+    rng = random.Random(5)
+    timers: Timers[int] = Timers()
+    model: dict[int, float] = {}
+    now = 0.0
+    for _ in range(3000):
+        key = rng.randrange(20)
+        due = rng.choice([None, now + rng.random()])
+        timers.arm(key, due)
+        model.pop(key, None)
+        if due is not None:
+            model[key] = due
+        assert timers.next() == min(model.values(), default=None)
+        if rng.random() < 0.2:
+            now += rng.random()
+            while (fired := timers.pop_due(now)) is not None:
+                assert model.pop(fired) <= now
+            assert all(left > now for left in model.values())
