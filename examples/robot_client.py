@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import QoSProfile
 
 from examples.request_log import RequestLog, RequestRecord
 
@@ -64,6 +65,13 @@ def add_arguments(parser: argparse.ArgumentParser, *, rate_hz: float, deadline_m
         metavar="S",
         help="wait for late answers at the end (default %(default)s)",
     )
+    parser.add_argument(
+        "--queue-depth",
+        type=int,
+        default=10,
+        metavar="N",
+        help="answers kept until the robot looks at them; more at once push the oldest out (default %(default)s)",
+    )
     parser.add_argument("--json", type=Path, metavar="OUT", help="write every request's record to this file")
     parser.add_argument("--seed", type=int, default=1, help="seed of what is asked (default %(default)s)")
     parser.add_argument("--quiet", action="store_true", help="no progress lines")
@@ -80,11 +88,14 @@ def positive(text: str) -> float:
 class RobotClient:
     """Calls a service at a fixed rate without ever waiting for an answer, and keeps a log of all calls."""
 
-    def __init__(self, node: Any, service_type: Any, service: str, workload: Workload, deadline_ms: float) -> None:
+    def __init__(
+        self, node: Any, service_type: Any, service: str, workload: Workload, deadline_ms: float, queue_depth: int
+    ) -> None:
         self.log = RequestLog(service, deadline_ms)
         self._node = node
         self._workload = workload
-        self._client = node.create_client(service_type, service)
+        qos = QoSProfile(depth=queue_depth)  # otherwise as rclpy's default for services: reliable, volatile
+        self._client = node.create_client(service_type, service, qos_profile=qos)
         self._waiting: dict[Any, RequestRecord] = {}
         self._answered: dict[int, RequestRecord] = {}
         # rclpy asks this for the future of each response that arrives, and drops the response silently if there is
@@ -130,7 +141,7 @@ def run(name: str, service_type: Any, service: str, workload: Workload, options:
     node = rclpy.create_node(name)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    robot = RobotClient(node, service_type, service, workload, options.deadline_ms)
+    robot = RobotClient(node, service_type, service, workload, options.deadline_ms, options.queue_depth)
     interrupted = False
     try:
         if not robot.wait_for_server(options.wait_s):
