@@ -3,7 +3,10 @@ applications around them are separate processes."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import signal
+import subprocess
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -63,7 +66,8 @@ class Mesh:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         for program in self._programs:
-            program.__exit__(None, None, None)
+            with program, contextlib.suppress(subprocess.TimeoutExpired):
+                program.stop(signal.SIGTERM)  # a killed one leaves its shared memory behind
         stopped = self.robot.stop(), self.cloud.stop()
         self.link.stop()
         if kind is None:
