@@ -149,9 +149,8 @@ def test_100_requests_in_flight_come_back_to_their_callers(system: System) -> No
 
     The client keeps more answers than rclpy's default of 10, which a client that is slow for a moment overflows.
     """
-    options = ("--duration", "0.1", "--rate", "1500", "--deadline-ms", "5000", "--ask-delay-ms", "10")
-    options += ("--queue-depth", "200")
-    run = Call(system, *options).result()
+    burst = ("--duration", "0.1", "--rate", "1500", "--deadline-ms", "5000", "--ask-delay-ms", "10")
+    run = Call(system, *burst, "--queue-depth", "200").result()
     assert_flawless(run)
     sent = sorted(request["sent_s"] for request in run["requests"])
     answered = sorted(request["sent_s"] + request["latency_ms"] / 1e3 for request in run["requests"])
