@@ -66,7 +66,7 @@ def _mapping(mapping: ServiceMapping) -> str:
 def _path(path: PathReport) -> tuple[str, ...]:
     median = path.rtt.quantile(0.5)
     rtt = f"rtt {median * 1000:.1f} ms" if math.isfinite(median) else "rtt -"
-    lost = f"lost {path.datagrams_lost} of {path.datagrams_sent}"
+    lost = f"lost {path.datagrams_lost} of {path.datagrams_sent} since the last report"
     return (f"{path.interface} -> {path.server}", "up" if path.up else "DOWN", rtt, lost)
 
 

@@ -3,7 +3,7 @@
 All decisions are ControlSession's. Names are resolved and connections made inside gRPC; nothing here is called by, or
 waited for by, a thread that moves datagrams.
 
-grpc.aio rather than a synchronous stub: at a report each 0.5 s the latter needs two more threads and about twice the
+grpc.aio rather than a synchronous stub: at a report each 0.5 s the latter needs two more threads and some more
 wake-ups, each of which may take the interpreter from a data-plane thread.
 """
 

@@ -73,7 +73,7 @@ def table(contenders: list[Contender], deadline_ms: float) -> Table:
 
     shown = Table(title=f"Robot asking for a path at 10 Hz, deadline {deadline_ms:g} ms")
     shown.add_column("")
-    for column in ("requests", "lost", "twice", "mean ms", "P50 ms", "P99 ms", "missed", "wins"):
+    for column in ("requests", "lost", "twice", "mean ms", "P50 ms", "P99 ms", "missed", "PLR's wins"):
         shown.add_column(column, justify="right", no_wrap=True)
     for row in contenders:
         shown.add_row(
