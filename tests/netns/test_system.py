@@ -13,7 +13,7 @@ import pytest
 
 from bench.echo import journal_ids
 from bench.netlab import Lab, LabConfig, LinkProfile
-from bench.system import System, read_json
+from bench.system import Part, System, read_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,10 +23,11 @@ pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 
 CLOUDS = ("cloud_a", "cloud_b")
 DEADLINE_MS = 500
-CLOUD_SERVICES = [{"name": "/echo"}, {"name": "/plan_path"}, {"name": "/count"}]
+CLOUD_SERVICES = [{"name": "/echo"}, {"name": "/plan_path"}, {"name": "/detect_*"}]
 ROBOT_SERVICES = [
     {"name": "/echo", "deadline_ms": DEADLINE_MS, "lifetime_ms": 30_000, "idempotent": True},
     {"name": "/plan_path", "deadline_ms": DEADLINE_MS, "lifetime_ms": 30_000, "idempotent": True},
+    {"name": "/detect_people", "deadline_ms": 1000, "lifetime_ms": 30_000, "idempotent": True},
 ]
 WLAN = LinkProfile(delay_ms=5, jitter_ms=2)
 WWAN = LinkProfile(delay_ms=15, jitter_ms=5)
@@ -97,6 +98,10 @@ def counter(system: System, name: str, **labels: str) -> float:
     )
 
 
+def offered(robot: Part, service: str) -> bool:
+    return any(service in line and " is offered here" in line for line in robot.log.read_text().splitlines())
+
+
 def executed(folder: Path) -> dict[str, list[str]]:
     return {cloud: journal_ids(folder / f"{cloud}.journal") for cloud in CLOUDS}
 
@@ -114,6 +119,18 @@ def test_a_custom_type_runs_at_most_once_on_each_server(system: System) -> None:
     for ids in executed(system.folder).values():
         assert ids
         assert len(ids) == len(set(ids))
+
+
+def test_people_are_found_on_camera_frames_through_the_sidecars(system: System) -> None:
+    """The second example: frames of about 145 kB. Its servers compute a lot and live for this test only."""
+    servers = [system.start_node(f"{c}.detector", c, ["-m", "examples.human_detection.server"]) for c in CLOUDS]
+    robot = system.parts["robot.sidecar"]
+    system.wait("/detect_people to be offered", lambda: offered(robot, "/detect_people"))
+    run = Call(system, "--duration", "4", "--rate", "5", module="examples.human_detection.client").result()
+    assert_flawless(run)
+    for server in servers:
+        assert server.terminate() == 0
+    system.wait("/detect_people to be withdrawn", lambda: "/detect_people is withdrawn" in robot.log.read_text())
 
 
 def test_a_path_blackholed_silently_at_50_hz(system: System) -> None:
