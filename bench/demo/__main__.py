@@ -195,7 +195,7 @@ def _play(stage: Stage, clients: dict[str, Part], seconds: float) -> tuple[list[
 def _progress(name: str, client: Part) -> str:
     lines = _PROGRESS.findall(client.log.read_text(errors="replace"))
     unanswered, late, median = lines[-1] if lines else ("0", "0", "-")
-    shown = "dark" if median == "-" else f"{float(median):.0f} ms"
+    shown = "none" if median == "-" else f"{float(median):.0f} ms"
     colour = "red" if median == "-" or float(median) > DEADLINE_MS else "green"
     short = name.removesuffix(" alone").removesuffix(", both")
     return f"{short} [{colour}]{shown:>7}[/{colour}] late {late:>3} open {unanswered:>3}"

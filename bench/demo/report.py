@@ -71,9 +71,9 @@ def table(contenders: list[Contender], deadline_ms: float) -> Table:
     """For people."""
     from rich.table import Table
 
-    shown = Table(title=f"Robot asking for a path at 10 Hz, deadline {deadline_ms:g} ms")
-    shown.add_column("")
-    for column in ("requests", "lost", "twice", "mean ms", "P50 ms", "P99 ms", "missed", "PLR's wins"):
+    shown = Table(title=f"Robot asking for a path at 10 Hz, deadline {deadline_ms:g} ms; latencies in ms")
+    shown.add_column("", no_wrap=True)
+    for column in ("sent", "lost", "twice", "mean", "P50", "P99", "missed", "PLR's wins"):
         shown.add_column(column, justify="right", no_wrap=True)
     for row in contenders:
         shown.add_row(
