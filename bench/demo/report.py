@@ -10,13 +10,13 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
+from rich import box
+from rich.table import Table
 
 from examples.request_log import quantile
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from rich.table import Table
 
 UNANSWERED_MS = 10_000.0
 """An unanswered request counts as this in means and quantiles; left out, the worse system would look better."""
@@ -69,11 +69,10 @@ def contender(name: str, run: dict[str, Any], share_of_wins: float | None) -> Co
 
 def table(contenders: list[Contender], deadline_ms: float) -> Table:
     """For people."""
-    from rich.table import Table
-
-    shown = Table(title=f"Robot asking for a path at 10 Hz, deadline {deadline_ms:g} ms; latencies in ms")
+    title = f"Robot asking for a path at 10 Hz, deadline {deadline_ms:g} ms; latencies in ms"
+    shown = Table(box=box.SIMPLE, pad_edge=False, title=title)
     shown.add_column("", no_wrap=True)
-    for column in ("sent", "lost", "twice", "mean", "P50", "P99", "missed", "PLR's wins"):
+    for column in ("sent", "lost", "twice", "mean", "P50", "P99", "missed", "PLR wins"):
         shown.add_column(column, justify="right", no_wrap=True)
     for row in contenders:
         shown.add_row(
@@ -81,9 +80,9 @@ def table(contenders: list[Contender], deadline_ms: float) -> Table:
             str(row.sent),
             str(row.lost),
             str(row.answered_twice),
-            f"{row.mean_ms:.1f}",
-            f"{row.p50_ms:.1f}",
-            f"{row.p99_ms:.1f}",
+            f"{row.mean_ms:.0f}",
+            f"{row.p50_ms:.0f}",
+            f"{row.p99_ms:.0f}",
             f"{row.miss_ratio:.2%}",
             "" if row.share_of_wins is None else f"{row.share_of_wins:.0%}",
         )
