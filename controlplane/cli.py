@@ -21,7 +21,8 @@ import grpc
 from google.protobuf import json_format
 
 from controlplane import status_table, version
-from controlplane.config import ControlPlaneConfig, check_target
+from controlplane.config import ControlPlaneConfig
+from protos.config_fields import check_remote
 from protos.convert import status_from_proto
 from protos.errors import DecodeError
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc
@@ -76,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _address(text: str) -> str:
     try:
-        return check_target(text)
+        return check_remote(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ipaddress
-import re
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from controlplane import config_file
 from controlplane.core.control_events import Settings
+from protos.config_fields import ListenAddress, RemoteAddress, refuse_duplicates
+from protos.config_file import parse_yaml, read_text, validate
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,53 +16,9 @@ if TYPE_CHECKING:
 RECONNECT_MAX_MS = 10_000
 """Sidecars try again at most this far apart."""
 
-_LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
-_HOST = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
-
-
-def split_host_port(text: str) -> tuple[str, int]:
-    """Split host:port, IPv6 in brackets; raises ValueError that says what was expected."""
-    host, _, port = text.rpartition(":")
-    if not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
-        raise ValueError(f"expected host:port, got {text!r}")
-    if host.startswith("[") and host.endswith("]"):
-        try:
-            return str(ipaddress.IPv6Address(host[1:-1])), int(port)
-        except ipaddress.AddressValueError:
-            raise ValueError(f"expected an IPv6 address in the brackets, got {text!r}") from None
-    if not _HOST.fullmatch(host):
-        raise ValueError(f"expected host:port with a name, IPv4 or [IPv6] address, got {text!r}")
-    return host, int(port)
-
-
-def _listen(text: str) -> str:
-    split_host_port(text)
-    return text
-
-
-def check_target(text: str) -> str:
-    """Check host:port of a server to connect to; raises ValueError that says what was expected."""
-    host, port = split_host_port(text)
-    if port == 0:
-        raise ValueError(f"expected a port from 1 to 65535, got {text!r}")
-    if host in ("0.0.0.0", "::"):  # noqa: S104 - refused, not listened on
-        raise ValueError(f"expected an address that sidecars can reach, got {text!r}")
-    return text
-
 
 def _as_list(value: object) -> object:
     return (value,) if isinstance(value, str) else value
-
-
-def _each_once(values: tuple[str, ...]) -> tuple[str, ...]:
-    for index, value in enumerate(values):
-        if value in values[:index]:
-            raise ValueError(f"expected each entry once, got {value!r} twice")
-    return values
-
-
-Listen = Annotated[str, AfterValidator(_listen)]
-Target = Annotated[str, AfterValidator(check_target)]
 
 
 class ControlPlaneConfig(BaseModel):
@@ -71,23 +26,25 @@ class ControlPlaneConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", title="plr-controlplane")
 
-    listen: Listen = Field(default="[::]:50051", description="host:port of the gRPC server; port 0 takes a free one.")
+    listen: ListenAddress = Field(
+        default="[::]:50051", description="address:port of the gRPC server; port 0 takes a free one."
+    )
     stun_listen: Annotated[
-        tuple[Listen, ...], BeforeValidator(_as_list), AfterValidator(_each_once), Field(max_length=16)
+        tuple[ListenAddress, ...], BeforeValidator(_as_list), AfterValidator(refuse_duplicates), Field(max_length=16)
     ] = Field(
         default=("[::]:3478",),
-        description="host:port or a list of them where STUN is answered; an empty list turns it off. "
+        description="address:port or a list of them where STUN is answered; an empty list turns it off. "
         "[::] means all addresses, IPv4 included.",
     )
     stun_servers: Annotated[
-        tuple[Target, ...], BeforeValidator(_as_list), AfterValidator(_each_once), Field(max_length=16)
+        tuple[RemoteAddress, ...], BeforeValidator(_as_list), AfterValidator(refuse_duplicates), Field(max_length=16)
     ] = Field(
         default=(),
         description="host:port of the STUN servers that sidecars are told to use, seen from the sidecars: "
         "this one's public address, others, or both.",
     )
-    metrics_listen: Listen | None = Field(
-        default="127.0.0.1:9465", description="host:port for Prometheus; null turns it off."
+    metrics_listen: ListenAddress | None = Field(
+        default="127.0.0.1:9465", description="address:port for Prometheus; null turns it off."
     )
     lease_ms: int = Field(
         default=5000,
@@ -144,4 +101,9 @@ class ControlPlaneConfig(BaseModel):
 
 def load_config(path: Path) -> ControlPlaneConfig:
     """Read and check the configuration; raises ConfigError."""
-    return config_file.load(ControlPlaneConfig, path)
+    return parse_config(read_text(path), str(path))
+
+
+def parse_config(text: str, source: str) -> ControlPlaneConfig:
+    """Check YAML text; `source` names it in the error. Raises ConfigError."""
+    return validate(ControlPlaneConfig, parse_yaml(text, source), source)

@@ -13,11 +13,11 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from controlplane import admin, service
-from controlplane.config import split_host_port
 from controlplane.core.registry import MAX_SIDECARS
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
 from controlplane.stun_server import start_stun_server
+from protos.config_fields import split_host_port
 from protos.plr.v1 import admin_pb2_grpc
 
 if TYPE_CHECKING:

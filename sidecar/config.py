@@ -8,19 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from protos.config_fields import IpAddress, ListenAddress, RemoteAddress, refuse_duplicates
+from protos.config_file import key_path, parse_yaml, read_text, validate
 from protos.errors import ConfigError
 from protos.model import NodeName, Role, ServiceName
-from sidecar.config_fields import (
-    InterfacePattern,
-    IpAddress,
-    ListenAddress,
-    RemoteAddress,
-    ServicePattern,
-    SidecarName,
-    is_glob,
-    refuse_duplicates,
-)
-from sidecar.config_file import key_path, parse_yaml, read_text, validate
+from sidecar.config_fields import InterfacePattern, ServicePattern, SidecarName, is_glob
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
 
 if TYPE_CHECKING:

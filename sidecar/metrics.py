@@ -12,8 +12,8 @@ from prometheus_client import CollectorRegistry, ProcessCollector, start_http_se
 from prometheus_client.core import HistogramMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
+from protos.config_fields import split_host_port
 from protos.model import ResourceKind
-from sidecar.config_fields import split_host_port
 from sidecar.metric_families import by_one, counter, cumulative, gauge
 from sidecar.state_store import FAILURES
 

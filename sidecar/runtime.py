@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import sdnotify
 
+from protos.config_fields import split_host_port
 from protos.errors import ConfigError
 from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, SessionId, Version
-from sidecar.config_fields import split_host_port
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.core.engine import EngineConfig

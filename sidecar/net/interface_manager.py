@@ -13,9 +13,9 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from protos.config_fields import split_host_port
 from protos.errors import ConfigError
 from protos.model import Candidate, CandidateKind, InterfaceId
-from sidecar.config_fields import split_host_port
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady

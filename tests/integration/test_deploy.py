@@ -14,9 +14,9 @@ import yaml
 
 from controlplane.__main__ import EXIT_USAGE
 from controlplane.config import load_config as load_controlplane_config
-from controlplane.config import split_host_port
 from controlplane.core.control import ControlCore
 from controlplane.metrics import Metrics
+from protos.config_fields import split_host_port
 from protos.model import Role
 from sidecar.config import load_config
 from sidecar.core.control_session import ControlStats

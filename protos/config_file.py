@@ -1,4 +1,7 @@
-"""Strict YAML: no key written twice, and every problem as one line that names file, key and expectation."""
+"""Strict YAML: no key written twice, and every problem as one line that names file, key and expectation.
+
+Both planes read their configuration with it. `read_text` is the only thing in this package that touches a file.
+"""
 
 from __future__ import annotations
 
@@ -79,6 +82,8 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
     except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         # The constructors of the YAML package leak these for malformed scalars (!!int x, 2026-02-31).
         raise ConfigError(source, "", f"expected YAML: {_one_line(str(error))}") from error
+    if data is None:
+        return {}
     if not isinstance(data, dict):
         raise ConfigError(source, "", f"expected keys and values, got {_shown(data)}")
     for key in data:
