@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import random
 import sys
@@ -214,6 +215,10 @@ def run(config: SidecarConfig, version: str, stopping: threading.Event) -> int:
     sidecar = Sidecar(config, version)
     notifier = sdnotify.SystemdNotifier()
     sidecar.start()
+    # What start-up made stays: a full collection over it would hold the interpreter, and all interfaces, for 20 to
+    # 35 ms; with it set aside, a collection looks at the requests in flight only.
+    gc.collect()
+    gc.freeze()
     notifier.notify("READY=1")
     stopping.wait()
     log.info("stopping: no new requests, finishing those in flight")
