@@ -17,6 +17,7 @@ import re
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -167,8 +168,12 @@ def _start_robots(system: System, seconds: float) -> dict[str, Part]:
         argv += ["--seed", "1", "--json", str(system.folder / f"{_slug(name)}.json")]
         clients[name] = system.start_node(f"{_slug(name)}.client", "robot", argv, domain=domain)
     for client in clients.values():
-        system.wait(f"{client.name} to call", lambda client=client: " sent " in client.log.read_text())  # type: ignore[misc]
+        system.wait(f"{client.name} to call", partial(_has_called, client))
     return clients
+
+
+def _has_called(client: Part) -> bool:
+    return " sent " in client.log.read_text()
 
 
 def _slug(name: str) -> str:

@@ -31,6 +31,8 @@ from sidecar.core.link_events import (
     PathMeasured,
     PeerClosed,
     PeerRestarted,
+    Resend,
+    Send,
     SendFinished,
     SetPeers,
 )
@@ -114,9 +116,8 @@ class Engine:
         self._events.clear()
         return events
 
-    def _to_link(self, command: LinkCommand) -> None:
-        interface = None if isinstance(command, SetPeers) else command.path.interface  # type: ignore[union-attr]
-        self._commands.append((interface, command))
+    def _to_link(self, command: Send | Resend) -> None:
+        self._commands.append((command.path.interface, command))
 
     # -- the application's calls ----------------------------------------------------------------------------------
 

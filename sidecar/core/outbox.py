@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import InterfaceName, NodeName
-    from sidecar.core.link_events import LinkCommand
     from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
@@ -27,7 +26,7 @@ MAX_BYTES = 256 * 1024 * 1024
 class Outbox:
     """Undelivered messages, by number. The numbers are this session's own, never reused."""
 
-    def __init__(self, routes: Routes, command: Callable[[LinkCommand], None], stats: EngineStats) -> None:
+    def __init__(self, routes: Routes, command: Callable[[Send | Resend], None], stats: EngineStats) -> None:
         self._routes = routes
         self._command = command
         self._stats = stats

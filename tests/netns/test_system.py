@@ -208,7 +208,6 @@ def test_a_cloud_killed_and_brought_back(system: System, cloud: str) -> None:
     for part in ("echo", "planner", "sidecar"):
         system.parts[f"{cloud}.{part}"].kill()
     assert_flawless(call.result())
-    system.parts["robot.sidecar"].log.read_text()
     start_cloud(system, cloud)
     name = cloud.replace("_", "-")
     system.wait(f"{cloud} to be reached", lambda: counter(system, "plr_path_up", peer=name) == 2)

@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
-import tempfile
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.ros.mesh import Mesh
+from tests.ros_domains import leased_domain
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-ROS_DOMAINS = range(99, 0, -1)
+    from pathlib import Path
 
 
 @pytest.fixture
 def robot_domain() -> Iterator[int]:
-    """A second domain, beside `ros_domain`, that nobody else on this machine has at the moment."""
-    locks = Path(tempfile.gettempdir()) / f"plr-test-domains-{os.getuid()}"
-    locks.mkdir(exist_ok=True)
-    for domain in ROS_DOMAINS:
-        with (locks / str(domain)).open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            yield domain
-            return
-    pytest.fail("every ROS domain is taken")
+    """A second domain, beside `ros_domain`."""
+    with leased_domain() as domain:
+        yield domain
 
 
 @pytest.fixture
