@@ -1,0 +1,198 @@
+"""How large a datagram one path carries: packetization layer path MTU discovery (RFC 8899; RFC 9000 section 14.3).
+
+Sizes are bytes of UDP payload. Every path starts at BASE_BYTES, which need not be proven. Probes, padded to the size
+under test and answered by a small PROBE_REPLY, go up the STEPS to what the local interface takes; what is confirmed
+holds at once. ICMP is never believed. A lost probe is neither congestion nor a failure of the path.
+
+Two things bring a path back to the base: full-sized datagrams that vanish while small ones pass (a black hole,
+RFC 8899 section 4.3: the route changed), and the path having been down (it may be another route now).
+"""
+
+from __future__ import annotations
+
+BASE_BYTES = 1200
+"""What every path of the Internet carries (RFC 9000 section 14; BASE_PLPMTU)."""
+MAX_BYTES = 8952
+"""Jumbo frames of 9000 bytes less the headers of IPv6 and UDP; larger ones gain nothing more."""
+STEPS = (1252, 1372, 1452, 1472, 2048, 4096, MAX_BYTES)
+"""Sizes tried, where the interface takes them: MTU 1280, tunnels and mobile networks, Ethernet with IPv6, with IPv4,
+jumbo frames. What the interface itself takes is always tried last."""
+MAX_PROBES = 3
+"""Unanswered probes after which a size does not pass (RFC 8899 section 5.1.2)."""
+PROBE_TIMEOUT_S = 1.0
+"""A probe is unanswered after this (RFC 8899 section 5.1.1), or after some round trips of a slower path."""
+RAISE_EVERY_S = 600.0
+"""A larger size is looked for again this often (RFC 8899 section 5.1.1)."""
+RETRY_S = 10.0
+"""First new search after a black hole; doubles up to RAISE_EVERY_S with each further one, so that a path which carries
+probes but not data is left alone."""
+BLACK_HOLE_LOST = 6
+"""Datagrams above the base, lost in a row (at 5 % of random loss once in 60 million), ..."""
+BLACK_HOLE_REPORTS = 2
+"""... and found lost on as many occasions, since one burst takes many at once."""
+
+HEADERS_V4 = 28
+HEADERS_V6 = 48
+"""IP and UDP headers, without options."""
+PROBES_REMEMBERED = 2 * MAX_PROBES
+"""Probes whose late reply still counts."""
+
+
+def largest_payload(mtu: int, *, ipv6: bool) -> int:
+    """Return the UDP payload that an interface of this MTU (bytes) takes, within BASE_BYTES and MAX_BYTES."""
+    return min(max(mtu - (HEADERS_V6 if ipv6 else HEADERS_V4), BASE_BYTES), MAX_BYTES)
+
+
+class PathMtu:
+    """The size of one path's datagrams, and the search for a larger one."""
+
+    __slots__ = (
+        "_at",
+        "_hole_at",
+        "_holes",
+        "_limit",
+        "_out",
+        "_reports",
+        "_row",
+        "_small_passed",
+        "_target",
+        "_tries",
+        "size",
+    )
+
+    def __init__(self) -> None:
+        self.size = BASE_BYTES
+        """Largest datagram that may be sent, in bytes."""
+        self._limit = BASE_BYTES
+        self._at: float | None = None
+        self._target: int | None = None
+        """The size under test; None between two searches."""
+        self._tries = 0
+        self._out: dict[int, int] = {}
+        """Sizes of the latest probes by their id."""
+        self._holes = 0
+        self._hole_at = 0.0
+        self._forgive()
+
+    # -- the path's life ------------------------------------------------------------------------------------------
+
+    def start(self, limit: int, now: float) -> None:
+        """The path is up: look for the largest size up to `limit` (see `largest_payload`), at once."""
+        self._limit = limit
+        self._target = None
+        self._at = now
+
+    def set_limit(self, limit: int, now: float) -> bool:
+        """The interface takes another size than it did; True when that makes datagrams smaller."""
+        if limit == self._limit or self._at is None:
+            return False
+        lowered = self.size > limit
+        self.size = min(self.size, limit)
+        self.start(limit, now)
+        return lowered
+
+    def stop(self) -> bool:
+        """The path is down, or leads elsewhere: back to the base without probing; True when it was above it."""
+        lowered = self._to_base()
+        self._at = None
+        return lowered
+
+    # -- probing --------------------------------------------------------------------------------------------------
+
+    @property
+    def timer(self) -> float | None:
+        """When `next_probe` is wanted; None while nothing is looked for."""
+        return self._at
+
+    def next_probe(self, probe_id: int, now: float, timeout_s: float = PROBE_TIMEOUT_S) -> int | None:
+        """Return the size of the probe that leaves now under this id; None when none is due.
+
+        `timeout_s` is when its reply is overdue, at least PROBE_TIMEOUT_S.
+        """
+        if self._at is None or now < self._at:
+            return None
+        if self._target is None:
+            self._target = self._above()
+            self._tries = 0
+        if self._target is None or self._tries == MAX_PROBES:
+            self._rest(now)
+            return None
+        self._tries += 1
+        self._at = now + max(timeout_s, PROBE_TIMEOUT_S)
+        self._out[probe_id] = self._target
+        if len(self._out) > PROBES_REMEMBERED:
+            del self._out[next(iter(self._out))]
+        return self._target
+
+    def on_reply(self, probe_id: int, now: float) -> bool:
+        """A PROBE_REPLY came; False when it answers none of these probes."""
+        size = self._out.pop(probe_id, None)
+        if size is None:
+            return False
+        if self.size < size <= self._limit:
+            self.size = size
+            self._forgive()
+            if self._target is not None and self._target <= size:
+                self._target = None
+                self._at = now
+        return True
+
+    def _above(self) -> int | None:
+        """The next size worth testing."""
+        for step in STEPS:
+            if self.size < step < self._limit:
+                return step
+        return self._limit if self.size < self._limit else None
+
+    def _rest(self, now: float) -> None:
+        self._target = None
+        self._at = now + RAISE_EVERY_S
+
+    # -- what becomes of the data ---------------------------------------------------------------------------------
+
+    def on_delivered(self, size: int) -> None:
+        """A datagram of this many bytes was acknowledged or answered."""
+        if size > BASE_BYTES:
+            self._forgive()
+        elif self._row:
+            self._small_passed = True
+
+    def on_lost(self, count: int, now: float) -> bool:
+        """`count` datagrams above BASE_BYTES were found lost at once; True when datagrams get smaller by it."""
+        if self.size == BASE_BYTES:
+            return False
+        self._row += count
+        self._reports += 1
+        if self._row < BLACK_HOLE_LOST or self._reports < BLACK_HOLE_REPORTS or not self._small_passed:
+            return False
+        self._holes = 1 if now > self._hole_at + RAISE_EVERY_S else self._holes + 1
+        self._hole_at = now
+        self._to_base()
+        self._at = now + min(RETRY_S * 2.0 ** (self._holes - 1), RAISE_EVERY_S)
+        return True
+
+    def on_too_big(self, size: int, now: float) -> bool:
+        """The kernel refused to send this many bytes over the interface; True when datagrams get smaller by it."""
+        if size <= BASE_BYTES or self._at is None:
+            return False
+        self._limit = min(self._limit, size - 1)
+        if size > self.size:
+            if self._target is not None and self._target >= size:
+                self._target, self._at = None, now
+            return False
+        self.size = max((step for step in (BASE_BYTES, *STEPS) if step < size), default=BASE_BYTES)
+        self.start(self._limit, now)
+        return True
+
+    def _forgive(self) -> None:
+        self._row = 0
+        self._reports = 0
+        self._small_passed = False
+
+    def _to_base(self) -> bool:
+        lowered = self.size > BASE_BYTES
+        self.size = BASE_BYTES
+        self._target = None
+        self._out.clear()
+        self._forgive()
+        return lowered
