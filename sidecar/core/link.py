@@ -22,10 +22,12 @@ from sidecar.core.link_events import (
     PathMeasured,
     PeerClosed,
     PeerRestarted,
+    Rebind,
     Resend,
     Send,
     SendClose,
     SendFinished,
+    SetCarrier,
     SetPeers,
     SetReady,
 )
@@ -53,7 +55,8 @@ MAX_PENDING_FRAMES = 256
 class Link:
     """All paths over one interface."""
 
-    def __init__(self, identity: LinkIdentity, rng: random.Random, now: float) -> None:
+    def __init__(self, identity: LinkIdentity, rng: random.Random, now: float, first_number: int = 0) -> None:
+        """`first_number`: the `next_number` of the link that had this interface before, in the same session."""
         self.identity = identity
         self.stats = LinkStats(identity.interface)
         self._builder = DatagramBuilder(identity, self.stats, rng)
@@ -61,12 +64,13 @@ class Link:
         self._by_token: dict[bytes, LinkPeer] = {}
         self._paths: dict[tuple[NodeName, InterfaceId], Path] = {}
         self._ready = False
+        self._carrier = True
         self._closing = False
         self._events: deque[LinkEvent] = deque()
         self._dirty: dict[PathId, Path] = {}
         self._timers: Timers[PathId] = Timers()
         self._measure_at = now + MEASURE_EVERY_S
-        self._first_number = 0
+        self._first_number = first_number
 
     # -- what the driver calls ------------------------------------------------------------------------------------
 
@@ -124,10 +128,16 @@ class Link:
                 self._set_peers(peers, now)
             case SetReady(ready):
                 self._ready = ready
+                self._probe_what_is_down(now)
+            case SetCarrier(on):
+                self._carrier = on
                 for path in self._paths.values():
-                    if ready and path.state is PathState.DOWN:
-                        path.probe_at = now
-                    self._dirty[path.id] = path
+                    if not on and path.state is not PathState.DOWN:
+                        self._take_down(path, "no carrier")
+                self._probe_what_is_down(now)
+            case Rebind():
+                for path in self._paths.values():
+                    self._rebind(path, now)
             case SendClose():
                 self._closing = True
                 for path in self._paths.values():
@@ -158,7 +168,7 @@ class Link:
     def datagrams_to_send(self, now: float) -> list[tuple[Address, bytes]]:
         """Build what may leave now, at most about BURST_DATAGRAMS; call again until nothing comes."""
         out: list[tuple[Address, bytes]] = []
-        probing = self._ready and not self._closing
+        probing = self._may_probe
         for path in list(self._dirty.values()):
             if self._builder.build(path, out, now, probing=probing):
                 del self._dirty[path.id]
@@ -237,6 +247,16 @@ class Link:
         self._report_measured(path)  # before its first request, so that its round-trip time counts in the choice
         self._events.append(PathChanged(path.id, PathState.UP, "answers"))
 
+    @property
+    def _may_probe(self) -> bool:
+        return self._ready and self._carrier and not self._closing
+
+    def _probe_what_is_down(self, now: float) -> None:
+        for path in self._paths.values():
+            if path.state is PathState.DOWN:
+                path.probe_soon(now)
+            self._dirty[path.id] = path
+
     # -- sending --------------------------------------------------------------------------------------------------
 
     def _live_path(self, path_id: PathId, message: OutboundMessage, indices: Iterable[int]) -> Path | None:
@@ -281,6 +301,15 @@ class Link:
         self._report_lost(path, path.recovery.give_up_all())
         for message, indices in path.queue.clear():
             self._events.append(FragmentsLost(path.id, message, indices))
+
+    def _rebind(self, path: Path, now: float) -> None:
+        """What is under way left from where we no longer are, or its answers go there: it travels again elsewhere."""
+        was_up = path.state is PathState.UP
+        path.start_afresh(now)
+        self._dirty[path.id] = path
+        if was_up:
+            self._events.append(PathChanged(path.id, path.state, "rebinding"))
+        self._report_lost(path, path.recovery.give_up_all(), timed_out=True)
 
     def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
         by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}
@@ -332,13 +361,17 @@ class Link:
             for name, path in best.items()
         }
 
+    @property
+    def next_number(self) -> int:
+        """No path of this link used this packet number or a later one."""
+        return max((self._first_number, *(path.recovery.next_number for path in self._paths.values())))
+
     # -- peers ----------------------------------------------------------------------------------------------------
 
     def _set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> None:
         before = self._paths
         # A peer that comes back may remember our old packet numbers under the same session: never use one again.
-        used = (path.recovery.next_number for path in before.values())
-        first_number = self._first_number = max((self._first_number, *used))
+        first_number = self._first_number = self.next_number
         self._by_session = {peer.session: peer for peer in peers}
         self._by_token = {peer.token: peer for peer in peers}
         self._paths = {}
@@ -370,7 +403,7 @@ class Link:
     def _arm(self, path: Path) -> None:
         recovery = path.recovery
         timers = (
-            path.probe_at if self._ready and not self._closing else None,
+            path.probe_at if self._may_probe else None,
             path.received.ack_at,
             recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
             path.silence_timer,

@@ -39,6 +39,18 @@ class SetReady:
 
 
 @dataclass(frozen=True, slots=True)
+class SetCarrier:
+    """Whether the interface can carry anything: without carrier or address its paths are down at once, unprobed."""
+
+    on: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Rebind:
+    """The interface's address or gateway changed: what was measured is void, and peers must learn where we are."""
+
+
+@dataclass(frozen=True, slots=True)
 class Send:
     """Send a whole message over this path."""
 
@@ -68,7 +80,7 @@ class SendClose:
     """Tell all peers that we go away."""
 
 
-LinkCommand = SetPeers | SetReady | Send | Resend | SendFinished | SendClose
+LinkCommand = SetPeers | SetReady | SetCarrier | Rebind | Send | Resend | SendFinished | SendClose
 
 
 class FragmentReceived(NamedTuple):

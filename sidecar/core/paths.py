@@ -8,6 +8,7 @@ from sidecar.core.pacing import SendQueue, Window
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.received import ReceivedPackets
 from sidecar.core.recovery import Recovery
+from sidecar.core.rtt import RttEstimator
 
 if TYPE_CHECKING:
     import random
@@ -40,6 +41,7 @@ class Path:
         "_probe_gap",
         "_probed_at",
         "_probes_out",
+        "_rebound",
         "_waiting_since",
         "bytes_sent",
         "candidates",
@@ -87,6 +89,7 @@ class Path:
         self._next_probe_id = 0
         self._probes_out: dict[int, float] = {}
         self._waiting_since: float | None = None
+        self._rebound = False
 
     @property
     def peer(self) -> NodeName:
@@ -94,8 +97,8 @@ class Path:
         return self.id.peer
 
     def destinations(self) -> tuple[Address, ...]:
-        """Where a probe goes now: the known address, or every candidate while the path is not up."""
-        if self.remote is not None and self.state is not PathState.DOWN:
+        """Where a probe goes now: the known address, or every candidate while the path is down or just rebound."""
+        if self.remote is not None and self.state is not PathState.DOWN and not self._rebound:
             return (self.remote,)
         if self.remote is not None and self.remote not in self.candidates:
             return (self.remote, *self.candidates)
@@ -125,6 +128,22 @@ class Path:
         if self.probe_at is not None:
             self.probe_at = min(self.probe_at, max(now, self._probed_at + FIRST_PROBE_S))
 
+    def probe_soon(self, now: float) -> None:
+        """The path may have come back: probe at once, and the first ones close together."""
+        self._probe_gap = FIRST_PROBE_S
+        self.probe_at = now
+
+    def start_afresh(self, now: float) -> None:
+        """The way to the peer changed: nothing measured on the old one holds (RFC 9000 section 9.4)."""
+        self.recovery.rtt = RttEstimator()
+        self.window = Window()
+        self._probes_out.clear()
+        self._rebound = True
+        self.probe_soon(now)
+        if self.state is PathState.UP:
+            self.state = PathState.UNSTABLE
+            self._waiting_since = now
+
     def answered_probe(self, probe_id: int, now: float) -> bool:
         """A PROBE_REPLY came; False when it answers nothing we asked."""
         sent_at = self._probes_out.pop(probe_id, None)
@@ -147,6 +166,7 @@ class Path:
     def made_progress(self, now: float) -> bool:
         """The peer proved that our datagrams arrive; True when that brings the path up."""
         self._waiting_since = now if self.recovery.sent else None
+        self._rebound = False
         if self.state is PathState.UP:
             if self.probe_at is None or self.probe_at < now + IDLE_PROBE_S / 2:
                 self.probe_at = now + IDLE_PROBE_S

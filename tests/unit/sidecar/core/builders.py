@@ -90,9 +90,11 @@ class Bench:
     link: Link = field(init=False)
     now: float = 1.0
     number: int = -1
+    first_number: int = 0
 
     def __post_init__(self) -> None:
-        self.link = Link(LinkIdentity(WLAN, InterfaceId(3), OUR_SESSION, OUR_TOKEN, 7), random.Random(1), self.now)
+        identity = LinkIdentity(WLAN, InterfaceId(3), OUR_SESSION, OUR_TOKEN, 7)
+        self.link = Link(identity, random.Random(1), self.now, self.first_number)
         self.know()
         self.link.execute(SetReady(ready=True), self.now)
 

@@ -14,10 +14,12 @@ from sidecar.core.link_events import (
     PathMeasured,
     PeerClosed,
     PeerRestarted,
+    Rebind,
     Resend,
     Send,
     SendClose,
     SendFinished,
+    SetCarrier,
     SetPeers,
     SetReady,
 )
@@ -152,6 +154,61 @@ def test_sending_over_a_path_that_is_not_usable_says_so_and_hands_back() -> None
             PathChanged(target, PathState.DOWN, "not usable here"),
             FragmentsLost(target, outbound, (1,)),
         ]
+
+
+# -- the interface itself changes -------------------------------------------------------------------------------------
+
+
+def test_a_lost_carrier_takes_every_path_down_at_once_and_hands_back_what_they_carried() -> None:
+    bench = up()
+    sent = message()
+    bench.link.execute(Send(PATH, sent), bench.now)
+    bench.sent()
+    bench.link.execute(SetCarrier(False), bench.now)
+    events = bench.events()
+    assert PathChanged(PATH, PathState.DOWN, "no carrier") in events
+    assert [event.message for event in events if isinstance(event, FragmentsLost)] == [sent]
+    bench.now += 10
+    assert bench.sent() == [], "nothing is probed without a carrier"
+    bench.link.execute(SetCarrier(True), bench.now)
+    assert [type(item) for item in frames(bench.sent())] == [Hello, Probe]
+
+
+def test_what_was_under_way_when_the_carrier_went_does_not_bring_the_path_up() -> None:
+    bench = up()
+    bench.link.execute(Send(PATH, message()), bench.now)
+    number = numbers(bench.sent())[0]
+    bench.link.execute(SetCarrier(False), bench.now)
+    bench.events()
+    bench.receive(frame.encode_ack(((number, number),), 0.0))
+    assert state_changes(bench) == []
+
+
+def test_a_rebinding_makes_a_path_unstable_until_it_answers_and_resends_what_was_under_way() -> None:
+    bench = up()
+    sent = message()
+    bench.link.execute(Send(PATH, sent), bench.now)
+    bench.sent()
+    bench.now += 0.001
+    bench.link.execute(Rebind(), bench.now)
+    events = bench.events()
+    assert PathChanged(PATH, PathState.UNSTABLE, "rebinding") in events
+    lost = [event for event in events if isinstance(event, FragmentsLost)]
+    assert lost == [FragmentsLost(PATH, sent, tuple(range(sent.count)), timed_out=True)]
+    (probe,) = [item for item in frames(bench.sent()) if isinstance(item, Probe)]
+    bench.now += 0.03
+    bench.receive(frame.encode_probe_reply(ProbeReply(probe.id)))
+    assert state_changes(bench) == [PathState.UP]
+    bench.link.handle_timer(bench.now + 1)
+    assert bench.link.stats.paths[A].srtt_s == pytest.approx(0.03), "the round-trip time is the new way's alone"
+
+
+def test_a_link_opened_anew_goes_on_with_the_packet_numbers_of_the_one_before() -> None:
+    bench = up()
+    first = bench.link.next_number
+    assert first > 0
+    again = Bench(first_number=first)
+    assert numbers(again.sent()) == [first]
 
 
 def test_the_peers_newest_address_is_followed() -> None:

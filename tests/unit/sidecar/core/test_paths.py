@@ -144,3 +144,16 @@ def test_probes_go_to_every_candidate_until_the_path_is_up() -> None:
     assert subject.destinations() == (HERE, THERE)
     subject.state = PathState.UP
     assert subject.destinations() == (THERE,)
+
+
+def test_after_a_rebinding_every_candidate_is_asked_until_one_answers() -> None:
+    subject = up()
+    subject.remote = ELSEWHERE
+    assert subject.destinations() == (ELSEWHERE,)
+    subject.start_afresh(101.0)
+    assert subject.state is PathState.UNSTABLE
+    assert not subject.recovery.rtt.has_sample
+    assert subject.destinations() == (ELSEWHERE, HERE, THERE)
+    assert subject.answered_probe(subject.next_probe(101.0, RNG), 101.02)
+    assert subject.made_progress(101.02)
+    assert subject.destinations() == (ELSEWHERE,)
