@@ -36,6 +36,7 @@ from std_srvs.srv import Empty
 
 from protos.model import NodeName, Role, ServiceName, SessionId
 from sidecar.core.events import ExecuteRequest, ExecutionId, OfferService, RequestFailed, ResponseArrived
+from sidecar.core.priority import Priority
 from sidecar.core.rules import ServiceRule
 from sidecar.ros import rcl
 
@@ -159,7 +160,16 @@ class Shortcut:
         self._requests[execution] = (request_id, service)
         assert self.cloud is not None
         self.cloud.handle(
-            ExecuteRequest(execution, service, "std_srvs/srv/Empty", payload, NodeName("robot"), CALL_TIMEOUT_S)
+            ExecuteRequest(
+                execution,
+                service,
+                "std_srvs/srv/Empty",
+                payload,
+                NodeName("robot"),
+                Priority.NORMAL,
+                1.0,
+                CALL_TIMEOUT_S,
+            )
         )
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:

@@ -13,6 +13,7 @@ from protos.config_file import key_path, parse_yaml, read_text, validate
 from protos.errors import ConfigError
 from protos.model import NodeName, Role, ServiceName
 from sidecar.config_fields import InterfacePattern, ServicePattern, SidecarName, is_glob
+from sidecar.core.priority import Priority
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
 
 if TYPE_CHECKING:
@@ -48,6 +49,14 @@ class LogLevel(enum.Enum):
     INFO = "info"
     WARNING = "warning"
     ERROR = "error"
+
+
+class PriorityWord(enum.Enum):
+    """Which of a robot's services go first."""
+
+    LOW = "low"
+    NORMAL = "normal"
+    HIGH = "high"
 
 
 class _Section(BaseModel):
@@ -96,6 +105,8 @@ class ServiceConfig(_Section):
     """Robot: copies of one request may run on several servers. Default false."""
     drop_late: bool | None = None
     """Robot: an answer after the deadline is not delivered. Default false."""
+    priority: Annotated[PriorityWord | None, _converted] = None
+    """Robot: low, normal or high; what is higher never waits for what is lower. Default normal."""
     capacity_interfaces: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Cloud: how many robot interfaces may be mapped to this server for the service; none: no limit."""
 
@@ -174,6 +185,7 @@ def _rule(role: Role, service: ServiceConfig) -> ServiceRule:
         lifetime_s=lifetime_ms / _MS_PER_S,
         idempotent=bool(service.idempotent),
         drop_late=bool(service.drop_late),
+        priority=Priority[(service.priority or PriorityWord.NORMAL).name],
         capacity=service.capacity_interfaces or _UNLIMITED,
     )
 
@@ -202,7 +214,7 @@ def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
 
 def _check_service(role: Role, service: ServiceConfig) -> Iterator[tuple[str, str]]:
     if role is Role.CLOUD:
-        for key in ("deadline_ms", "idempotent", "drop_late"):
+        for key in ("deadline_ms", "idempotent", "drop_late", "priority"):
             if getattr(service, key) is not None:
                 yield key, "expected on a robot only: it is the robot's sidecar that decides this"
         return

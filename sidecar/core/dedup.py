@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
     from sidecar.core.messages import RequestMessage
     from sidecar.core.path_id import PathId
+    from sidecar.core.priority import Priority
     from sidecar.core.stats import EngineStats
 
 MAX_RUNNING = 8192
@@ -50,10 +51,12 @@ class Waiter:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Send this to the robot; it is of no use after `expires`."""
+    """Send this to the robot: wanted by `deadline`, of no use after `expires`."""
 
     waiter: Waiter
     message: ResponseMessage | RejectionMessage
+    priority: Priority
+    deadline: float
     expires: float
 
 
@@ -63,6 +66,9 @@ class _Execution:
     request_id: RequestId
     robot: NodeName
     service: ServiceName
+    priority: Priority
+    deadline: float
+    """When the robot wants its answer."""
     expires: float
     """When no robot waits any more."""
     patience_ends: float
@@ -142,6 +148,8 @@ class ExecutionTable:
             message.request_id,
             path.peer,
             message.service,
+            message.priority,
+            now + message.deadline_left_s,
             now + lifetime,
             now + patience_s,
             lifetime,
@@ -156,7 +164,14 @@ class ExecutionTable:
         # bytes(): the buffer is the reassembler's and rmw wants bytes.
         payload = bytes(message.payload)
         return ExecuteRequest(
-            execution.id, message.service, message.type, payload, path.peer, min(lifetime, patience_s)
+            execution.id,
+            message.service,
+            message.type,
+            payload,
+            path.peer,
+            message.priority,
+            message.deadline_left_s,
+            min(lifetime, patience_s),
         )
 
     def _arm(self, execution: _Execution) -> None:
@@ -175,7 +190,8 @@ class ExecutionTable:
         else:
             self._stats.executions[message.service, "refused"] += 1
         rejection = RejectionMessage(message.request_id, message.copy, reason, text)
-        return Reply(waiter, rejection, now + min(message.lifetime_left_s, MAX_LIFETIME_S))
+        expires = now + min(message.lifetime_left_s, MAX_LIFETIME_S)
+        return Reply(waiter, rejection, message.priority, now + message.deadline_left_s, expires)
 
     def complete(self, execution_id: ExecutionId, payload: bytes, processing_s: float, now: float) -> list[Reply]:
         """The local server answered."""
@@ -253,9 +269,10 @@ class ExecutionTable:
         request_id = execution.request_id
         if execution.payload is not None:
             response = ResponseMessage(request_id, waiter.copy, execution.processing_s, execution.payload)
-            return Reply(waiter, response, expires)
+            return Reply(waiter, response, execution.priority, execution.deadline, expires)
         reason, text = execution.refusal or (RejectReason.FORGOTTEN, "answered before; the answer is gone")
-        return Reply(waiter, RejectionMessage(request_id, waiter.copy, reason, text), expires)
+        rejection = RejectionMessage(request_id, waiter.copy, reason, text)
+        return Reply(waiter, rejection, execution.priority, execution.deadline, expires)
 
     def _cache(self, execution: _Execution) -> None:
         size = len(execution.payload or b"")

@@ -311,7 +311,13 @@ class Engine:
             path = reply.waiter.path
             if self.routes.state(path) is PathState.DOWN:
                 path = self.routes.best_to(path.peer) or path
-            self._outbox.send(path, encode_message(reply.message), deadline=reply.expires, expires=reply.expires)
+            self._outbox.send(
+                path,
+                encode_message(reply.message),
+                priority=reply.priority,
+                deadline=reply.deadline,
+                expires=reply.expires,
+            )
 
     def _on_path_changed(self, event: PathChanged, now: float) -> None:
         path, state = event.path, event.state

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NewType
 
 if TYPE_CHECKING:
     from protos.model import Assignment, InterfaceName, NodeName, ServiceName
+    from sidecar.core.priority import Priority
 
 RequestId = NewType("RequestId", bytes)
 """16 bytes that name one request for ever; see `request_id.py`."""
@@ -101,6 +102,9 @@ class ExecuteRequest:
     type: str
     payload: bytes = field(repr=False)
     robot: NodeName
+    priority: Priority
+    deadline_s: float
+    """Seconds from now after which the answer is late; 0 when it is late already."""
     expires_s: float
     """Seconds from now after which nobody waits for the answer."""
 

@@ -1,11 +1,12 @@
 """What a reassembled message holds. Integers are big-endian.
 
-    request    1  request id (16 bytes) copy (8) lifetime left in ms (32) n (16) service name m (16) type name, payload
+    request    1  request id (16 bytes) copy (8) priority (8) deadline left in us (32) lifetime left in ms (32)
+                  n (16) service name m (16) type name, payload
     response   2  request id (16 bytes) copy (8) processing time in us (32), payload
     rejection  3  request id (16 bytes) copy (8) reason (8) n (16) text
 
 `copy` numbers the copies of one request; the answer repeats it, so that each copy's latency is known whichever path
-the answer takes.
+the answer takes. A deadline that is over has 0 left.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from protos.model import ServiceName
 from sidecar.core.events import RejectReason, RequestId
+from sidecar.core.priority import Priority
 from sidecar.core.request_id import REQUEST_ID_BYTES
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ MAX_NAME_BYTES = 255
 MAX_TEXT_BYTES = 500
 
 _HEAD = struct.Struct(f">B{REQUEST_ID_BYTES}sB")
+_REQUEST_TIMES = struct.Struct(">BII")
 _U32 = struct.Struct(">I")
 _U16 = struct.Struct(">H")
 _REQUEST, _RESPONSE, _REJECTION = 1, 2, 3
@@ -38,6 +41,8 @@ class RequestMessage:
 
     request_id: RequestId
     copy: int
+    priority: Priority
+    deadline_left_s: float
     lifetime_left_s: float
     service: ServiceName
     type: str
@@ -71,11 +76,12 @@ def encode_message(message: Message) -> bytes:
     """Return the message's bytes (one copy of the payload, into the buffer the fragments are cut from)."""
     if isinstance(message, RequestMessage):
         service, kind = message.service.encode(), message.type.encode()
-        lifetime_ms = max(0, min(int(message.lifetime_left_s * 1e3), 0xFFFFFFFF))
+        deadline_us = _clamped(message.deadline_left_s * 1e6)
+        lifetime_ms = _clamped(message.lifetime_left_s * 1e3)
         return b"".join(
             (
                 _HEAD.pack(_REQUEST, message.request_id, message.copy),
-                _U32.pack(lifetime_ms),
+                _REQUEST_TIMES.pack(message.priority, deadline_us, lifetime_ms),
                 _U16.pack(len(service)),
                 service,
                 _U16.pack(len(kind)),
@@ -84,7 +90,7 @@ def encode_message(message: Message) -> bytes:
             )
         )
     if isinstance(message, ResponseMessage):
-        processing_us = max(0, min(int(message.processing_s * 1e6), 0xFFFFFFFF))
+        processing_us = _clamped(message.processing_s * 1e6)
         return b"".join(
             (
                 _HEAD.pack(_RESPONSE, message.request_id, message.copy),
@@ -120,11 +126,17 @@ def decode_message(view: memoryview) -> Message:
 
 
 def _decode_request(request_id: RequestId, copy: int, view: memoryview, position: int) -> Message:
-    (lifetime_ms,) = _U32.unpack_from(view, position)
-    service, position = _decode_text(view, position + 4, MAX_NAME_BYTES)
+    priority, deadline_us, lifetime_ms = _REQUEST_TIMES.unpack_from(view, position)
+    try:
+        priority = Priority(priority)
+    except ValueError:
+        raise DecodeError("unknown priority") from None
+    service, position = _decode_text(view, position + _REQUEST_TIMES.size, MAX_NAME_BYTES)
     kind, position = _decode_text(view, position, MAX_NAME_BYTES)
     payload = _payload(view, position)
-    return RequestMessage(request_id, copy, lifetime_ms / 1e3, ServiceName(service), kind, payload)
+    return RequestMessage(
+        request_id, copy, priority, deadline_us / 1e6, lifetime_ms / 1e3, ServiceName(service), kind, payload
+    )
 
 
 def _decode_response(request_id: RequestId, copy: int, view: memoryview, position: int) -> Message:
@@ -148,6 +160,10 @@ _DECODERS: dict[int, Callable[[RequestId, int, memoryview, int], Message]] = {
     _RESPONSE: _decode_response,
     _REJECTION: _decode_rejection,
 }
+
+
+def _clamped(value: float) -> int:
+    return max(0, min(int(value), 0xFFFFFFFF))
 
 
 def _payload(view: memoryview, position: int) -> memoryview:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.frame import MAX_SYMBOL_BYTES, symbol_count
+from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
     from protos.model import NodeName
@@ -18,7 +19,19 @@ class OutboundMessage:
     that reads an old value merely sends a symbol that is no longer needed.
     """
 
-    __slots__ = ("acked", "count", "data", "deadline", "expires", "interfaces", "number", "over", "path", "symbol")
+    __slots__ = (
+        "acked",
+        "count",
+        "data",
+        "deadline",
+        "expires",
+        "interfaces",
+        "number",
+        "over",
+        "path",
+        "priority",
+        "symbol",
+    )
 
     def __init__(
         self,
@@ -26,6 +39,7 @@ class OutboundMessage:
         path: PathId,
         data: bytes,
         *,
+        priority: Priority = Priority.NORMAL,
         deadline: float,
         expires: float,
         symbol: int = MAX_SYMBOL_BYTES,
@@ -36,6 +50,7 @@ class OutboundMessage:
         self.interfaces = {path.interface}
         """Those it was sent over; the engine's, links do not look at this."""
         self.data = memoryview(data)
+        self.priority = priority
         self.deadline = deadline
         self.expires = expires
         self.symbol = symbol

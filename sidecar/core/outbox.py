@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, NodeName
     from sidecar.core.path_id import PathId
+    from sidecar.core.priority import Priority
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
 
@@ -53,12 +54,14 @@ class Outbox:
             and held.held(peer) + size <= REASSEMBLED_PEER_BYTES
         )
 
-    def send(self, path: PathId, data: bytes, *, deadline: float, expires: float) -> OutboundMessage | None:
+    def send(
+        self, path: PathId, data: bytes, *, priority: Priority, deadline: float, expires: float
+    ) -> OutboundMessage | None:
         """Send a message over `path`; None (counted) when there is no room."""
         if not self.has_room(path.peer, len(data)):
             self._stats.dropped["outbox_full"] += 1
             return None
-        message = OutboundMessage(self._next_number, path, data, deadline=deadline, expires=expires)
+        message = OutboundMessage(self._next_number, path, data, priority=priority, deadline=deadline, expires=expires)
         self._next_number += 1
         self._messages[message.number] = message
         self._shares_of_messages.take(path.peer)

@@ -176,13 +176,19 @@ class RequestTable:
         head = RequestMessage(
             request.id,
             len(request.copies),
+            request.rule.priority,
+            request.deadline_at - now,
             request.expires_at - now,
             request.service,
             request.type,
             request.payload,
         )
         message = self._parts.outbox.send(
-            path, encode_message(head), deadline=request.deadline_at, expires=request.expires_at
+            path,
+            encode_message(head),
+            priority=request.rule.priority,
+            deadline=request.deadline_at,
+            expires=request.expires_at,
         )
         if message is not None:
             request.copies.append(Copy(path, now, message))

@@ -10,6 +10,8 @@ import fnmatch
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from sidecar.core.priority import Priority
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -50,6 +52,8 @@ class ServiceRule:
     """Copies of one request may run on several servers."""
     drop_late: bool = False
     """A response after the deadline is not delivered."""
+    priority: Priority = Priority.NORMAL
+    """Whose messages and executions go first where something waits."""
     capacity: int = 0
     """Cloud: how many robot interfaces may be mapped here; 0 means no limit."""
 

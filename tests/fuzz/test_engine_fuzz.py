@@ -17,6 +17,7 @@ from sidecar.core.link import MAX_PENDING_FRAMES
 from sidecar.core.messages import Message, RejectionMessage, RequestMessage, ResponseMessage, encode_message
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES
 from sidecar.core.path_id import PathState
+from sidecar.core.priority import Priority
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
@@ -42,7 +43,9 @@ def some_message(rng: random.Random) -> Message:
     service = rng.choice([SERVICE, SERVICE, ServiceName(f"/made/up/{rng.random()}")])
     lifetime = rng.choice([0.0, 1.0, 4e6])
     choices: list[Message] = [
-        RequestMessage(request_id, copy, lifetime, service, rng.choice([TYPE, "other"]), rng.randbytes(20)),
+        RequestMessage(
+            request_id, copy, Priority.NORMAL, 0.1, lifetime, service, rng.choice([TYPE, "other"]), rng.randbytes(20)
+        ),
         ResponseMessage(request_id, copy, 0.1, b"lie"),
         RejectionMessage(request_id, copy, rng.choice(list(RejectReason)), "lie"),
     ]
@@ -62,7 +65,7 @@ ATTACKS: dict[str, Callable[[random.Random], bytes]] = {
     "messages": lambda rng: whole(rng.getrandbits(60), some_message(rng)),
     "requests": lambda rng: whole(
         rng.getrandbits(60),
-        RequestMessage(RequestId(rng.randbytes(16)), 0, 300.0, SERVICE, TYPE, rng.randbytes(900)),
+        RequestMessage(RequestId(rng.randbytes(16)), 0, Priority.NORMAL, 0.1, 300.0, SERVICE, TYPE, rng.randbytes(900)),
     ),
     "goodbyes": lambda rng: frame.encode_close() * 64,
     "restarts": lambda rng: frame.encode_hello(frame.Hello(rng.randbytes(16), rng.getrandbits(64))),

@@ -18,13 +18,24 @@ from sidecar.core.messages import (
     decode_message,
     encode_message,
 )
+from sidecar.core.priority import Priority
 
 ids = st.binary(min_size=16, max_size=16).map(RequestId)
 u8, u32 = st.integers(0, 255), st.integers(0, 2**32 - 1)
 names = st.text(st.characters(codec="utf-8"), max_size=60)
 payloads = st.binary(max_size=200)
 messages = st.one_of(
-    st.builds(RequestMessage, ids, u8, u32.map(lambda n: n / 1e3), names.map(ServiceName), names, payloads),
+    st.builds(
+        RequestMessage,
+        ids,
+        u8,
+        st.sampled_from(Priority),
+        u32.map(lambda n: n / 1e6),
+        u32.map(lambda n: n / 1e3),
+        names.map(ServiceName),
+        names,
+        payloads,
+    ),
     st.builds(ResponseMessage, ids, u8, u32.map(lambda n: n / 1e6), payloads),
     st.builds(RejectionMessage, ids, u8, st.sampled_from(RejectReason), names),
 )
@@ -50,7 +61,7 @@ def test_a_message_or_the_one_error(data: bytes) -> None:
     assert encode_message(message)[:18] == data[:18]
     if isinstance(message, RequestMessage):
         assert len(message.service.encode()) <= MAX_NAME_BYTES
-        assert encode_message(message)[22:] == data[22:]
+        assert encode_message(message)[27:] == data[27:]
 
 
 @given(messages, st.integers(0, 300), st.binary(min_size=1, max_size=3))

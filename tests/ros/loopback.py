@@ -22,6 +22,7 @@ from sidecar.core.events import (
     ResponseArrived,
     WithdrawService,
 )
+from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -127,7 +128,16 @@ class Loopback:
         self.executions[execution] = request.id
         kind = next((offer.type for offer in self.offers if offer.name == request.service), "none/srv/None")
         self.cloud_app.handle(
-            ExecuteRequest(execution, request.service, kind, payload, NodeName("robot"), self.faults.lifetime_s)
+            ExecuteRequest(
+                execution,
+                request.service,
+                kind,
+                payload,
+                NodeName("robot"),
+                Priority.NORMAL,
+                1.0,
+                self.faults.lifetime_s,
+            )
         )
 
     def completed(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:

@@ -18,6 +18,7 @@ from sidecar.config import (
     load_config,
     parse_config,
 )
+from sidecar.core.priority import Priority
 
 SOURCE = "sidecar.yaml"
 ROBOT: dict[str, Any] = {
@@ -115,6 +116,13 @@ def test_copies_to_several_servers_only_when_asked_for() -> None:
     (rule,) = parse(ROBOT).service_rules()
     assert not rule.idempotent
     assert not rule.drop_late
+    assert rule.priority is Priority.NORMAL
+
+
+@pytest.mark.parametrize("priority", Priority)
+def test_priorities_are_words(priority: Priority) -> None:
+    (rule,) = parse(with_service(ROBOT, priority=priority.name.lower())).service_rules()
+    assert rule.priority is priority
 
 
 BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
@@ -136,6 +144,9 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(CLOUD, deadline_ms=100), "services[0].deadline_ms", "on a robot only"),
     (with_service(CLOUD, idempotent=False), "services[0].idempotent", "on a robot only"),
     (with_service(CLOUD, drop_late=True), "services[0].drop_late", "on a robot only"),
+    (with_service(CLOUD, priority="high"), "services[0].priority", "on a robot only"),
+    (with_service(ROBOT, priority="urgent"), "services[0].priority", "expected 'low', 'normal' or 'high'"),
+    (with_service(ROBOT, priority=1), "services[0].priority", "expected 'low', 'normal' or 'high'"),
     (
         with_service(CLOUD, capacity_interfaces=0),
         "services[0].capacity_interfaces",

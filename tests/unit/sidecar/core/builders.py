@@ -31,6 +31,7 @@ from sidecar.core.link_events import (
 from sidecar.core.messages import RequestMessage
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.path_id import PathId
+from sidecar.core.priority import Priority
 from sidecar.core.rules import ServiceRule
 
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")
@@ -62,8 +63,15 @@ def request_id(number: int) -> RequestId:
     return RequestId(number.to_bytes(16, "big"))
 
 
-def request(number: int = 1, copy: int = 0, *, lifetime_s: float = 10.0, service: ServiceName = ECHO) -> RequestMessage:
-    return RequestMessage(request_id(number), copy, lifetime_s, service, TYPE, b"question")
+def request(
+    number: int = 1,
+    copy: int = 0,
+    *,
+    deadline_s: float = 1.0,
+    lifetime_s: float = 10.0,
+    service: ServiceName = ECHO,
+) -> RequestMessage:
+    return RequestMessage(request_id(number), copy, Priority.NORMAL, deadline_s, lifetime_s, service, TYPE, b"question")
 
 
 def rule(pattern: str = ECHO, *, idempotent: bool = True, lifetime_s: float = 10.0) -> ServiceRule:

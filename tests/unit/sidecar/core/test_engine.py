@@ -47,6 +47,7 @@ from sidecar.core.messages import (
     encode_message,
 )
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.priority import Priority
 from tests.unit.sidecar.core.builders import (
     ECHO,
     TYPE,
@@ -140,7 +141,7 @@ def test_an_answer_takes_another_path_when_the_requests_own_is_down() -> None:
 REFUSALS = {
     "no such service": (request(service=ServiceName("/none")), RejectReason.NOT_OFFERED),
     "another type": (
-        RequestMessage(request_id(1), 0, 1.0, ECHO, "t/srv/Other", b""),
+        RequestMessage(request_id(1), 0, Priority.NORMAL, 0.1, 1.0, ECHO, "t/srv/Other", b""),
         RejectReason.WRONG_TYPE,
     ),
 }

@@ -15,12 +15,13 @@ from sidecar.core.messages import (
     decode_message,
     encode_message,
 )
+from sidecar.core.priority import Priority
 
 ID = RequestId(bytes(range(16)))
 GOLDENS: dict[str, tuple[Message, str]] = {
     "request": (
-        RequestMessage(ID, 2, 1.5, ServiceName("/a"), "t", b"xyz"),
-        "01" + ID.hex() + "02 000005dc 0002 2f61 0001 74 78797a",
+        RequestMessage(ID, 2, Priority.LOW, 0.1, 1.5, ServiceName("/a"), "t", b"xyz"),
+        "01" + ID.hex() + "02 02 000186a0 000005dc 0002 2f61 0001 74 78797a",
     ),
     "response": (ResponseMessage(ID, 1, 0.25, b"xyz"), "02" + ID.hex() + "01 0003d090 78797a"),
     "rejection": (
@@ -51,7 +52,8 @@ def test_other_kinds_reasons_and_text_are_refused() -> None:
     for bad in (
         "04" + ID.hex() + "00",
         "03" + ID.hex() + "00 ff 0000",
-        "01" + ID.hex() + "00 00000000 0001 ff 0000",
+        "01" + ID.hex() + "00 00 00000000 00000000 0001 ff 0000",
+        "01" + ID.hex() + "00 03 00000000 00000000 0001 61 0000",
     ):
         with pytest.raises(DecodeError):
             decode_message(memoryview(bytes.fromhex(bad)))

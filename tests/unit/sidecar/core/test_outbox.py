@@ -7,6 +7,7 @@ from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES, Outbox
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.priority import Priority
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
@@ -31,7 +32,7 @@ class Box:
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
 
     def send(self, over: PathId = OVER_WLAN, size: int = 3000, expires: float = 10.0) -> OutboundMessage:
-        message = self.outbox.send(over, bytes(size), deadline=1.0, expires=expires)
+        message = self.outbox.send(over, bytes(size), priority=Priority.NORMAL, deadline=1.0, expires=expires)
         assert message is not None
         assert self.commands.pop() == Send(over, message)
         return message
@@ -155,7 +156,7 @@ def test_what_moved_to_another_interface_is_not_left_behind_there_either() -> No
 def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
     box = Box(OVER_WLAN, TO_B)
     taken = 0
-    while box.outbox.send(OVER_WLAN, b"x", deadline=1.0, expires=10.0) is not None:
+    while box.outbox.send(OVER_WLAN, b"x", priority=Priority.NORMAL, deadline=1.0, expires=10.0) is not None:
         taken += 1
     assert taken == MAX_MESSAGES // 2
     assert box.stats.dropped["outbox_full"] == 1

@@ -17,6 +17,7 @@ from sidecar.core.messages import (
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.priority import Priority
 from sidecar.core.requests import MAX_COPIES, RequestParts, RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
@@ -82,7 +83,10 @@ def test_copies_are_numbered_and_carry_what_is_left_of_the_lifetime() -> None:
     table.submit()
     sends = [command for command in table.commands if isinstance(command, Send)]
     copies = [decode_message(memoryview(bytes(send.message.data))) for send in sends]
-    assert copies == [RequestMessage(request_id(1), copy, 10.0, ECHO, TYPE, memoryview(b"question")) for copy in (0, 1)]
+    assert copies == [
+        RequestMessage(request_id(1), copy, Priority.NORMAL, 1.0, 10.0, ECHO, TYPE, memoryview(b"question"))
+        for copy in (0, 1)
+    ]
     assert table.sent() == [WLAN_A, WWAN_B]
 
 
@@ -277,12 +281,12 @@ def test_what_cannot_be_sent_is_rejected_at_once(monkeypatch: pytest.MonkeyPatch
 
 def test_a_full_outbox_towards_one_server_sends_to_the_other_only_and_two_full_ones_reject() -> None:
     table = Table()
-    while table.outbox.send(WLAN_A, bytes(8_000_000), deadline=9.0, expires=9.0) is not None:
+    while table.outbox.send(WLAN_A, bytes(8_000_000), priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
         pass
     table.sent()
     table.submit(1, payload=bytes(8_000_000))
     assert table.sent() == [WWAN_B]
-    while table.outbox.send(WWAN_B, bytes(8_000_000), deadline=9.0, expires=9.0) is not None:
+    while table.outbox.send(WWAN_B, bytes(8_000_000), priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
         pass
     table.submit(2, payload=bytes(8_000_000))
     assert table.only_failure().outcome == "rejected"
