@@ -31,7 +31,7 @@ from protos.model import (
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ExecuteRequest, RequestFailed, RequestId, ResponseArrived
-from sidecar.core.frame import MAX_SYMBOL_BYTES, symbol_count
+from sidecar.core.frame import BASE_SYMBOL_BYTES, symbol_count
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
@@ -168,7 +168,7 @@ def measure(traffic: Traffic, batch: int) -> str:
     cpu_s = time.process_time() - start
     requests = traffic.rounds * traffic.at_once
     datagrams = (pair.robot.datagrams + pair.cloud.datagrams - before) / requests
-    fragments = requests * (symbol_count(traffic.size, MAX_SYMBOL_BYTES) + 1)
+    fragments = requests * (symbol_count(traffic.size, BASE_SYMBOL_BYTES) + 1)
     return (
         f"{traffic.name:24s} {cpu_s / requests * 1e6:12.0f} {datagrams:12.1f} "
         f"{fragments / cpu_s:14.0f} {requests * traffic.size / cpu_s / 1e6:10.1f}"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sidecar.core import frame
-from sidecar.core.frame import MAX_FRAMES_BYTES, Header
+from sidecar.core.frame import BASE_FRAMES_BYTES, Header
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _fill(pending: list[bytes]) -> tuple[list[bytes], int | None]:
     finished: int | None = None
     count = 0
     for encoded in pending:
-        if size + len(encoded) > MAX_FRAMES_BYTES or count == frame.MAX_FRAMES:
+        if size + len(encoded) > BASE_FRAMES_BYTES or count == frame.MAX_FRAMES:
             break
         if encoded[0] == frame.FINISHED_TYPE:
             if finished is not None:

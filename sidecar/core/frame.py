@@ -22,6 +22,7 @@ byte tells our datagrams (0xD1) from STUN's (0x00 to 0x3F, RFC 8489 section 5) o
 
 Frames, each a type byte and then::
 
+    PADDING      0  and every zero byte after it             makes a probe as long as the path shall carry (pmtu.py)
     PROBE        1  id (32)                                  is answered at once
     PROBE_REPLY  2  id (32)
     ACK          3  largest (64) delay in us (32) n (8), n times: length - 1 of a range (16), gap - 1 below it (16)
@@ -45,6 +46,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
 from protos.model import PROTOCOL_VERSION, TOKEN_BYTES, InterfaceId, SessionId
+from sidecar.core import pmtu
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,11 +55,12 @@ FIRST_BYTE = 0xD0 | PROTOCOL_VERSION
 HEADER = struct.Struct(">BBBBQQ")
 HEADER_BYTES = HEADER.size
 
-MAX_DATAGRAM_BYTES = 1200
-"""UDP payload that every path of the Internet carries unfragmented (RFC 9000 section 14); per-path discovery later."""
+MAX_DATAGRAM_BYTES = pmtu.MAX_BYTES
+"""UDP payload of the longest datagram that is accepted; how long those to a path may be, `pmtu.py` finds out."""
 TAG_BYTES = 16
 """Room left for the tag of the AEAD."""
-MAX_FRAMES_BYTES = MAX_DATAGRAM_BYTES - HEADER_BYTES - TAG_BYTES
+BASE_FRAMES_BYTES = pmtu.BASE_BYTES - HEADER_BYTES - TAG_BYTES
+"""Frames of a datagram that every path carries."""
 
 MAX_MESSAGE_BYTES = 16 * 1024 * 1024 + 1024
 """Largest payload the product promises (16 MiB) and the head of a message."""
@@ -66,7 +69,7 @@ MAX_ACK_RANGES = 32
 MAX_FRAMES = 64
 """Frames in one datagram; an honest one holds a handful."""
 
-_PROBE, _PROBE_REPLY, _ACK, _FRAGMENT, FINISHED_TYPE, _CLOSE, _HELLO = 1, 2, 3, 4, 6, 8, 9
+_PADDING, _PROBE, _PROBE_REPLY, _ACK, _FRAGMENT, FINISHED_TYPE, _CLOSE, _HELLO = 0, 1, 2, 3, 4, 6, 8, 9
 
 _U32 = struct.Struct(">I")
 _U64 = struct.Struct(">Q")
@@ -76,8 +79,11 @@ _FRAGMENT_HEAD = struct.Struct(">QIHH")
 _TYPED_FRAGMENT_HEAD = struct.Struct(">BQIHH")
 _HELLO_BODY = struct.Struct(f">{TOKEN_BYTES}sQ")
 
-MAX_SYMBOL_BYTES = MAX_FRAMES_BYTES - _TYPED_FRAGMENT_HEAD.size
-"""Payload of one datagram that holds nothing but a fragment."""
+FRAGMENT_OVERHEAD_BYTES = HEADER_BYTES + _TYPED_FRAGMENT_HEAD.size + TAG_BYTES
+"""What a datagram that holds nothing but a fragment has beside the symbol."""
+BASE_SYMBOL_BYTES = pmtu.BASE_BYTES - FRAGMENT_OVERHEAD_BYTES
+"""Symbol that every path carries."""
+MAX_SYMBOL_BYTES = MAX_DATAGRAM_BYTES - FRAGMENT_OVERHEAD_BYTES
 MIN_SYMBOL_BYTES = 256
 """Smaller symbols would let a peer make us count millions of fragments for one message."""
 
@@ -224,6 +230,11 @@ def encode_close() -> bytes:
     return b"\x08"
 
 
+def encode_padding(size: int) -> bytes:
+    """Return a frame of this many bytes that says nothing."""
+    return bytes(size)
+
+
 def encode_hello(frame: Hello) -> bytes:
     """Return the frame's bytes."""
     return b"\x09" + _HELLO_BODY.pack(frame.token, frame.incarnation)
@@ -238,13 +249,13 @@ def decode_frames(view: memoryview) -> list[Frame]:
     frames: list[Frame] = []
     position = 0
     end = len(view)
-    if not end:
-        raise DecodeError("no frames")
     try:
         while position < end:
             kind = view[position]
             position += 1
-            if kind == _FRAGMENT:
+            if kind == _PADDING:
+                position = _skip_padding(view, position)
+            elif kind == _FRAGMENT:
                 fragment, position = _decode_fragment(view, position)
                 frames.append(fragment)
             elif kind == _ACK:
@@ -268,7 +279,15 @@ def decode_frames(view: memoryview) -> list[Frame]:
                 raise DecodeError("too many frames")
     except struct.error:
         raise DecodeError("truncated frame") from None
+    if not frames:
+        raise DecodeError("no frames")
     return frames
+
+
+def _skip_padding(view: memoryview, position: int) -> int:
+    """Return where the zeros end."""
+    rest = view[position:]
+    return len(view) - len(bytes(rest).lstrip(b"\0"))
 
 
 def _decode_fragment(view: memoryview, position: int) -> tuple[Fragment, int]:
@@ -276,8 +295,8 @@ def _decode_fragment(view: memoryview, position: int) -> tuple[Fragment, int]:
     position += _FRAGMENT_HEAD.size
     if total > MAX_MESSAGE_BYTES:
         raise DecodeError("message over the limit")
-    if symbol < MIN_SYMBOL_BYTES:
-        raise DecodeError("symbol too small")
+    if not MIN_SYMBOL_BYTES <= symbol <= MAX_SYMBOL_BYTES:
+        raise DecodeError("symbol too small or too large")
     start = index * symbol
     if start >= total and (index or total):
         raise DecodeError("fragment beyond the end of its message")

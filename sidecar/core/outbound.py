@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.frame import MAX_SYMBOL_BYTES, symbol_count
+from sidecar.core.frame import BASE_SYMBOL_BYTES, symbol_count
 from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class OutboundMessage:
         priority: Priority = Priority.NORMAL,
         deadline: float,
         expires: float,
-        symbol: int = MAX_SYMBOL_BYTES,
+        symbol: int = BASE_SYMBOL_BYTES,
     ) -> None:
         self.number = number
         self.path = path

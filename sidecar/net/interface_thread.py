@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 RECEIVE_BATCH = 64
 """Datagrams read before anything else is looked at."""
-RECEIVE_BYTES = 2048
+RECEIVE_BYTES = MAX_DATAGRAM_BYTES + 1
 """Longer than any datagram of ours: a longer one is truncated, hence malformed, hence dropped."""
 BLOCKED_TIMER_S = 0.005
 """While the socket takes nothing, timers are looked at this often: what is due may wait for the socket itself."""

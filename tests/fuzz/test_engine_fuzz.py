@@ -12,7 +12,7 @@ from sidecar.core import frame
 from sidecar.core.dedup import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
 from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.fragments import FINISHED_REMEMBERED, MAX_PEER_BYTES, MAX_PEER_MESSAGES
-from sidecar.core.frame import MAX_MESSAGE_BYTES, MAX_SYMBOL_BYTES, Header, Probe, ProbeReply
+from sidecar.core.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
 from sidecar.core.link import MAX_PENDING_FRAMES
 from sidecar.core.messages import Message, RejectionMessage, RequestMessage, ResponseMessage, encode_message
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES
@@ -33,8 +33,8 @@ def fragment(number: int, total: int, symbol: int, index: int) -> bytes:
 
 
 def whole(number: int, message: Message) -> bytes:
-    data = encode_message(message)[:MAX_SYMBOL_BYTES]
-    return frame.encode_fragment_head(number, len(data), MAX_SYMBOL_BYTES, 0) + data
+    data = encode_message(message)[:BASE_SYMBOL_BYTES]
+    return frame.encode_fragment_head(number, len(data), BASE_SYMBOL_BYTES, 0) + data
 
 
 def some_message(rng: random.Random) -> Message:

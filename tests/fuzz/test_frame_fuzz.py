@@ -62,6 +62,12 @@ def test_frames_come_back_in_order(pairs: list[tuple[bytes, frame.Frame]]) -> No
     assert frame.decode_frames(memoryview(encoded)) == [value for _, value in pairs]
 
 
+@given(st.lists(whole_frames, min_size=1, max_size=4), st.integers(0, frame.MAX_DATAGRAM_BYTES))
+def test_padding_adds_nothing(pairs: list[tuple[bytes, frame.Frame]], size: int) -> None:
+    encoded = b"".join(data for data, _ in pairs) + frame.encode_padding(size)
+    assert frame.decode_frames(memoryview(encoded)) == [value for _, value in pairs]
+
+
 @given(ack_ranges(), st.floats(0, 10_000))
 def test_an_ack_tells_a_prefix_of_the_ranges_and_nothing_that_did_not_come(
     ranges: list[tuple[int, int]], delay_s: float

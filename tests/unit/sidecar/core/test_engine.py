@@ -26,7 +26,7 @@ from sidecar.core.events import (
     RejectReason,
     RequestFailed,
 )
-from sidecar.core.frame import MAX_SYMBOL_BYTES, Fragment
+from sidecar.core.frame import BASE_SYMBOL_BYTES, Fragment
 from sidecar.core.link_events import (
     FragmentReceived,
     LinkCommand,
@@ -85,9 +85,9 @@ class Sidecar:
 
     def receive(self, message: Message | bytes, *, session: int = 1, now: float = 0.1) -> None:
         data = message if isinstance(message, bytes) else encode_message(message)
-        assert len(data) <= MAX_SYMBOL_BYTES
+        assert len(data) <= BASE_SYMBOL_BYTES
         self.number += 1
-        fragment = Fragment(self.number, len(data), MAX_SYMBOL_BYTES, 0, memoryview(data))
+        fragment = Fragment(self.number, len(data), BASE_SYMBOL_BYTES, 0, memoryview(data))
         self.engine.on_link_event(FragmentReceived(self.path, SessionId(session), fragment), now)
 
     def take(self) -> tuple[list[LinkCommand], list[ApplicationEvent]]:

@@ -4,7 +4,7 @@ import pytest
 
 from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
-from sidecar.core import frame
+from sidecar.core import frame, pmtu
 from sidecar.core.frame import AckFrame, Close, Finished, Fragment, Header, Hello, Probe, ProbeReply
 
 HEADER = Header(InterfaceId(1), InterfaceId(2), SessionId(0x0102030405060708), 0x1112131415161718)
@@ -44,7 +44,15 @@ def test_the_bytes_of_a_datagram_of_each_kind(kind: str) -> None:
 
 
 def test_room_is_left_for_the_tag() -> None:
-    assert frame.HEADER_BYTES + 17 + frame.MAX_SYMBOL_BYTES + frame.TAG_BYTES == frame.MAX_DATAGRAM_BYTES == 1200
+    overhead = frame.HEADER_BYTES + len(frame.encode_fragment_head(1, 1, 256, 0)) + frame.TAG_BYTES
+    assert overhead + frame.BASE_SYMBOL_BYTES == pmtu.BASE_BYTES == 1200
+    assert overhead + frame.MAX_SYMBOL_BYTES == frame.MAX_DATAGRAM_BYTES == pmtu.MAX_BYTES
+
+
+def test_padding_is_skipped_wherever_it_stands() -> None:
+    probe, padding = frame.encode_probe(Probe(1)), frame.encode_padding(1000)
+    for data in (probe + padding, padding + probe, padding + probe + padding):
+        assert frame.decode_frames(memoryview(data)) == [Probe(1)]
 
 
 def test_the_last_fragment_is_shorter_and_an_empty_message_has_one() -> None:
@@ -90,7 +98,8 @@ def test_another_version_is_told_from_garbage() -> None:
 
 BROKEN = {
     "nothing": "",
-    "unknown type": "00",
+    "nothing but padding": "00" * 100,
+    "unknown type": "0a",
     "reserved type": "05",
     "truncated probe": "01 0000",
     "truncated hello": "09 00",
@@ -104,6 +113,7 @@ BROKEN = {
     "fragment past the end": "04 0000000000000007 0000012c 0100 0002",
     "fragment of nothing past the end": "04 0000000000000007 00000000 0100 0001",
     "fragment with a tiny symbol": "04 0000000000000007 0000012c 00ff 0000" + "00" * 255,
+    "fragment with a symbol that no datagram holds": "04 0000000000000007 00100000 22c4 0075" + "00" * 7276,
     "fragment of a giant": "04 0000000000000007 01000401 0100 0000" + "00" * 256,
     "whole frame then garbage": "08 ff",
     "65 frames": "08" * 65,

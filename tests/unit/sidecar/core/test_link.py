@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import InterfaceId, InterfaceName, NodeName, SessionId
-from sidecar.core import frame
+from sidecar.core import frame, pmtu
 from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Hello, Probe, ProbeReply
 from sidecar.core.link_events import (
     FragmentReceived,
@@ -61,7 +61,7 @@ def up() -> Bench:
 
 
 def fragment(number: int = 1, size: int = 100) -> bytes:
-    return frame.encode_fragment_head(number, size, frame.MAX_SYMBOL_BYTES, 0) + bytes(size)
+    return frame.encode_fragment_head(number, size, frame.BASE_SYMBOL_BYTES, 0) + bytes(size)
 
 
 def state_changes(bench: Bench) -> list[PathState]:
@@ -230,7 +230,7 @@ def test_a_message_goes_out_in_numbered_datagrams_and_is_acknowledged() -> None:
     assert [item.symbol_index for item in frames(sent) if isinstance(item, Fragment)] == [0, 1, 2]
     first = numbers(sent)[0]
     assert numbers(sent) == [first, first + 1, first + 2]
-    assert all(len(datagram) <= frame.MAX_DATAGRAM_BYTES - frame.TAG_BYTES for datagram in sent)
+    assert all(len(datagram) <= pmtu.BASE_BYTES - frame.TAG_BYTES for datagram in sent)
     bench.now += 0.01
     bench.receive(frame.encode_ack([(first, first + 2)], 0.0), frame.encode_finished(Finished(1)))
     assert bytes(outbound.acked) == b"\1\1\1"
