@@ -149,7 +149,7 @@ class Path:
         sent_at = self._probes_out.pop(probe_id, None)
         if sent_at is None:
             return False
-        self.recovery.rtt.sample(now - sent_at)
+        self.recovery.rtt.sample(now - sent_at, now)
         self.note_rtt()
         return True
 

@@ -107,7 +107,7 @@ class Recovery:
                     self.acked_bytes += datagram.size
                     newly.append(datagram)
         if newest is not None:
-            self.rtt.sample(now - newest.at, ack.delay_s)
+            self.rtt.sample(now - newest.at, now, ack.delay_s)
         if newly:
             self._pto_count = 0
             self.largest_acked = max(self.largest_acked, largest)

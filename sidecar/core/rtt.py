@@ -8,40 +8,63 @@ GRANULARITY_S = 0.001
 """Finest timer that is worth arming."""
 UNSTABLE_FLOOR_S = 0.060
 """A path silent for less than this is never called unstable (SRT's floor)."""
+MINIMUM_MEMORY_S = 10.0
+"""A minimum not seen again for this long is forgotten: the route may have become longer (BBR's RTprop filter)."""
 
 
 class RttEstimator:
-    """Smoothed round-trip time, its variation and its minimum, in seconds."""
+    """Smoothed round-trip time, its variation and its minimum of late, in seconds."""
 
-    __slots__ = ("latest", "minimum", "smoothed", "variation")
+    __slots__ = ("_half_began", "_half_minimum", "_last_minimum", "latest", "minimum", "smoothed", "variation")
 
     def __init__(self) -> None:
         self.smoothed = 0.0
         self.variation = 0.0
         self.minimum = 0.0
+        """The least of the last MINIMUM_MEMORY_S, give or take half."""
         self.latest = 0.0
+        self._half_began = 0.0
+        self._half_minimum = 0.0
+        self._last_minimum = 0.0
 
     @property
     def has_sample(self) -> bool:
         """Whether anything was measured."""
         return self.latest > 0
 
-    def sample(self, rtt_s: float, peer_delay_s: float = 0.0) -> None:
+    def sample(self, rtt_s: float, now: float, peer_delay_s: float = 0.0) -> None:
         """Take one measured round trip, of which the peer says that `peer_delay_s` is its own.
 
         The peer is believed only as far as its word leaves a possible round trip (RFC 9002 section 5.3).
         """
         rtt_s = max(rtt_s, 1e-6)
         if not self.has_sample:
-            self.latest = self.smoothed = self.minimum = rtt_s
+            self.latest = self.smoothed = rtt_s
             self.variation = rtt_s / 2
+            self.forget_minimum(now)
             return
-        self.minimum = min(self.minimum, rtt_s)
+        self._note_minimum(rtt_s, now)
         if rtt_s - peer_delay_s >= self.minimum:
             rtt_s -= peer_delay_s
         self.variation += (abs(self.smoothed - rtt_s) - self.variation) / 4
         self.smoothed += (rtt_s - self.smoothed) / 8
         self.latest = rtt_s
+
+    def _note_minimum(self, rtt_s: float, now: float) -> None:
+        """Keep the least of this half of the memory and of the half before."""
+        if now - self._half_began >= MINIMUM_MEMORY_S / 2:
+            stale = now - self._half_began >= MINIMUM_MEMORY_S
+            self._last_minimum = rtt_s if stale else self._half_minimum
+            self._half_minimum = rtt_s
+            self._half_began = now
+        elif rtt_s < self._half_minimum:
+            self._half_minimum = rtt_s
+        self.minimum = min(self._half_minimum, self._last_minimum)
+
+    def forget_minimum(self, now: float) -> None:
+        """Start the minimum afresh from the latest sample: another network is below, or its queue was drained."""
+        self.minimum = self._half_minimum = self._last_minimum = self.latest
+        self._half_began = now
 
     def probe_timeout(self, peer_delay_s: float) -> float:
         """Seconds after which an acknowledgement is overdue (RFC 9002 section 6.2.1)."""

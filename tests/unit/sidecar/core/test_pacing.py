@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def rtt(seconds: float) -> RttEstimator:
     estimator = RttEstimator()
-    estimator.sample(seconds)
+    estimator.sample(seconds, 0.0)
     return estimator
 
 

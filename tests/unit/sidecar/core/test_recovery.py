@@ -86,7 +86,7 @@ def test_what_was_sent_after_the_acknowledged_is_not_lost() -> None:
 
 def test_probe_timeout_doubles_gives_up_the_oldest_and_ends_with_an_acknowledgement() -> None:
     recovery = with_sent(12)
-    recovery.rtt.sample(0.1)
+    recovery.rtt.sample(0.1, 0.0)
     timeout = 0.1 + 4 * 0.05 + MAX_ACK_DELAY_S
     assert recovery.pto_timer == pytest.approx(1.0 + timeout)
     assert numbers(recovery.on_probe_timeout(2.0)) == list(range(PTO_DATAGRAMS))
@@ -99,7 +99,7 @@ def test_probe_timeout_doubles_gives_up_the_oldest_and_ends_with_an_acknowledgem
 
 def test_probe_timeouts_stop_doubling_and_end_with_the_flight() -> None:
     recovery = with_sent(40)
-    recovery.rtt.sample(0.1)
+    recovery.rtt.sample(0.1, 0.0)
     for turn in range(20):
         assert recovery.pto_timer is not None
         assert recovery.pto_timer - recovery.last_eliciting_at <= 0.4 * 2**MAX_PTO_BACKOFF

@@ -1,0 +1,326 @@
+"""How much may be under way on one path, and when the next burst may leave.
+
+A model of the path, after BBR (draft-ietf-ccwg-bbr): the rate at which it delivers and the round trip of its empty
+queue say how fast to send and how much to have in flight. Single losses change nothing: radio links lose datagrams
+without being full. Losses while a queue stands do: then a ceiling on the bytes in flight is cut, and grows again as
+CUBIC's window does (RFC 9438), so that TCP keeps its share.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TYPE_CHECKING, NamedTuple
+
+from sidecar.core.delivery_rate import DeliveryRate
+
+if TYPE_CHECKING:
+    from sidecar.core.rtt import RttEstimator
+
+DATAGRAM_BYTES = 1200
+"""What windows and growth are counted in; larger datagrams make neither wrong, only coarser."""
+INITIAL_WINDOW_BYTES = 32 * 1024
+"""May leave at once on a path of which nothing is known: within what browsers do (RFC 6928 says 14 kB for TCP), and
+so that small requests never wait for an estimate."""
+MIN_WINDOW_BYTES = 4 * DATAGRAM_BYTES
+"""Always allowed in flight: keeps acknowledgements coming (RFC 8085 section 3.1 asks for a small minimum)."""
+MAX_WINDOW_BYTES = 16 * 1024 * 1024
+"""Never more in flight: 1 Gbit/s over 134 ms."""
+MAX_BURST_BYTES = 64 * 1024
+"""Largest burst between two pauses: one segmentation offload."""
+BURST_S = 0.001
+"""A burst is what the path carries in this time, where that is more than two datagrams."""
+LATE_S = 0.004
+"""A sender woken late makes up for at most this much time: timers and schedulers are not exact."""
+END_HOST_S = 0.005
+"""Delay in the hosts beyond the path's round trip: delayed acknowledgements, other threads' turns. Also what is never
+taken for a standing queue."""
+WINDOW_GAIN = 2.0
+"""Bandwidth-delay products in flight: what acknowledgements that come in clumps need."""
+STARTUP_GAIN = 2.0
+"""The rate at most doubles with each round at first, as in slow start."""
+DRAIN_GAIN = 0.5
+"""After start-up, until its queue is gone."""
+CYCLE = (1.25, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+"""Pacing gains round by round: ask for more, drain what that queued, cruise (BBR's ProbeBW)."""
+FULL_GROWTH = 1.25
+FULL_ROUNDS = 3
+"""The path is full when the rate did not grow by FULL_GROWTH within FULL_ROUNDS."""
+QUEUE_FACTOR = 0.25
+"""A round trip this much above the minimum shows a queue."""
+MINIMUM_STALE_S = 5.0
+"""A minimum round trip not seen for this long is looked for, with half the window, before it is forgotten."""
+CUT = 0.7
+"""What a loss with a standing queue leaves of the ceiling (CUBIC's beta, RFC 9438 section 4.6)."""
+CUBIC_C = 0.4
+"""Growth of the ceiling, datagrams per cubed second (RFC 9438 section 5)."""
+HEAVY_LOSS = 0.2
+"""Losing this much of a round's bytes is congestion even without a queue: a policer, or a tiny buffer."""
+OUTAGE_FRACTION = 0.5
+"""What a path that was down is believed to carry of what it carried before."""
+PERSISTENT_FACTOR = 3
+"""Probe timeouts without any acknowledgement that make congestion persistent (RFC 9002 section 7.6.1)."""
+
+
+class RateSample(NamedTuple):
+    """What one acknowledgement tells."""
+
+    acked_bytes: int
+    """Newly acknowledged by it."""
+    sent_at: float
+    """When the newest datagram among those left (s)."""
+    rtt_s: float
+    """Round trip of that datagram; 0 when it is not the largest acknowledged, so that nothing was measured."""
+    in_flight: int
+    """Bytes in flight after it."""
+
+
+class Phase(Enum):
+    """What the sender is doing."""
+
+    STARTUP = "startup"
+    DRAIN = "drain"
+    CRUISE = "cruise"
+    PROBE_RTT = "probe_rtt"
+
+
+class CongestionController:
+    """Window and pacing of one path. Sizes in bytes, rates in bytes a second, times in seconds."""
+
+    __slots__ = (
+        "_ceiling",
+        "_cut_at",
+        "_cycle",
+        "_epoch_at",
+        "_epoch_ceiling",
+        "_first_window",
+        "_full_rate",
+        "_full_rounds",
+        "_last_ack_at",
+        "_phase_until",
+        "_probed_rtt_at",
+        "_release_at",
+        "_round_acked",
+        "_round_in_flight",
+        "_round_lost",
+        "_round_min_rtt",
+        "_rtt",
+        "phase",
+        "rate",
+    )
+
+    def __init__(self) -> None:
+        self.phase = Phase.STARTUP
+        self.rate = DeliveryRate()
+        self._rtt: RttEstimator | None = None
+        self._first_window = float(INITIAL_WINDOW_BYTES)
+        self._release_at = 0.0
+        self._last_ack_at: float | None = None
+        self._cycle = 2
+        self._full_rate = 0.0
+        self._full_rounds = 0
+        self._phase_until = 0.0
+        self._probed_rtt_at: float | None = None
+        self._ceiling: float | None = None
+        self._epoch_at = 0.0
+        self._epoch_ceiling = 0.0
+        self._cut_at = float("-inf")
+        self._round_acked = 0
+        self._round_lost = 0
+        self._round_in_flight = 0
+        self._round_min_rtt = float("inf")
+
+    # -- asking ---------------------------------------------------------------------------------------------------
+
+    def budget(self, now: float, in_flight: int) -> int:
+        """Return the bytes that may leave now: 0, or at least one datagram."""
+        room = self.window - in_flight
+        if room <= 0:
+            return 0
+        pace = self.pacing_rate
+        if pace is not None:
+            if now < self._release_at:
+                return 0
+            late = min(now - self._release_at, LATE_S) * pace
+            room = min(room, max(burst(pace), late))
+        return max(int(room), DATAGRAM_BYTES)
+
+    def next_release(self, now: float, in_flight: int) -> float | None:
+        """Return when pacing lets more leave; None when only an acknowledgement can, or nothing holds it back."""
+        if self._release_at <= now or in_flight >= self.window or self.pacing_rate is None:
+            return None
+        return self._release_at
+
+    @property
+    def window(self) -> float:
+        """Bytes that may be in flight."""
+        model = self._model_window()
+        if self._ceiling is not None:
+            model = min(model, self._ceiling)
+        return min(max(model, MIN_WINDOW_BYTES), MAX_WINDOW_BYTES)
+
+    def _model_window(self) -> float:
+        rate = self.rate.best
+        if not rate or self._rtt is None:
+            return self._first_window
+        product = rate * self._rtt.minimum
+        if self.phase is Phase.PROBE_RTT:
+            return product / 2
+        model = WINDOW_GAIN * product + rate * END_HOST_S + 2 * DATAGRAM_BYTES
+        return max(model, self._first_window) if self.phase is Phase.STARTUP else model
+
+    @property
+    def pacing_rate(self) -> float | None:
+        """Bytes a second; None while nothing is known of the path."""
+        rate = self.rate.best
+        if not rate or self._rtt is None:
+            return None
+        if self.phase is Phase.STARTUP:
+            return max(STARTUP_GAIN * rate, self._first_window / max(self._rtt.smoothed, 1e-4))
+        if self.phase is Phase.DRAIN:
+            return DRAIN_GAIN * rate
+        if self.phase is Phase.PROBE_RTT:
+            return rate
+        return CYCLE[self._cycle] * rate
+
+    # -- being told -----------------------------------------------------------------------------------------------
+
+    def on_sent(self, now: float, size: int, in_flight: int) -> None:
+        """These bytes left; `in_flight` includes them."""
+        self.rate.on_sent(now)
+        self._round_in_flight = max(self._round_in_flight, in_flight)
+        pace = self.pacing_rate
+        if pace is not None:
+            self._release_at = max(self._release_at, now - LATE_S) + size / pace
+
+    def ran_dry(self) -> None:
+        """More might leave, but nothing waits: what is delivered from here on says little of what the path can."""
+        self.rate.ran_dry()
+
+    def on_acked(self, sample: RateSample, rtt: RttEstimator, now: float) -> None:
+        """Learn from an acknowledgement."""
+        self._rtt = rtt
+        self._last_ack_at = now
+        self._round_acked += sample.acked_bytes
+        if sample.rtt_s:
+            self._round_min_rtt = min(self._round_min_rtt, sample.rtt_s)
+            if self._probed_rtt_at is None or sample.rtt_s <= 1.05 * rtt.minimum + 1e-4:
+                self._probed_rtt_at = now
+        limit = STARTUP_GAIN * (self.rate.settled or self._first_window / max(rtt.minimum, 1e-4))
+        round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit)
+        if self._ceiling is not None:
+            self._grow_ceiling(now)
+        if self.phase is Phase.DRAIN and sample.in_flight <= self.rate.best * rtt.minimum:
+            self._cruise()
+        if round_over:
+            self._end_round(rtt, now)
+
+    def on_lost(self, lost_bytes: int, in_flight: int, now: float) -> None:
+        """These bytes were lost; `in_flight` is what is left."""
+        self._round_lost += lost_bytes
+        rtt = self._rtt
+        if rtt is None or self._last_ack_at is None:
+            return
+        timeout = rtt.probe_timeout(END_HOST_S)
+        if now - self._last_ack_at > PERSISTENT_FACTOR * timeout:
+            self._collapse(rtt)
+            return
+        if now - self._cut_at < rtt.smoothed:
+            return
+        heavy = self._round_lost > max(HEAVY_LOSS * (self._round_lost + self._round_acked), 8 * DATAGRAM_BYTES)
+        if heavy or self._queue_stands(rtt):
+            self._cut(in_flight + lost_bytes, now)
+
+    def on_path_down(self, now: float) -> None:
+        """The path is dead."""
+        self.rate.scale(OUTAGE_FRACTION)
+        self._forget_ceiling()
+
+    def on_path_up(self, now: float) -> None:
+        """The path answers again: start from a part of what it carried, and look for more."""
+        self.phase = Phase.STARTUP
+        self._first_window = float(MIN_WINDOW_BYTES) if self.rate.best else float(INITIAL_WINDOW_BYTES)
+        self._full_rate = 0.0
+        self._full_rounds = 0
+        self._probed_rtt_at = now
+
+    # -- rounds ---------------------------------------------------------------------------------------------------
+
+    def _end_round(self, rtt: RttEstimator, now: float) -> None:
+        standing = self._round_min_rtt - rtt.minimum if self._round_min_rtt < float("inf") else 0.0
+        queued = standing > QUEUE_FACTOR * rtt.minimum + END_HOST_S
+        if standing > rtt.minimum + 2 * END_HOST_S:
+            self.rate.believe_latest()
+        if self.phase is Phase.STARTUP:
+            self._check_full(queued=queued)
+        elif self.phase is Phase.CRUISE:
+            self._cycle = (self._cycle + 1) % len(CYCLE)
+        elif self.phase is Phase.PROBE_RTT and now >= self._phase_until:
+            self._probed_rtt_at = now
+            self._cruise()
+        if self.phase is Phase.CRUISE and now - (self._probed_rtt_at or now) > MINIMUM_STALE_S:
+            self.phase = Phase.PROBE_RTT
+            self._phase_until = now + rtt.smoothed
+        self._round_acked = self._round_lost = 0
+        self._round_in_flight = 0
+        self._round_min_rtt = float("inf")
+
+    def _check_full(self, *, queued: bool) -> None:
+        if self.rate.limited_by_sender:
+            return
+        if self.rate.best > FULL_GROWTH * self._full_rate:
+            self._full_rate = self.rate.best
+            self._full_rounds = 0
+        else:
+            self._full_rounds += 1
+        if queued or self._full_rounds >= FULL_ROUNDS:
+            self.phase = Phase.DRAIN
+
+    def _cruise(self) -> None:
+        self.phase = Phase.CRUISE
+        self._cycle = 2
+
+    # -- loss -----------------------------------------------------------------------------------------------------
+
+    def _queue_stands(self, rtt: RttEstimator) -> bool:
+        excess = min(rtt.smoothed, rtt.latest) - rtt.minimum
+        return excess > max(0.2 * rtt.minimum, 2.5 * rtt.variation, 0.001)
+
+    def _cut(self, in_flight: int, now: float) -> None:
+        at = float(max(in_flight, self._round_in_flight))
+        if self._ceiling is not None:
+            at = min(at, self._ceiling)
+        self._ceiling = max(CUT * at, MIN_WINDOW_BYTES)
+        self._epoch_ceiling = at
+        self._epoch_at = self._cut_at = now
+        if self.phase is Phase.STARTUP:
+            self.phase = Phase.DRAIN
+
+    def _grow_ceiling(self, now: float) -> None:
+        top = self._epoch_ceiling / DATAGRAM_BYTES
+        k = (top * (1 - CUT) / CUBIC_C) ** (1 / 3)
+        t = now - self._epoch_at
+        cubic = CUBIC_C * (t - k) ** 3 + top
+        # As fast as Reno where that is faster (RFC 9438 section 4.3).
+        rtt = self._rtt.smoothed if self._rtt is not None else 0.1
+        reno = CUT * top + 3 * (1 - CUT) / (1 + CUT) * t / max(rtt, 1e-3)
+        self._ceiling = max(cubic, reno, CUT * top) * DATAGRAM_BYTES
+        if self._ceiling > 2 * self._model_window() and self._ceiling > 2 * self._epoch_ceiling:
+            self._forget_ceiling()
+
+    def _forget_ceiling(self) -> None:
+        self._ceiling = None
+        self._cut_at = float("-inf")
+
+    def _collapse(self, rtt: RttEstimator) -> None:
+        """Persistent congestion: begin again with the least (RFC 9002 section 7.6.2)."""
+        self.rate.restart(MIN_WINDOW_BYTES / max(rtt.smoothed, 1e-3))
+        self._forget_ceiling()
+        self._first_window = float(MIN_WINDOW_BYTES)
+        self.phase = Phase.STARTUP
+        self._full_rate = 0.0
+        self._full_rounds = 0
+
+
+def burst(pace: float) -> float:
+    """Bytes that leave together at a pacing rate (bytes a second)."""
+    return max(2.0 * DATAGRAM_BYTES, min(pace * BURST_S, MAX_BURST_BYTES))

@@ -1,0 +1,147 @@
+"""The rate at which one path delivers, from the spacing of acknowledgements.
+
+Measured over trains: datagrams sent one after the other without a pause for want of data. A train is cut into rounds
+of at least a round trip. The rate of a round is what was acknowledged in it over the time this took, or over the time
+the sender took, whichever is longer (after draft-cheng-iccrg-delivery-rate-estimation, without state per datagram). A
+pause between two requests belongs to no train: a burst of a few datagrams measures the path and not the application.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+MIN_ROUND_BYTES = 8 * 1200
+"""A rate of fewer bytes is noise."""
+LIMITED_FACTOR = 1.1
+"""Acknowledgements this much further apart than what they acknowledge show the path's rate, not the sender's."""
+ROUNDS = 10
+"""The best of so many rounds counts (BBR's filter)."""
+BELIEVED_ROUNDS = 2
+"""What is left of these when they contradict a standing queue."""
+MAX_TRAINS = 256
+"""Trains under way; beyond that, the oldest are taken for one."""
+
+
+class DeliveryRate:
+    """Best delivery rate of the last rounds, bytes a second; 0 when unknown."""
+
+    __slots__ = (
+        "_anchor_at",
+        "_anchor_sent_at",
+        "_bytes",
+        "_dry",
+        "_last_at",
+        "_last_sent_at",
+        "_limited",
+        "_rate",
+        "_rounds",
+        "_trains",
+        "best",
+        "limited_by_sender",
+        "settled",
+    )
+
+    def __init__(self) -> None:
+        self.best = 0.0
+        self.settled = 0.0
+        """The best of complete rounds, without the present one."""
+        self.limited_by_sender = True
+        """Whether the last complete round says no more than what was offered."""
+        self._rounds: deque[float] = deque(maxlen=ROUNDS)
+        self._trains: deque[float] = deque()
+        self._dry = True
+        self._anchor_at: float | None = None
+        self._anchor_sent_at = 0.0
+        self._bytes = 0
+        self._rate = 0.0
+        self._limited = True
+        self._last_at = 0.0
+        self._last_sent_at = 0.0
+
+    def on_sent(self, now: float) -> None:
+        """Something left."""
+        if self._dry:
+            self._dry = False
+            if len(self._trains) >= MAX_TRAINS:
+                self._trains.popleft()
+            self._trains.append(now)
+
+    def ran_dry(self) -> None:
+        """Nothing waits to be sent: what is sent next begins a train."""
+        self._dry = True
+
+    def on_acked(self, size: int, sent_at: float, now: float, limit: float) -> bool:
+        """Take newly acknowledged bytes, the newest of them sent at `sent_at`; True when that ended a round.
+
+        No round is believed beyond `limit`: acknowledgements that come in clumps may show any rate.
+        """
+        trains = self._trains
+        begins = self._anchor_at is None
+        while len(trains) > 1 and sent_at >= trains[1]:
+            trains.popleft()
+            begins = True
+        if begins:
+            over = self._close(sender=True)
+            self._anchor(now, sent_at)
+            return over
+        assert self._anchor_at is not None
+        self._bytes += size
+        acked_s, sent_s = now - self._anchor_at, sent_at - self._anchor_sent_at
+        if self._bytes >= MIN_ROUND_BYTES and acked_s > 0:
+            self._rate = min(self._bytes / max(acked_s, sent_s), limit)
+            self._limited = acked_s <= LIMITED_FACTOR * sent_s
+            self._update()
+            if sent_at >= self._anchor_at:
+                self._close(sender=False)
+                self._anchor(now, sent_at)
+                return True
+        return False
+
+    def _anchor(self, now: float, sent_at: float) -> None:
+        self._anchor_at = now
+        self._anchor_sent_at = sent_at
+        self._bytes = 0
+        self._rate = 0.0
+        self._limited = True
+
+    def _close(self, *, sender: bool) -> bool:
+        """End the round; `sender`: for want of data. A round that the sender limited can only raise the rate."""
+        rate = self._rate
+        if not rate:
+            return False
+        self.limited_by_sender = sender and self._limited
+        if not self.limited_by_sender:
+            self._rounds.append(rate)
+        elif rate > self.settled:
+            if self._rounds:
+                self._rounds[-1] = rate
+            else:
+                self._rounds.append(rate)
+        self._rate = 0.0
+        self._update()
+        return True
+
+    def _update(self) -> None:
+        self.settled = max(self._rounds, default=0.0)
+        self.best = max(self.settled, self._rate)
+
+    def believe_latest(self) -> None:
+        """Forget all but the latest rounds: a queue that stands shows that they were too good."""
+        while len(self._rounds) > BELIEVED_ROUNDS:
+            self._rounds.popleft()
+        self._update()
+
+    def scale(self, factor: float) -> None:
+        """Believe only part of what is known, and nothing of what is under way."""
+        self.restart(self.best * factor)
+
+    def restart(self, rate: float) -> None:
+        """Begin again with this rate."""
+        self._rounds.clear()
+        if rate:
+            self._rounds.append(rate)
+        self._trains.clear()
+        self._dry = True
+        self._anchor_at = None
+        self._rate = 0.0
+        self._update()
