@@ -1,0 +1,110 @@
+"""The client's side of every contender: requests at a rate or so many at once, and what became of each.
+
+A request begins with HEADER, its number and the moment it was sent; an answer begins with the same bytes. All clocks
+are CLOCK_MONOTONIC, which all processes and network namespaces of one host share: a receiver can tell one-way times.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+HEADER = struct.Struct("<Qd")
+"""Number of the request, seconds at which it was sent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What to send."""
+
+    size: int
+    """Bytes of each request, at least HEADER.size."""
+    count: int
+    rate_hz: float | None = None
+    """Requests a second, open loop; None: closed loop, `at_once` in flight."""
+    at_once: int = 1
+    grace_s: float = 5.0
+    """How long the last answers are waited for."""
+
+
+@dataclass(slots=True)
+class CallLog:
+    """When each request left, and when its first answer came; in order of sending. Fed from several threads."""
+
+    sent_s: list[float] = field(default_factory=list)
+    latency_s: list[float | None] = field(default_factory=list)
+    first: int = 0
+    _missing: int = 0
+    _changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def sent(self, now: float) -> None:
+        """Note that the next request leaves now."""
+        with self._changed:
+            self.sent_s.append(now)
+            self.latency_s.append(None)
+            self._missing += 1
+
+    def answered(self, header: bytes | bytearray | memoryview, now: float) -> None:
+        """Note an answer; only the first of a request counts."""
+        number, sent = HEADER.unpack_from(header)
+        index = number - self.first
+        with self._changed:
+            if 0 <= index < len(self.latency_s) and self.latency_s[index] is None:
+                self.latency_s[index] = now - sent
+                self._missing -= 1
+                self._changed.notify_all()
+
+    def wait_until_missing(self, at_most: int, timeout_s: float) -> bool:
+        """Wait until no more than so many requests lack an answer; False when the time was over first."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._missing <= at_most, timeout_s)
+
+    def as_json(self) -> dict[str, Any]:
+        """What `Calls.of` reads."""
+        return {"sent_s": self.sent_s, "latency_s": self.latency_s}
+
+
+class Caller:
+    """Sends plans of requests through `send` and collects the answers; numbers go on from plan to plan."""
+
+    def __init__(self, send: Callable[[int, bytes], None]) -> None:
+        self._send = send
+        self._log = CallLog()
+        self._next = 0
+
+    def answered(self, header: bytes | bytearray | memoryview, now: float) -> None:
+        """Take an answer, which begins with `header`, from whatever thread it came to."""
+        self._log.answered(header, now)
+
+    def call(self, plan: Plan) -> dict[str, Any]:
+        """Send the requests; returns what `Calls.of` reads when all are answered or the grace is over."""
+        filler = os.urandom(max(0, plan.size - HEADER.size))
+        log = self._log = CallLog(first=self._next)
+        start = time.monotonic()
+        for position in range(plan.count):
+            if plan.rate_hz is not None:
+                time.sleep(max(0.0, start + position / plan.rate_hz - time.monotonic()))
+            elif not log.wait_until_missing(plan.at_once - 1, plan.grace_s):
+                break
+            number = self._next
+            self._next += 1
+            now = time.monotonic()
+            data = HEADER.pack(number, now) + filler
+            log.sent(now)
+            self._send(number, data)
+        log.wait_until_missing(0, plan.grace_s)
+        return log.as_json()
+
+
+def usage() -> dict[str, float]:
+    """Return processor seconds and resident bytes of this process."""
+    with open("/proc/self/statm") as statm:
+        pages = int(statm.read().split()[1])
+    return {"cpu_s": time.process_time(), "rss_bytes": pages * os.sysconf("SC_PAGE_SIZE")}

@@ -1,0 +1,91 @@
+"""Our data plane for a section: a robot's and some clouds' programs, introduced to each other and ready to call."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any, Self
+
+from bench.dataplane.calling import HEADER
+from bench.dataplane.remote import Remote
+from bench.dataplane.statistics import Calls
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from bench.netlab import Host
+
+Service = dict[str, Any]
+SERVICE: Service = {"name": "/bench", "deadline_ms": 1_000.0, "lifetime_ms": 30_000.0, "idempotent": True}
+
+
+class Ours:
+    """Robot and clouds. Use it in a `with` block."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        robot: Host | None = None,
+        clouds: Mapping[str, Host | None],
+        interfaces: Sequence[str] = ("lo",),
+        cloud_interface: str = "lo",
+        mapping: Sequence[tuple[str, str]] | None = None,
+        service: Service = SERVICE,
+        answer_bytes: int = HEADER.size,
+        name: str = "ours",
+    ) -> None:
+        """Start them; hosts are the lab's, None is this machine. Without `mapping` the engine picks the paths."""
+        self._stack = contextlib.ExitStack()
+        start = self._stack.enter_context
+        try:
+            self.clouds = {
+                cloud: start(Remote.start("engine", folder, host=host, name=f"{name}.{cloud}"))
+                for cloud, host in clouds.items()
+            }
+            self.robot = start(Remote.start("engine", folder, host=robot, name=f"{name}.robot"))
+            common = {"stun": {"enabled": False}, "udp_port": 0, "log_level": "warning"}
+            peers = []
+            for cloud, program in self.clouds.items():
+                config = {"name": cloud, "role": "cloud", "interfaces": [cloud_interface], **common}
+                services = [{"name": service["name"]}]
+                peers.append(program.ask("start", config={**config, "services": services}, answer_bytes=answer_bytes))
+            config = {"name": "robot", "role": "robot", "interfaces": list(interfaces), **common}
+            me = self.robot.ask("start", config={**config, "services": [service]})
+            for program in self.clouds.values():
+                program.ask("meet", peers=[me])
+            self.robot.ask("meet", peers=peers, mapping=mapping)
+            self.robot.ask("wait_until_offered")
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def call(self, **plan: Any) -> Calls:
+        """Send the requests of a `calling.Plan` and wait for the answers."""
+        self.begin(**plan)
+        return self.finish()
+
+    def begin(self, **plan: Any) -> None:
+        """Begin to send; `finish` returns what became of it."""
+        self.robot.begin("call", **plan)
+
+    def finish(self, timeout_s: float = 180.0) -> Calls:
+        """Wait for what was begun."""
+        return Calls.of(self.robot.finish(timeout_s))
+
+    def take_one_way(self) -> list[float]:
+        """One-way seconds of the requests since the last time, over all clouds."""
+        return [seconds for cloud in self.clouds.values() for _, seconds in cloud.ask("take_one_way")]
+
+    def cpu_s(self) -> float:
+        """Processor seconds of all its programs."""
+        return sum(float(program.ask("usage")["cpu_s"]) for program in (self.robot, *self.clouds.values()))

@@ -1,0 +1,206 @@
+"""Our data plane as a program: engine, interface threads and sockets of a sidecar, without ROS and control plane.
+
+The application is this very process: the robot's side sends the requests of a plan, the cloud's answers each with its
+beginning. What the control plane would push (peers, mapping) comes from the controller.
+"""
+
+from __future__ import annotations
+
+import base64
+import gc
+import logging
+import queue
+import random
+import sys
+import threading
+import time
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from bench.dataplane.calling import HEADER, Caller, Plan, usage
+from bench.dataplane.remote import serve
+from protos.model import (
+    Assignment,
+    Candidate,
+    CandidateKind,
+    InterfaceName,
+    MappingSet,
+    NodeName,
+    Peer,
+    PeerSet,
+    Role,
+    ServiceMapping,
+    ServiceName,
+    ServiceOffer,
+    SessionId,
+    Version,
+)
+from sidecar.config import SidecarConfig
+from sidecar.core.engine import EngineConfig
+from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, RequestId, ResponseArrived
+from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from sidecar.net.interface_manager import Identity, InterfaceManager
+from sidecar.runtime import SWITCH_INTERVAL_S
+
+if TYPE_CHECKING:
+    from sidecar.core.events import ApplicationEvent
+
+SERVICE = ServiceName("/bench")
+TYPE = "bench/srv/Bytes"
+READY_TIMEOUT_S = 20.0
+
+
+class EngineProgram:
+    """One sidecar's data plane."""
+
+    def __init__(self) -> None:
+        self._role = Role.ROBOT
+        self._caller = Caller(self._submit)
+        self._failed: list[str] = []
+        self._one_way: list[tuple[int, float]] = []
+        self._answer_bytes = HEADER.size
+        self._executions: queue.SimpleQueue[ExecuteRequest | None] = queue.SimpleQueue()
+        self._candidates: tuple[Candidate, ...] = ()
+        self._offered = threading.Event()
+        self._have_candidates = threading.Event()
+        self._version = 0
+
+    # -- questions ------------------------------------------------------------------------------------------------
+
+    def start(self, config: dict[str, Any], answer_bytes: int = HEADER.size) -> dict[str, Any]:
+        """Open the interfaces of a sidecar's configuration; returns it as a peer, for the other side's `meet`."""
+        parsed = SidecarConfig.model_validate({"control_plane": "127.0.0.1:1", "metrics_listen": None, **config})
+        self._role, self._answer_bytes = parsed.role, answer_bytes
+        logging.basicConfig(level=parsed.log_level.name, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        self._identity = Identity(SessionId(random.getrandbits(63) | 1), random.randbytes(16), 1)
+        hooks = DataPlaneHooks(self, lambda _interface, _event: None, lambda: None)
+        self._plane = ThreadedDataPlane(
+            EngineConfig(parsed.role, parsed.service_rules()), self._identity.session, hooks
+        )
+        self._interfaces = InterfaceManager(parsed, self._identity, self._plane, self._on_candidates)
+        self._plane.start()
+        self._interfaces.start()
+        if parsed.role is Role.CLOUD:
+            self._plane.set_offers((ServiceOffer(SERVICE, TYPE),))
+            threading.Thread(target=self._answer, daemon=True, name="application").start()
+        if not self._have_candidates.wait(READY_TIMEOUT_S):
+            raise TimeoutError("no interface came into use")
+        gc.collect()
+        gc.freeze()
+        return self._as_peer(parsed.name)
+
+    def meet(self, peers: list[dict[str, Any]], mapping: list[tuple[str, str]] | None = None) -> None:
+        """Take these peers, and (robot) send every request over these (interface, server) pairs."""
+        self._version += 1
+        version = Version(self._version)
+        error = self._plane.apply_peers(PeerSet(version, self._version, tuple(_peer_of(peer) for peer in peers)))
+        if error is None and mapping is not None:
+            pairs = tuple(Assignment(InterfaceName(interface), NodeName(server)) for interface, server in mapping)
+            services = (ServiceMapping(SERVICE, pairs),)
+            error = self._plane.apply_mapping(MappingSet(version, self._version, services))
+        if error is not None:
+            raise ValueError(error)
+
+    def wait_until_offered(self) -> None:
+        """Robot: return when a path is up and the service can be called."""
+        if not self._offered.wait(READY_TIMEOUT_S):
+            raise TimeoutError("no path came up")
+        self._plane.set_carried(frozenset({SERVICE}))
+
+    def call(self, **plan: Any) -> dict[str, Any]:
+        """Robot: send the requests of a plan; returns its log."""
+        self._failed = []
+        return {**self._caller.call(Plan(**plan)), "failed": self._failed}
+
+    def take_one_way(self) -> list[tuple[int, float]]:
+        """Cloud: number and one-way seconds of every request since the last time."""
+        taken, self._one_way = self._one_way, []
+        return taken
+
+    def usage(self) -> dict[str, Any]:
+        """Processor seconds, resident bytes, threads."""
+        return {**usage(), "threads": threading.active_count()}
+
+    def counters(self) -> dict[str, Any]:
+        """What the data plane counted."""
+        engine = self._plane.engine_stats
+        links = {}
+        for link in self._plane.link_stats():
+            links[link.interface] = {
+                "bytes": dict(link.bytes),
+                "datagrams": {" ".join(key): count for key, count in link.datagrams.items()},
+                "dropped": dict(link.dropped),
+                "paths": {peer: asdict(path) for peer, path in link.paths.items()},
+            }
+        return {"links": links, "dropped": dict(engine.dropped), "in_flight": engine.in_flight}
+
+    def close(self) -> None:
+        """Say goodbye and end."""
+        if self._have_candidates.is_set():
+            self._plane.stop()
+            self._interfaces.stop()
+
+    # -- sidecar.ports.Application, on the data plane's threads ---------------------------------------------------
+
+    def handle(self, event: ApplicationEvent) -> None:
+        """Take an event."""
+        now = time.monotonic()
+        match event:
+            case ResponseArrived():
+                self._caller.answered(event.payload, now)
+            case ExecuteRequest():
+                number, sent = HEADER.unpack_from(event.payload)
+                self._one_way.append((number, now - sent))
+                self._executions.put(event)
+            case OfferService():
+                self._offered.set()
+            case RequestFailed():
+                self._failed.append(event.reason)
+            case _:
+                pass
+
+    # -- the application ------------------------------------------------------------------------------------------
+
+    def _submit(self, number: int, data: bytes) -> None:
+        # The session makes the id unique over several runs of the robot's side.
+        request_id = RequestId(self._identity.session.to_bytes(8, "big") + (number & (1 << 64) - 1).to_bytes(8, "big"))
+        self._plane.submit(request_id, SERVICE, data)
+
+    def _answer(self) -> None:
+        while (request := self._executions.get()) is not None:
+            self._plane.complete(request.execution, bytes(request.payload[: self._answer_bytes]), 0.0)
+
+    # -- what the control plane would do --------------------------------------------------------------------------
+
+    def _on_candidates(self, candidates: tuple[Candidate, ...]) -> None:
+        self._candidates = candidates
+        if candidates:
+            self._have_candidates.set()
+
+    def _as_peer(self, name: str) -> dict[str, Any]:
+        return {
+            "name": name,
+            "role": self._role.value,
+            "session": self._identity.session,
+            "token": base64.b64encode(self._identity.token).decode(),
+            "candidates": [
+                {"interface_id": c.interface_id, "interface": c.interface, "kind": c.kind.value, "address": c.address}
+                for c in self._candidates
+            ],
+        }
+
+
+def _peer_of(fields: dict[str, Any]) -> Peer:
+    role = Role(fields["role"])
+    candidates = tuple(
+        Candidate(c["interface_id"], c["interface"], CandidateKind(c["kind"]), (c["address"][0], c["address"][1]))
+        for c in fields["candidates"]
+    )
+    offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
+    token = base64.b64decode(fields["token"])
+    return Peer(fields["name"], role, SessionId(fields["session"]), token, 1, candidates, offers)
+
+
+if __name__ == "__main__":
+    serve(EngineProgram())
