@@ -29,6 +29,7 @@ from sidecar.core.link_events import (
     MessageFinished,
     PathChanged,
     PathMeasured,
+    PathMtuChanged,
     PeerClosed,
     PeerRestarted,
     Resend,
@@ -245,6 +246,10 @@ class Engine:
                 pass  # of a peer that left, or an interface that went, a moment ago
             case PathChanged():
                 self._on_path_changed(event, now)
+            case PathMtuChanged(path, max_datagram) if self._knows(path):
+                self.routes.set_max_datagram(path, max_datagram)
+            case PathMtuChanged():
+                pass
             case PeerRestarted():
                 if self.peers.restarted(event, now):
                     self._end_session(event.peer, now)

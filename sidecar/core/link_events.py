@@ -51,6 +51,13 @@ class Rebind:
 
 
 @dataclass(frozen=True, slots=True)
+class SetMtu:
+    """The interface's MTU: bytes, IP header included."""
+
+    mtu: int
+
+
+@dataclass(frozen=True, slots=True)
 class Send:
     """Send a whole message over this path."""
 
@@ -80,7 +87,7 @@ class SendClose:
     """Tell all peers that we go away."""
 
 
-LinkCommand = SetPeers | SetReady | SetCarrier | Rebind | Send | Resend | SendFinished | SendClose
+LinkCommand = SetPeers | SetReady | SetCarrier | Rebind | SetMtu | Send | Resend | SendFinished | SendClose
 
 
 class FragmentReceived(NamedTuple):
@@ -121,6 +128,14 @@ class PathChanged:
 
 
 @dataclass(frozen=True, slots=True)
+class PathMtuChanged:
+    """The longest datagram (bytes of UDP payload) that a path is known to carry; one that goes down forgets it."""
+
+    path: PathId
+    max_datagram: int
+
+
+@dataclass(frozen=True, slots=True)
 class PathMeasured:
     """Round-trip times (s) and datagram counts of one path since the last such event."""
 
@@ -147,4 +162,13 @@ class PeerClosed:
     peer: NodeName
 
 
-LinkEvent = FragmentReceived | FragmentsLost | MessageFinished | PathChanged | PathMeasured | PeerRestarted | PeerClosed
+LinkEvent = (
+    FragmentReceived
+    | FragmentsLost
+    | MessageFinished
+    | PathChanged
+    | PathMtuChanged
+    | PathMeasured
+    | PeerRestarted
+    | PeerClosed
+)

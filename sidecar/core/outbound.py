@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.frame import BASE_SYMBOL_BYTES, symbol_count
+from sidecar.core.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, symbol_count
 from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ class OutboundMessage:
         "over",
         "path",
         "priority",
+        "successor",
         "symbol",
     )
 
@@ -37,7 +38,7 @@ class OutboundMessage:
         self,
         number: int,
         path: PathId,
-        data: bytes,
+        data: bytes | memoryview,
         *,
         priority: Priority = Priority.NORMAL,
         deadline: float,
@@ -57,12 +58,43 @@ class OutboundMessage:
         self.count = symbol_count(len(data), symbol)
         self.acked = bytearray(self.count)
         self.over = False
-        """Delivered, called off or expired: nothing of it needs to travel any more."""
+        """Delivered, called off, expired or cut anew: nothing of it needs to travel any more."""
+        self.successor: OutboundMessage | None = None
+        """The same bytes, cut anew into smaller symbols."""
 
     @property
     def peer(self) -> NodeName:
         """Whom it is for."""
         return self.path.peer
+
+    @property
+    def newest(self) -> OutboundMessage:
+        """What the bytes travel as by now: this message, or what it was cut into."""
+        message = self
+        while message.successor is not None:
+            message = message.successor
+        return message
+
+    @property
+    def datagram_bytes(self) -> int:
+        """Length of its longest datagram, with the room for the tag."""
+        return min(len(self.data), self.symbol) + FRAGMENT_OVERHEAD_BYTES
+
+    def cut_anew(self, number: int, path: PathId, symbol: int) -> OutboundMessage:
+        """Return the same bytes as another message, for paths that carry no more than `symbol` bytes at once.
+
+        Its symbols do not complete those of this one at the receiver.
+        """
+        self.successor = OutboundMessage(
+            number,
+            path,
+            self.data,
+            priority=self.priority,
+            deadline=self.deadline,
+            expires=self.expires,
+            symbol=symbol,
+        )
+        return self.successor
 
     def missing(self) -> tuple[int, ...]:
         """The symbols that still have to travel."""

@@ -61,13 +61,28 @@ class Outbox:
         if not self.has_room(path.peer, len(data)):
             self._stats.dropped["outbox_full"] += 1
             return None
-        message = OutboundMessage(self._next_number, path, data, priority=priority, deadline=deadline, expires=expires)
-        self._next_number += 1
-        self._messages[message.number] = message
-        self._shares_of_messages.take(path.peer)
-        self._shares_of_bytes.take(path.peer, len(data))
-        self._command(Send(path, message))
+        message = OutboundMessage(
+            self._take_number(),
+            path,
+            data,
+            priority=priority,
+            deadline=deadline,
+            expires=expires,
+            symbol=self._routes.symbol_to(path.peer),
+        )
+        self._enter(message)
         return message
+
+    def _take_number(self) -> int:
+        number = self._next_number
+        self._next_number += 1
+        return number
+
+    def _enter(self, message: OutboundMessage) -> None:
+        self._messages[message.number] = message
+        self._shares_of_messages.take(message.peer)
+        self._shares_of_bytes.take(message.peer, len(message.data))
+        self._command(Send(message.path, message))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
         """The peer holds all of it. None when it is not one of the peer's messages, or was over before."""
@@ -78,7 +93,8 @@ class Outbox:
         return message
 
     def drop(self, message: OutboundMessage) -> None:
-        """Nothing more of it needs to travel."""
+        """Nothing more of it needs to travel, as whatever it was cut into."""
+        message = message.newest
         message.over = True
         if self._messages.pop(message.number, None) is not None:
             self._shares_of_messages.give_back(message.peer)
@@ -102,15 +118,25 @@ class Outbox:
         indices = tuple(index for index in event.indices if message.needs(index))
         if not indices:
             return
-        path = self._routes.best_to(message.peer, avoid=event.path if event.timed_out else None)
+        path = self._routes.best_to(
+            message.peer, avoid=event.path if event.timed_out else None, size=message.datagram_bytes
+        )
         if path is None:
             self._parked.setdefault(message.peer, {})[message.number] = message
         else:
             self._resend(message, path, indices)
 
     def _resend(self, message: OutboundMessage, path: PathId, indices: tuple[int, ...]) -> None:
+        if message.datagram_bytes > self._routes.max_datagram(path):
+            self._cut_anew(message, path)
+            return
         message.interfaces.add(path.interface)
         self._command(Resend(path, message, indices))
+
+    def _cut_anew(self, message: OutboundMessage, path: PathId) -> None:
+        """No path carries its symbols any more: the whole of it travels again, in smaller ones."""
+        self.drop(message)
+        self._enter(message.cut_anew(self._take_number(), path, self._routes.symbol_to(path.peer)))
 
     def on_path_up(self, path: PathId) -> None:
         """Send what waited for a path to this peer."""

@@ -353,7 +353,7 @@ class RequestTable:
 
     def _call_off(self, request: Request) -> None:
         for copy in request.pending():
-            if not copy.message.over:
+            if not copy.message.newest.over:
                 self._parts.outbox.drop(copy.message)
                 copy.state = CopyState.DEAD
                 self._parts.measurements.lost(copy.path, request.service)

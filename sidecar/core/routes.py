@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.pmtu import BASE_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -22,6 +24,8 @@ class Route:
     id: PathId
     state: PathState = PathState.DOWN
     smoothed_rtt_s: float = 0.0
+    max_datagram: int = BASE_BYTES
+    """Bytes of UDP payload."""
 
     @property
     def order(self) -> tuple[int, float, PathId]:
@@ -38,7 +42,14 @@ class Routes:
 
     def set_state(self, path: PathId, state: PathState) -> None:
         """Note a path's liveness."""
-        self._get(path).state = state
+        route = self._get(path)
+        route.state = state
+        if state is PathState.DOWN:
+            route.max_datagram = BASE_BYTES
+
+    def set_max_datagram(self, path: PathId, size: int) -> None:
+        """Note how long a path's datagrams may be, in bytes of UDP payload."""
+        self._get(path).max_datagram = size
 
     def set_rtt(self, path: PathId, smoothed_rtt_s: float) -> None:
         """Note a path's smoothed round-trip time."""
@@ -95,10 +106,31 @@ class Routes:
         ]
         return min(routes, key=lambda route: route.order, default=None)
 
-    def best_to(self, peer: NodeName, avoid: PathId | None = None) -> PathId | None:
-        """Return the best path to the peer that is not down; `avoid` is taken only when there is no other."""
+    def best_to(self, peer: NodeName, avoid: PathId | None = None, size: int = 0) -> PathId | None:
+        """Return the best path to the peer that is not down, preferably one that carries datagrams of `size` bytes.
+
+        `avoid` is taken only when there is no other, or when it is up and the others carry less than `size`.
+        """
+
+        def reluctance(route: Route) -> int:
+            suspect = route.id == avoid
+            if route.max_datagram < size:
+                return 4 if suspect else 2
+            if suspect:
+                return 1 if route.state is PathState.UP else 3
+            return 0
+
         routes = self.usable((peer,))
-        for route in routes:
-            if route.id != avoid:
-                return route.id
-        return routes[0].id if routes else None
+        best = min(routes, key=lambda route: (reluctance(route), route.order), default=None)
+        return None if best is None else best.id
+
+    def max_datagram(self, path: PathId) -> int:
+        """Return how long the path's datagrams may be, in bytes of UDP payload."""
+        route = self._routes.get(path)
+        return BASE_BYTES if route is None else route.max_datagram
+
+    def symbol_to(self, peer: NodeName) -> int:
+        """Return the symbol size (bytes) that every path to the peer carries which is not down."""
+        routes = self._by_peer.get(peer, {}).values()
+        sizes = (route.max_datagram for route in routes if route.state is not PathState.DOWN)
+        return min(sizes, default=BASE_BYTES) - FRAGMENT_OVERHEAD_BYTES

@@ -7,6 +7,7 @@ from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES, Outbox
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.pmtu import BASE_BYTES
 from sidecar.core.priority import Priority
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
@@ -172,3 +173,78 @@ def test_one_peer_never_gets_more_bytes_than_it_can_reassemble(monkeypatch: pyte
     assert box.outbox.has_room(B, size)
     monkeypatch.setattr(outbox_module, "REASSEMBLED_PEER_BYTES", MAX_BYTES)
     assert box.outbox.has_room(A, 1)
+
+
+def carries(box: Box, over: PathId, size: int) -> None:
+    box.routes.set_max_datagram(over, size)
+
+
+def test_symbols_fit_every_path_to_that_peer_that_is_not_down() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    carries(box, OVER_WLAN, 8952)
+    carries(box, OVER_WWAN, 1372)
+    box.routes.set_state(TO_B, PathState.UP)
+    assert box.send().datagram_bytes == 1372
+    assert box.send(TO_B).datagram_bytes == BASE_BYTES
+    box.routes.set_state(OVER_WWAN, PathState.DOWN)
+    assert box.send(size=10_000).datagram_bytes == 8952
+    assert box.send(size=10).datagram_bytes < 100
+
+
+def test_lost_symbols_take_the_path_that_carries_them() -> None:
+    box = Box(OVER_WLAN)
+    carries(box, OVER_WLAN, 1472)
+    message = box.send()
+    box.routes.set_state(OVER_WWAN, PathState.UP)
+    box.routes.set_rtt(OVER_WLAN, 1.0)
+    box.lost(message, 0)
+    box.lost(message, 1, timed_out=True)
+    assert box.commands == [Resend(OVER_WLAN, message, (0,)), Resend(OVER_WLAN, message, (1,))]
+
+
+def test_a_message_that_no_path_carries_any_more_is_cut_anew() -> None:
+    box = Box(OVER_WLAN)
+    carries(box, OVER_WLAN, 1472)
+    message = box.send(size=3000)
+    message.acked[0] = 1
+    box.routes.set_state(OVER_WWAN, PathState.UP)
+    box.routes.set_state(OVER_WLAN, PathState.DOWN)
+    box.lost(message, 1)
+    (command,) = box.commands
+    anew = message.newest
+    assert command == Send(OVER_WWAN, anew)
+    assert message.over
+    assert anew.number > message.number
+    assert anew.datagram_bytes == BASE_BYTES
+    assert len(anew.missing()) == anew.count
+    assert b"".join(anew.symbol_data(index) for index in range(anew.count)) == bytes(3000)
+    assert (len(box.outbox), box.outbox.held_bytes) == (1, 3000)
+    # Who still holds the first one means the bytes.
+    box.lost(message, 2)
+    box.outbox.drop(message)
+    assert anew.over
+    assert (len(box.outbox), box.outbox.held_bytes, len(box.commands)) == (0, 0, 1)
+
+
+def test_what_waits_for_a_path_is_cut_to_the_one_that_comes() -> None:
+    box = Box(OVER_WLAN)
+    carries(box, OVER_WLAN, 1472)
+    message = box.send()
+    box.routes.set_state(OVER_WLAN, PathState.DOWN)
+    box.lost(message, 0)
+    assert not box.commands
+    box.routes.set_state(OVER_WLAN, PathState.UP)
+    box.outbox.on_path_up(OVER_WLAN)
+    assert box.commands == [Send(OVER_WLAN, message.newest)]
+    assert message.newest.datagram_bytes == BASE_BYTES
+
+
+def test_a_suspect_path_is_left_for_one_that_is_too_small() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    carries(box, OVER_WLAN, 1472)
+    box.routes.set_state(OVER_WWAN, PathState.DOWN)
+    message = box.send()
+    box.routes.set_state(OVER_WWAN, PathState.UP)
+    box.routes.set_state(OVER_WLAN, PathState.UNSTABLE)
+    box.lost(message, 0, timed_out=True)
+    assert box.commands == [Send(OVER_WWAN, message.newest)]

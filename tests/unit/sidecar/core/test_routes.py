@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.path_id import PathState
+from sidecar.core.pmtu import BASE_BYTES
 from sidecar.core.routes import Routes
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
 
@@ -32,6 +34,29 @@ def test_the_best_path_may_be_avoided_unless_it_is_the_only_one() -> None:
         table.set_state(gone, PathState.DOWN)
     assert table.best_to(A, avoid=FAST) == FAST
     assert table.best_to(B) is None
+
+
+def test_a_path_that_carries_the_size_is_preferred_to_a_better_one() -> None:
+    table = routes()
+    table.set_max_datagram(SHAKY, 1472)
+    assert table.best_to(A, size=1400) == SHAKY
+    assert table.best_to(A, size=1200) == FAST
+    assert table.best_to(A, size=1473) == FAST
+    assert table.best_to(A, avoid=SHAKY, size=1400) == FAST
+    table.set_state(SHAKY, PathState.UP)
+    assert table.best_to(A, avoid=SHAKY, size=1400) == SHAKY
+
+
+def test_a_path_that_was_down_carries_the_base_again() -> None:
+    table = routes()
+    for known in (FAST, SLOW, SHAKY):
+        table.set_max_datagram(known, 1472)
+    assert table.symbol_to(A) == 1472 - FRAGMENT_OVERHEAD_BYTES
+    table.set_state(FAST, PathState.DOWN)
+    assert table.symbol_to(A) == 1472 - FRAGMENT_OVERHEAD_BYTES
+    table.set_state(FAST, PathState.UP)
+    assert table.max_datagram(FAST) == BASE_BYTES
+    assert table.symbol_to(A) == BASE_BYTES - FRAGMENT_OVERHEAD_BYTES
 
 
 def test_the_best_over_one_interface() -> None:
