@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.link_events import SendClose
+from sidecar.net.timerfd import Timer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -67,17 +68,16 @@ class ThreadedDataPlane:
         self._engine = Engine(config, self._clock())
         self._lock = threading.Lock()
         self._links: dict[InterfaceName, InterfaceThread] = {}
-        self._wake_timer = threading.Event()
-        self._timer_due = 0.0
+        self._timer = Timer()
         self._stopping = False
         self._logged_conflicts: frozenset[tuple[ServiceName, NodeName, str]] = frozenset()
-        self._timer = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
+        self._timer_thread = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
 
     # -- life -----------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Start the timer; interfaces come by `set_links`."""
-        self._timer.start()
+        self._timer_thread.start()
 
     def set_links(self, links: dict[InterfaceName, InterfaceThread]) -> None:
         """Use these interfaces from now on; starting and stopping their threads is the caller's."""
@@ -105,8 +105,9 @@ class ThreadedDataPlane:
             link.post(SendClose())
             link.wake()
         self._stopping = True
-        self._wake_timer.set()
-        self._timer.join(2.0)
+        with self._lock:
+            self._timer.arm(0.0)
+        self._timer_thread.join(2.0)
 
     # -- sidecar.ports.DataPlane ----------------------------------------------------------------------------------
 
@@ -221,10 +222,8 @@ class ThreadedDataPlane:
                 woken.add(link)
         for event in self._engine.take_events():
             self._hooks.application.handle(event)
-        due = self._engine.next_timer()
-        if due < self._timer_due:
-            self._timer_due = due
-            self._wake_timer.set()
+        # The kernel's timer, not its thread: nearly every request has a deadline, and is answered long before it.
+        self._timer.arm_at_latest(self._engine.next_timer())
         return woken
 
     def _links_for(self, interface: InterfaceName | None) -> list[InterfaceThread]:
@@ -248,12 +247,14 @@ class ThreadedDataPlane:
                 # Without this thread no deadline is noticed and no request ends.
                 log.exception("internal error; the timers go on")
                 time.sleep(ERROR_PAUSE_S)
-            self._wake_timer.wait(min(max(0.0, self._timer_due - self._clock()), MAX_TIMER_SLEEP_S))
+            else:
+                self._timer.wait()
 
     def _timer_turn(self) -> None:
         with self._lock:
-            self._wake_timer.clear()
-            self._engine.handle_timer(self._clock())
+            now = self._clock()
+            self._engine.handle_timer(now)
             woken = self._queue_outputs()
-            self._timer_due = self._engine.next_timer()
+            if not self._stopping:
+                self._timer.arm(min(self._engine.next_timer(), now + MAX_TIMER_SLEEP_S))
         self._wake(woken)

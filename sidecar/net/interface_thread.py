@@ -5,14 +5,10 @@ It only moves bytes, commands and events and arms one timer; every decision is i
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import logging
-import os
-import select
 import threading
 import time
-import weakref
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
@@ -20,6 +16,7 @@ from sidecar.core.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
 from sidecar.core.link_events import PathChanged
 from sidecar.net.path_log import PathLog
 from sidecar.net.sockets import normalise, to_sockaddr
+from sidecar.net.waiter import Waiter
 
 if TYPE_CHECKING:
     import socket
@@ -73,10 +70,7 @@ class InterfaceThread:
         self._owner = owner
         self._clock = clock
         self._inbox: deque[LinkCommand | Callable[[StunClient], None]] = deque()
-        self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        # Closed with the object, not with the thread: whoever still holds it may wake it, and must not hit another
-        # file that got the same number.
-        weakref.finalize(self, os.close, self._wake_fd)
+        self._waiter = Waiter(sock.fileno(), clock)
         self._unsent: deque[tuple[Address, bytes]] = deque()
         self._path_log = PathLog()
         self._stopping = False
@@ -107,50 +101,39 @@ class InterfaceThread:
         self._inbox.append(command)
 
     def wake(self) -> None:
-        """Make the thread look at its inbox; for free when called by the thread itself, which looks anyway."""
-        if threading.current_thread() is not self._thread:
-            with contextlib.suppress(BlockingIOError):
-                os.eventfd_write(self._wake_fd, 1)
+        """Make the thread look at its inbox; nearly free while it is awake."""
+        self._waiter.wake()
 
     # Runs on the thread ------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        poller = select.epoll()
+        waiter = self._waiter
         try:
-            poller.register(self._socket.fileno(), select.EPOLLIN)
-            poller.register(self._wake_fd, select.EPOLLIN)
-            blocked = False
-            while True:
-                stopping = self._stopping
-                ready = poller.poll(0 if stopping else self._timeout())
-                for fd, _ in ready:
-                    if fd == self._wake_fd:
-                        with contextlib.suppress(BlockingIOError):
-                            os.eventfd_read(fd)
-                try:
-                    self._turn()
-                except Exception:
-                    # One interface's bug must not silence the interface for good, nor hide.
-                    log.exception("%s: internal error; the interface goes on", self.interface)
-                    self.link.stats.dropped["internal_error"] += 1
-                    time.sleep(ERROR_PAUSE_S)
-                if bool(self._unsent) != blocked:
-                    blocked = bool(self._unsent)
-                    events = select.EPOLLIN | select.EPOLLOUT if blocked else select.EPOLLIN
-                    poller.modify(self._socket.fileno(), events)
-                if stopping:
-                    return
+            while not self._stopping:
+                waiter.wait(self._due(), for_room=bool(self._unsent))
+                self._guarded_turn()
+            self._guarded_turn()
         finally:
-            poller.close()
+            waiter.close()
             self._socket.close()
 
-    def _timeout(self) -> float:
+    def _guarded_turn(self) -> None:
+        try:
+            self._turn()
+        except Exception:
+            # One interface's bug must not silence the interface for good, nor hide.
+            log.exception("%s: internal error; the interface goes on", self.interface)
+            self.link.stats.dropped["internal_error"] += 1
+            time.sleep(ERROR_PAUSE_S)
+
+    def _due(self) -> float:
+        """When a turn is wanted without anybody asking for it."""
         due = self.link.next_timer()
         if self._stun is not None:
             stun_due = self._stun.next_timer()
             if stun_due is not None:
                 due = min(due, stun_due)
-        return max(BLOCKED_TIMER_S if self._unsent else 0.0, due - self._clock())
+        return max(due, self._clock() + BLOCKED_TIMER_S) if self._unsent else due
 
     def _turn(self) -> None:
         link, clock = self.link, self._clock
@@ -190,6 +173,7 @@ class InterfaceThread:
 
     def _execute(self) -> None:
         inbox = self._inbox
+        self._waiter.looked()
         while inbox:
             command = inbox.popleft()
             if callable(command):

@@ -149,7 +149,7 @@ def test_an_internal_error_silences_neither_the_timers_nor_the_interface(
     robot, _ = nodes
     for owner, name in ((robot.plane._engine, "handle_timer"), (robot.thread.link, "handle_timer")):
         fail_once(owner, name)
-    robot.plane._wake_timer.set()
+    robot.plane._timer.arm(0.0)
     submit(robot, 1, b"still here")
     robot.wait_for(ResponseArrived)
     deadline = time.monotonic() + PATIENCE_S
@@ -159,7 +159,7 @@ def test_an_internal_error_silences_neither_the_timers_nor_the_interface(
         "the timers go on",
         "the interface goes on",
     }
-    assert robot.plane._timer.is_alive()
+    assert robot.plane._timer_thread.is_alive()
     assert robot.thread._thread.is_alive()
 
 
@@ -176,8 +176,9 @@ def fail_once(owner: object, name: str) -> None:
 def test_timers_do_not_spin_while_the_socket_takes_nothing() -> None:
     node = Node("robot", Role.ROBOT, 1)
     thread = node.thread
-    thread._clock = lambda: thread.link.next_timer() + 1.0
-    assert thread._timeout() == 0.0
+    overdue = thread.link.next_timer() + 1.0
+    thread._clock = lambda: overdue
+    assert thread._due() < overdue
     thread._unsent.append((("127.0.0.1", 9), b"x"))
-    assert thread._timeout() == BLOCKED_TIMER_S
+    assert thread._due() == overdue + BLOCKED_TIMER_S
     thread._socket.close()
