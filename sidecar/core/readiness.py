@@ -1,8 +1,9 @@
 """When an interface may carry data (paper, section IV.B: an interface that STUN cannot see is not used).
 
-An interface is ready once STUN showed its address. While STUN servers answer nobody (the control plane, which runs
-them, is away), waiting would lose requests for nothing: after a grace time every interface is ready, and the probes
-of each path decide. Readiness once given stays for as long as the interface does.
+An interface is ready once STUN showed its address. While STUN servers answer nobody who has the interface's families
+(the control plane, which runs them, is away, or has no IPv6 for an IPv6-only interface), waiting would lose requests
+for nothing: after a grace time such an interface is ready, and the probes of each path decide. Readiness once given
+stays for as long as the interface does.
 """
 
 from __future__ import annotations
@@ -22,20 +23,32 @@ class Readiness:
     def __init__(self, *, stun_enabled: bool) -> None:
         self._stun_enabled = stun_enabled
         self._added_at: dict[InterfaceName, float] = {}
+        self._families: dict[InterfaceName, frozenset[int]] = {}
         self._ready: set[InterfaceName] = set()
         self._answered: set[tuple[InterfaceName, int]] = set()
         """Interface and family whose last STUN round was answered."""
 
-    def add(self, interface: InterfaceName, now: float) -> bool:
-        """An interface appeared; returns whether it is ready at once."""
+    def add(self, interface: InterfaceName, families: frozenset[int], now: float) -> bool:
+        """An interface appeared, with addresses of these families (4, 6); returns whether it is ready at once."""
         self._added_at[interface] = now
+        self._families[interface] = families
         if not self._stun_enabled:
             self._ready.add(interface)
         return interface in self._ready
 
+    def set_families(self, interface: InterfaceName, families: frozenset[int]) -> None:
+        """The interface's addresses changed."""
+        self._families[interface] = families
+
+    @property
+    def waiting(self) -> bool:
+        """Whether some interface is not ready."""
+        return len(self._ready) < len(self._added_at)
+
     def remove(self, interface: InterfaceName) -> None:
         """An interface is gone."""
         self._added_at.pop(interface, None)
+        self._families.pop(interface, None)
         self._ready.discard(interface)
         self._answered = {(name, family) for name, family in self._answered if name != interface}
 
@@ -54,13 +67,14 @@ class Readiness:
         self._answered.discard((interface, family))
 
     def after_grace(self, now: float) -> list[InterfaceName]:
-        """Return the interfaces that become ready because no STUN server answers anybody."""
-        if self._answered:
-            return []
+        """Return the interfaces that become ready because no STUN server answers anybody in their families."""
+        answered = {family for _, family in self._answered}
         late = [
             interface
             for interface, added_at in self._added_at.items()
-            if interface not in self._ready and now >= added_at + STUN_GRACE_S
+            if interface not in self._ready
+            and now >= added_at + STUN_GRACE_S
+            and not self._families[interface] & answered
         ]
         self._ready.update(late)
         return late

@@ -1,30 +1,26 @@
 """Keeps a link for every usable interface: opens sockets, follows hotplug and address changes, runs STUN on each.
 
-The interfaces are looked at every SCAN_EVERY_S. (The next version listens to netlink instead.)
+The kernel announces changes (`netlink_watch`); at each one, and rarely without, all interfaces are looked at.
 """
 
 from __future__ import annotations
 
 import logging
-import random
-import socket
 import threading
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.config_fields import split_host_port
 from protos.errors import ConfigError
-from protos.model import Candidate, CandidateKind, InterfaceId
+from protos.model import Candidate, InterfaceId
 from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.link import Link
-from sidecar.core.link_events import SetReady
 from sidecar.core.readiness import Readiness
-from sidecar.core.stun_client import StunClient
+from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.stun_events import Failed, Mapped, MappingChanged
-from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.interfaces import choose, list_interfaces
-from sidecar.net.sockets import normalise, open_socket
+from sidecar.net.managed_interface import STOP_TIMEOUT_S, ManagedInterface
+from sidecar.net.netlink_watch import NetlinkWatch
+from sidecar.net.stun_names import StunNames
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,15 +29,17 @@ if TYPE_CHECKING:
     from sidecar.config import SidecarConfig
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane
-    from sidecar.net.interfaces import Interface, SkippedInterface
+    from sidecar.net.interface_thread import InterfaceThread
+    from sidecar.net.interfaces import Interface, InterfaceChoice, SkippedInterface
 
 log = logging.getLogger(__name__)
 
-SCAN_EVERY_S = 2.0
-"""How soon a new interface is found; a scan costs a few milliseconds of one core."""
 MAX_INTERFACES = 256
 """An interface's number is one byte of the datagram's header."""
-STOP_TIMEOUT_S = 1.0
+GRACE_CHECK_S = 0.5
+"""While an interface waits for STUN, how often it is asked whether STUN answers anybody."""
+COALESCE_S = 0.005
+"""Between two readings of a flood of announcements: each costs a turn of the interpreter, which all threads share."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +52,11 @@ class Identity:
 
 
 @dataclass(slots=True)
-class _Managed:
-    interface: Interface
-    thread: InterfaceThread
-    number: InterfaceId
-    reflexive: dict[int, Address]
+class _Number:
+    """An interface's number in this run, kept while it is away, with the packet numbers that were not used yet."""
+
+    id: InterfaceId
+    first_packet: int = 0
 
 
 class InterfaceManager:
@@ -75,17 +73,19 @@ class InterfaceManager:
         self._identity = identity
         self._data_plane = data_plane
         self._candidates_changed = candidates_changed
-        self._managed: dict[InterfaceName, _Managed] = {}
-        self._numbers: dict[InterfaceName, InterfaceId] = {}
+        self._managed: dict[InterfaceName, ManagedInterface] = {}
+        self._numbers: dict[InterfaceName, _Number] = {}
         self._stun_names: tuple[str, ...] = config.stun.servers
         self._stun_servers: tuple[Address, ...] = ()
+        self._resolver = StunNames(self._use_stun_servers)
         self._candidates: tuple[Candidate, ...] = ()
         self._readiness = Readiness(stun_enabled=config.stun.enabled)
         self._skipped: dict[InterfaceName, str] = {}
         self._warned = False
         self._lock = threading.Lock()
         """Guards the addresses, which the interfaces' threads report."""
-        self._look_now = threading.Event()
+        self._watch = NetlinkWatch()
+        self._schedule = ScanSchedule(time.monotonic(), has_news=False)
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="plr-interfaces", daemon=True)
 
@@ -103,22 +103,33 @@ class InterfaceManager:
                 "interfaces",
                 f"expected an existing interface, got '{missing[0]}' (there are: {existing})",
             )
+        try:
+            self._watch.subscribe()
+            self._schedule = ScanSchedule(time.monotonic(), has_news=True)
+        except OSError as error:
+            log.warning("changes of interfaces are not announced (%s): looking every %g s", error, WITHOUT_NEWS_S)
+        if self._config.stun.enabled:
+            self._resolver.look_up(self._stun_names)
+            self._resolver.start()
         self._scan()
         self._thread.start()
 
     def stop(self) -> None:
         """End the threads."""
         self._stopping = True
-        self._look_now.set()
+        self._resolver.stop()
+        self._watch.wake()
         self._thread.join(STOP_TIMEOUT_S * 2)
         for managed in list(self._managed.values()):
-            managed.thread.stop(STOP_TIMEOUT_S)
+            managed.stop()
+        if not self._thread.is_alive():
+            self._watch.close()
 
     def set_stun_servers(self, names: tuple[str, ...]) -> None:
         """Use these host:port servers, unless the configuration has its own."""
         if not self._config.stun.servers and names != self._stun_names:
             self._stun_names = names
-            self._look_now.set()
+            self._resolver.look_up(names)
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
         """Take what STUN found; called on the interface's thread."""
@@ -131,164 +142,187 @@ class InterfaceManager:
                     log.info("%s: reachable from outside as %s port %d", interface, *address)
                     managed.reflexive[family] = address
                     if self._readiness.mapped(interface, family):
-                        self._set_ready(managed, ready=True)
+                        managed.set_ready()
                 case Failed(family, reason, last_known):
                     self._readiness.failed(interface, family)
-                    still = f"; still using {last_known[0]} port {last_known[1]}" if last_known else ""
-                    log.warning("%s: STUN over IPv%d failed: %s%s; trying again", interface, family, reason, still)
+                    if not managed.suspended:
+                        still = f"; still using {last_known[0]} port {last_known[1]}" if last_known else ""
+                        log.warning("%s: STUN over IPv%d failed: %s%s; trying again", interface, family, reason, still)
         self._publish_candidates()
+
+    def _use_stun_servers(self, servers: tuple[Address, ...]) -> None:
+        """The names were looked up; called on the resolver's thread."""
+        with self._lock:
+            self._stun_servers = servers
+            for managed in self._managed.values():
+                managed.set_stun_servers(servers)
 
     # Runs on the manager's thread --------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        while True:
-            self._look_now.wait(SCAN_EVERY_S)
-            self._look_now.clear()
+        while not self._stopping:
+            self._turn(self._wait_s())
+
+    def _wait_s(self) -> float:
+        wait_s = self._schedule.due - time.monotonic()
+        return min(wait_s, GRACE_CHECK_S) if self._readiness.waiting else wait_s
+
+    def _turn(self, wait_s: float) -> None:
+        try:
+            changes = self._watch.wait(wait_s)
             if self._stopping:
                 return
-            try:
+            if changes.gone_links:
+                self._suspend_links(changes.gone_links)
+            if changes.any:
+                self._schedule.changed(time.monotonic())
+            if self._schedule.due <= time.monotonic():
                 self._scan()
-            except OSError as error:
-                log.warning("interfaces could not be listed: %s; trying again", error)
+            elif changes.any:
+                time.sleep(COALESCE_S)
+            self._let_late_ones_begin()
+        except OSError as error:
+            log.warning("interfaces could not be listed: %s; trying again", error)
+            self._schedule.failed(time.monotonic())
+            time.sleep(GRACE_CHECK_S)
+
+    def _suspend_links(self, indices: frozenset[int]) -> None:
+        """Before anything is looked at: what these carried takes other paths now, not after the next look."""
+        for managed in self._managed.values():
+            if managed.interface.index in indices and not managed.suspended:
+                self._suspend(managed, "no carrier")
+
+    def _suspend(self, managed: ManagedInterface, reason: str) -> None:
+        log.warning("%s: %s; its requests take other paths", managed.name, reason)
+        with self._lock:
+            managed.suspend()
 
     def _scan(self) -> None:
-        self._resolve_stun_servers()
+        started = time.monotonic()
         choice = choose(list_interfaces(), self._config.interfaces)
         self._log_skipped({skipped.name: skipped.reason for skipped in choice.skipped})
-        wanted = {interface.name: interface for interface in choice.usable}
-        self._drop_gone(wanted)
-        changed = False
-        for name, interface in wanted.items():
-            managed = self._managed.get(name)
+        self._drop_gone(choice)
+        changed = added = False
+        for interface in choice.usable:
+            managed = self._managed.get(interface.name)
             if managed is None:
-                changed |= self._add(interface)
-            elif managed.interface.addresses != interface.addresses:
-                self._readdress(managed, interface)
-        if changed:
-            links = {name: managed.thread for name, managed in self._managed.items()}
-            self._data_plane.set_links(links)
+                added |= self._add(interface)
+            else:
+                changed |= self._update(managed, interface)
+        if added:
+            self._data_plane.set_links(self._links())
+        if (changed or added) and self._config.stun.enabled:
+            self._resolver.look_up(self._stun_names)  # this network's DNS may know what the last one's did not
         self._warn_when_none(choice.skipped)
-        with self._lock:
-            for name in self._readiness.after_grace(time.monotonic()):
-                log.warning("%s: no STUN server answers; used without it, as far as probes succeed", name)
-                self._set_ready(self._managed[name], ready=True)
         self._publish_candidates()
+        self._schedule.scanned(started, time.monotonic())
 
-    def _warn_when_none(self, skipped: tuple[SkippedInterface, ...]) -> None:
-        """Without any interface nothing is carried, and nothing else would say so."""
-        none = not self._managed
-        if none and not self._warned:
-            reasons = "; ".join(f"{interface.name}: {interface.reason}" for interface in skipped) or "there are none"
-            log.warning("no interface is in use, nothing can be carried (%s)", reasons)
-        self._warned = none
-
-    def _drop_gone(self, wanted: dict[InterfaceName, Interface]) -> None:
-        gone = [managed for name, managed in self._managed.items() if name not in wanted]
-        for managed in gone:
-            name = managed.interface.name
-            log.warning("%s: gone or unusable; its requests take other paths", name)
-            with self._lock:
-                del self._managed[name]
-                self._readiness.remove(name)
+    def _drop_gone(self, choice: InterfaceChoice) -> None:
+        """Suspend what cannot carry now; let go of what is not there any more, or as another device."""
+        usable = {interface.name: interface for interface in choice.usable}
+        idle = {skipped.name: skipped for skipped in choice.skipped if skipped.wanted}
+        gone: list[ManagedInterface] = []
+        for name, managed in list(self._managed.items()):
+            now_usable, now_idle = usable.get(name), idle.get(name)
+            if now_usable is not None:
+                keep = not managed.must_reopen(now_usable)
+            else:
+                keep = now_idle is not None and now_idle.index == managed.interface.index
+            if not keep:
+                log.warning("%s: gone, or another device now; its requests take other paths", name)
+                with self._lock:
+                    del self._managed[name]
+                    self._readiness.remove(name)
+                gone.append(managed)
+            elif now_idle is not None and not managed.suspended:
+                self._suspend(managed, now_idle.reason)
         if gone:
-            self._data_plane.set_links({name: managed.thread for name, managed in self._managed.items()})
+            self._data_plane.set_links(self._links())
         for managed in gone:
-            managed.thread.stop(STOP_TIMEOUT_S)
+            self._numbers[managed.name].first_packet = managed.stop()
 
     def _add(self, interface: Interface) -> bool:
         number = self._number(interface.name)
         if number is None:
             return False
-        try:
-            opened = open_socket(interface, self._config.udp_port)
-        except OSError as error:
-            self._log_skipped_once(interface.name, f"its socket could not be opened: {error}")
-            return False
         me = self._identity
-        link = Link(
-            LinkIdentity(interface.name, number, me.session, me.token, me.incarnation),
-            random.SystemRandom(),
-            time.monotonic(),
-        )
-        stun = None
-        if self._config.stun.enabled:
-            stun = StunClient(self._stun_servers, random.SystemRandom(), drops=link.stats.dropped)
-            stun.start(time.monotonic())
-        thread = InterfaceThread(opened.socket, link, stun, self._data_plane)
+        identity = LinkIdentity(interface.name, number.id, me.session, me.token, me.incarnation)
         with self._lock:
-            managed = self._managed[interface.name] = _Managed(interface, thread, number, {})
-            self._set_ready(managed, ready=self._readiness.add(interface.name, time.monotonic()))
-        thread.start()
+            servers = self._stun_servers if self._config.stun.enabled else None
+            try:
+                managed = ManagedInterface(
+                    interface, self._config.udp_port, identity, number.first_packet, servers, self._data_plane
+                )
+            except OSError as error:
+                self._log_skipped_once(interface.name, f"its socket could not be opened: {error}")
+                return False
+            self._managed[interface.name] = managed
+            if self._readiness.add(interface.name, interface.families, time.monotonic()):
+                managed.set_ready()
+        managed.thread.start()
         log.info(
             "%s: in use, port %d, bound to the %s, addresses %s",
-            interface.name, thread.port, opened.bound_to, ", ".join(interface.addresses),
+            interface.name, managed.thread.port, managed.bound_to, ", ".join(interface.addresses),
         )  # fmt: skip
         return True
 
-    def _readdress(self, managed: _Managed, interface: Interface) -> None:
-        log.info("%s: addresses changed to %s", interface.name, ", ".join(interface.addresses))
+    def _update(self, managed: ManagedInterface, interface: Interface) -> bool:
+        was = managed.interface
+        back = managed.suspended
         with self._lock:
-            managed.interface = interface
-            managed.reflexive.clear()
-        managed.thread.post(lambda stun: stun.start(time.monotonic()))
-        managed.thread.wake()
+            changed = managed.update(interface)
+            self._readiness.set_families(interface.name, interface.families)
+        if back:
+            log.info("%s: back, addresses %s", interface.name, ", ".join(interface.addresses))
+        elif set(interface.addresses) != set(was.addresses):
+            log.info("%s: addresses changed to %s", interface.name, ", ".join(interface.addresses))
+        elif interface.gateways != was.gateways:
+            log.info("%s: gateways changed to %s", interface.name, ", ".join(interface.gateways) or "none")
+        return changed
 
-    def _number(self, name: InterfaceName) -> InterfaceId | None:
+    def _links(self) -> dict[InterfaceName, InterfaceThread]:
+        return {name: managed.thread for name, managed in self._managed.items()}
+
+    def _let_late_ones_begin(self) -> None:
+        with self._lock:
+            for name in self._readiness.after_grace(time.monotonic()):
+                log.warning("%s: no STUN server answers; used without it, as far as probes succeed", name)
+                self._managed[name].set_ready()
+
+    def _warn_when_none(self, skipped: tuple[SkippedInterface, ...]) -> None:
+        """Without any interface nothing is carried, and nothing else would say so."""
+        none = all(managed.suspended for managed in self._managed.values())
+        if none and not self._warned:
+            reasons = "; ".join(f"{interface.name}: {interface.reason}" for interface in skipped) or "there are none"
+            log.warning("no interface is in use, nothing can be carried (%s)", reasons)
+        self._warned = none
+
+    def _number(self, name: InterfaceName) -> _Number | None:
         if name not in self._numbers:
             if len(self._numbers) >= MAX_INTERFACES:
                 self._log_skipped_once(name, f"more than {MAX_INTERFACES} interfaces came and went in this run")
                 return None
-            self._numbers[name] = InterfaceId(len(self._numbers))
+            self._numbers[name] = _Number(InterfaceId(len(self._numbers)))
         return self._numbers[name]
-
-    def _set_ready(self, managed: _Managed, *, ready: bool) -> None:
-        managed.thread.post(SetReady(ready))
-        managed.thread.wake()
-
-    def _resolve_stun_servers(self) -> None:
-        """Host names are looked up here, on a thread that nothing waits for."""
-        servers: list[Address] = []
-        for name in self._stun_names:
-            host, port = split_host_port(name)
-            try:
-                found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-            except OSError as error:
-                log.warning("STUN server %s: %s; trying again", name, error)
-                continue
-            servers.extend(normalise(entry[4]) for entry in found)
-        resolved = tuple(dict.fromkeys(servers))
-        if resolved and resolved != self._stun_servers:
-            self._stun_servers = resolved
-            for managed in self._managed.values():
-                managed.thread.post(lambda stun: stun.set_servers(resolved, time.monotonic()))
-                managed.thread.wake()
 
     def _publish_candidates(self) -> None:
         with self._lock:
-            candidates = tuple(candidate for managed in self._managed.values() for candidate in self._of(managed))
-            if candidates == self._candidates:
+            candidates: list[Candidate] = []
+            for managed in self._managed.values():
+                candidates += managed.candidates(self._advertised(managed.name))
+            if tuple(candidates) == self._candidates:
                 return
-            self._candidates = candidates
-        self._candidates_changed(candidates)
+            self._candidates = tuple(candidates)
+        self._candidates_changed(self._candidates)
 
-    def _of(self, managed: _Managed) -> list[Candidate]:
-        name, number, port = managed.interface.name, managed.number, managed.thread.port
-        hosts = [(address, port) for address in managed.interface.addresses]
-        for advertised in self._config.advertise:
-            first = next(iter(self._managed), None)
-            if (advertised.interface or first) == name:
-                hosts.append((advertised.address, port))
-        found = [Candidate(number, name, CandidateKind.HOST, address) for address in hosts]
-        found.extend(
-            Candidate(number, name, CandidateKind.SERVER_REFLEXIVE, address)
-            for address in managed.reflexive.values()
-            if address not in hosts
-        )
-        return found
+    def _advertised(self, name: InterfaceName) -> list[str]:
+        first = next(iter(self._managed), None)
+        return [entry.address for entry in self._config.advertise if (entry.interface or first) == name]
 
     def _log_skipped(self, skipped: dict[InterfaceName, str]) -> None:
         for name, reason in skipped.items():
-            self._log_skipped_once(name, reason)
+            if name not in self._managed:
+                self._log_skipped_once(name, reason)
         for name in [name for name in self._skipped if name in self._managed]:
             del self._skipped[name]
 

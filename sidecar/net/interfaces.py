@@ -18,7 +18,7 @@ from protos.model import InterfaceName
 from sidecar.config_fields import is_glob
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
 
 _IFF_UP = 0x1
 _IFF_LOOPBACK = 0x8
@@ -58,8 +58,21 @@ class Interface:
     mtu: int
     addresses: tuple[str, ...] = ()
     """IPv4 and IPv6 of global or unique-local scope, in canonical form; no link-local ones."""
-    default_route: bool = False
-    """Some default route, of either family and in whatever table, leaves by it."""
+    gateways: tuple[str, ...] = ()
+    """Where the default routes that leave by it lead, of both families and all tables, sorted; "" for a link that
+    needs no gateway."""
+
+    @property
+    def families(self) -> frozenset[int]:
+        """4, 6, both or none: of its addresses."""
+        return frozenset(6 if ":" in address else 4 for address in self.addresses)
+
+    def rebound_since(self, before: Interface) -> bool:
+        """Whether what was sent from it `before` may have left from elsewhere, or by another way.
+
+        A further address alone takes nothing away.
+        """
+        return self.gateways != before.gateways or not set(before.addresses) <= set(self.addresses)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +80,10 @@ class SkippedInterface:
     """An interface that is there but not used."""
 
     name: InterfaceName
+    index: int
     reason: str
+    wanted: bool
+    """It would be used if it could carry anything now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +100,8 @@ def list_interfaces() -> tuple[Interface, ...]:
     """Return the interfaces of the caller's network namespace by index; raises OSError when netlink fails."""
     with IPRoute() as netlink:
         addresses = _addresses_by_index(netlink.get_addr())
-        routed = frozenset(_default_route_indices(netlink.get_routes()))
-        interfaces = [_interface(link, addresses, routed) for link in netlink.get_links()]
+        gateways = _gateways_by_index(netlink.get_routes())
+        interfaces = [_interface(link, addresses, gateways) for link in netlink.get_links()]
     return tuple(sorted(interfaces, key=lambda interface: interface.index))
 
 
@@ -100,16 +116,17 @@ def choose(interfaces: Iterable[Interface], wanted: Sequence[str] | None) -> Int
     names = set()
     for interface in interfaces:
         names.add(interface.name)
-        reason = _reason_to_skip(interface, wanted)
+        unwanted = _reason_not_to_want(interface, wanted)
+        reason = unwanted or _reason_not_to_use(interface)
         if reason is None:
             usable.append(interface)
         else:
-            skipped.append(SkippedInterface(interface.name, reason))
+            skipped.append(SkippedInterface(interface.name, interface.index, reason, wanted=unwanted is None))
     missing = tuple(name for name in wanted or () if not is_glob(name) and name not in names)
     return InterfaceChoice(tuple(usable), tuple(skipped), missing)
 
 
-def _reason_to_skip(interface: Interface, wanted: Sequence[str] | None) -> str | None:
+def _reason_not_to_want(interface: Interface, wanted: Sequence[str] | None) -> str | None:
     name = interface.name
     if wanted is not None and not any(fnmatch.fnmatchcase(name, pattern) for pattern in wanted):
         return "not in the configuration"
@@ -117,6 +134,10 @@ def _reason_to_skip(interface: Interface, wanted: Sequence[str] | None) -> str |
         kind = _virtual_kind(interface)
         if kind is not None:
             return f"{kind}: used only when the configuration has its exact name"
+    return None
+
+
+def _reason_not_to_use(interface: Interface) -> str | None:
     if not interface.up:
         return "down"
     if not interface.carrier:
@@ -134,7 +155,7 @@ def _virtual_kind(interface: Interface) -> str | None:
     return None
 
 
-def _interface(link: Any, addresses: dict[int, list[str]], routed: frozenset[int]) -> Interface:
+def _interface(link: Any, addresses: dict[int, list[str]], gateways: dict[int, set[str]]) -> Interface:
     flags = link["flags"]
     index = link["index"]
     kind = LOOPBACK if flags & _IFF_LOOPBACK else link.get(("linkinfo", "kind")) or ""
@@ -146,7 +167,7 @@ def _interface(link: Any, addresses: dict[int, list[str]], routed: frozenset[int
         carrier=bool(flags & _IFF_LOWER_UP),
         mtu=link.get("mtu") or 0,
         addresses=tuple(addresses.get(index, ())),
-        default_route=index in routed,
+        gateways=tuple(sorted(gateways.get(index, ()))),
     )
 
 
@@ -164,12 +185,20 @@ def _addresses_by_index(messages: Iterable[Any]) -> dict[int, list[str]]:
     return addresses
 
 
-def _default_route_indices(messages: Iterable[Any]) -> Iterator[int]:
+def _gateways_by_index(messages: Iterable[Any]) -> dict[int, set[str]]:
+    gateways: dict[int, set[str]] = {}
     for message in messages:
         unicast = message["type"] == _RTN_UNICAST and message["family"] in (socket.AF_INET, socket.AF_INET6)
         if not unicast or message["dst_len"] != 0:
             continue
         if message.get("oif") is not None:
-            yield message.get("oif")
+            gateways.setdefault(message.get("oif"), set()).add(_next_hop(message))
         for hop in message.get("multipath") or ():
-            yield hop["oif"]
+            gateways.setdefault(hop["oif"], set()).add(_next_hop(hop))
+    return gateways
+
+
+def _next_hop(route: Any) -> str:
+    """The gateway of a route or of one of its hops; RTA_VIA is one of the other family."""
+    via = route.get("gateway") or (route.get("via") or {}).get("addr") or ""
+    return str(via)

@@ -102,7 +102,7 @@ def test_interfaces_are_described_as_netlink_has_them() -> None:
     assert seen["wlan0"]["kind"] == "veth"
     assert seen["wlan0"]["up"]
     assert seen["wlan0"]["carrier"]
-    assert seen["wlan0"]["default_route"]
+    assert seen["wlan0"]["gateways"]
     # No link-local ones, and of a point-to-point address our end.
     assert sorted(seen["wlan0"]["addresses"]) == ["10.0.1.1", "10.0.8.1", "fd00:1::1"]
     assert seen["br-lab"]["kind"] == "bridge"
@@ -111,4 +111,4 @@ def test_interfaces_are_described_as_netlink_has_them() -> None:
     assert seen["eth6"]["up"]
     assert not seen["eth6"]["carrier"]
     assert seen["eth6"]["addresses"] == ["10.0.6.1"]
-    assert not seen["eth6"]["default_route"]
+    assert seen["eth6"]["gateways"] == []

@@ -8,7 +8,7 @@ from protos.model import InterfaceName
 from sidecar.net.interfaces import LOOPBACK, Interface, SkippedInterface, choose, list_interfaces
 
 WLAN = Interface(
-    InterfaceName("wlan0"), 3, "", up=True, carrier=True, mtu=1500, addresses=("192.0.2.2",), default_route=True
+    InterfaceName("wlan0"), 3, "", up=True, carrier=True, mtu=1500, addresses=("192.0.2.2",), gateways=("192.0.2.1",)
 )
 
 
@@ -84,7 +84,7 @@ def test_what_cannot_carry_is_skipped_even_when_named(entry: Interface, reason: 
     for wanted in (None, ["wlan0"], ["wl*"]):
         choice = choose([entry], wanted)
         assert choice.usable == ()
-        assert choice.skipped == (SkippedInterface(entry.name, reason),)
+        assert choice.skipped == (SkippedInterface(entry.name, entry.index, reason, wanted=True),)
         assert choice.missing == ()
 
 
@@ -93,6 +93,7 @@ def test_a_list_leaves_out_the_rest() -> None:
     choice = choose([WLAN, eth, LO], ["eth*"])
     assert names(choice.usable) == ["eth0"]
     assert [skipped.reason for skipped in choice.skipped] == ["not in the configuration"] * 2
+    assert not any(skipped.wanted for skipped in choice.skipped)
 
 
 def test_a_named_interface_that_does_not_exist_is_missing_but_a_glob_may_match_nothing_yet() -> None:
@@ -102,11 +103,33 @@ def test_a_named_interface_that_does_not_exist_is_missing_but_a_glob_may_match_n
 
 
 def test_an_interface_without_default_route_is_usable() -> None:
-    assert choose([replace(WLAN, default_route=False)], None).usable
+    assert choose([replace(WLAN, gateways=())], None).usable
 
 
 def test_this_host_has_a_loopback_interface() -> None:
     (loopback,) = [entry for entry in list_interfaces() if entry.kind == LOOPBACK]
     assert loopback.name == "lo"
-    assert not loopback.default_route
+    assert loopback.gateways == ()
     assert loopback.index == 1
+
+
+@pytest.mark.parametrize(
+    ("after", "rebound"),
+    [
+        (WLAN, False),
+        (replace(WLAN, addresses=("192.0.2.3",)), True),
+        (replace(WLAN, addresses=()), True),
+        (replace(WLAN, addresses=("2001:db8::2", "192.0.2.2")), False),
+        (replace(WLAN, gateways=("192.0.2.9",)), True),
+        (replace(WLAN, gateways=()), True),
+        (replace(WLAN, mtu=1280), False),
+    ],
+)
+def test_a_lost_address_or_another_gateway_rebinds(after: Interface, rebound: bool) -> None:
+    assert after.rebound_since(WLAN) is rebound
+
+
+def test_the_families_are_those_of_the_addresses() -> None:
+    assert WLAN.families == {4}
+    assert replace(WLAN, addresses=("2001:db8::2",)).families == {6}
+    assert replace(WLAN, addresses=()).families == frozenset()

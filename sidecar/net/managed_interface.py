@@ -1,0 +1,121 @@
+"""One interface in use: its thread, what is known of its addresses, and whether it can carry anything now.
+
+It stays while the interface does. Without carrier or address it is only suspended: socket, packet numbers and what
+the peers know of it remain good, so that it carries again at once when it is back.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from typing import TYPE_CHECKING
+
+from protos.model import Candidate, CandidateKind
+from sidecar.core.link import Link
+from sidecar.core.link_events import Rebind, SetCarrier, SetReady
+from sidecar.core.stun_client import StunClient
+from sidecar.net.interface_thread import InterfaceThread
+from sidecar.net.sockets import BoundTo, open_socket
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from protos.model import Address, InterfaceName
+    from sidecar.core.datagrams import LinkIdentity
+    from sidecar.net.interface_thread import LinkOwner
+    from sidecar.net.interfaces import Interface
+
+STOP_TIMEOUT_S = 1.0
+
+
+class ManagedInterface:
+    """An interface, its socket and its thread. Used by the manager; `reflexive` and `interface` under its lock."""
+
+    def __init__(
+        self,
+        interface: Interface,
+        port: int,
+        identity: LinkIdentity,
+        first_number: int,
+        stun_servers: Iterable[Address] | None,
+        owner: LinkOwner,
+    ) -> None:
+        """Open the socket; raises OSError when it is refused. `stun_servers` is None when STUN is off."""
+        self.interface = interface
+        self.suspended = False
+        self.reflexive: dict[int, Address] = {}
+        """By family, where STUN servers see it."""
+        opened = open_socket(interface, port)
+        self.bound_to = opened.bound_to
+        self._bound_address = opened.socket.getsockname()[0] if opened.bound_to is BoundTo.ADDRESS else None
+        link = Link(identity, random.SystemRandom(), time.monotonic(), first_number)
+        stun = None
+        if stun_servers is not None:
+            stun = StunClient(stun_servers, random.SystemRandom(), drops=link.stats.dropped)
+            stun.start(time.monotonic())
+        self.thread = InterfaceThread(opened.socket, link, stun, owner)
+
+    @property
+    def name(self) -> InterfaceName:
+        """The interface's name."""
+        return self.interface.name
+
+    def must_reopen(self, interface: Interface) -> bool:
+        """Whether the socket does not fit the interface as it is now: another device, or its address is gone."""
+        if interface.index != self.interface.index:
+            return True
+        return self._bound_address is not None and self._bound_address not in interface.addresses
+
+    def suspend(self) -> None:
+        """It can carry nothing: its paths are down at once."""
+        self.suspended = True
+        self._post(SetCarrier(on=False))
+
+    def update(self, interface: Interface) -> bool:
+        """Take the interface as it is now; returns whether anything changed for its peers."""
+        before, self.interface = self.interface, interface
+        was_suspended, self.suspended = self.suspended, False
+        rebound = interface.rebound_since(before)
+        if was_suspended:
+            self._post(SetCarrier(on=True))
+        if rebound:
+            self._post(Rebind())
+        changed = was_suspended or rebound or set(interface.addresses) != set(before.addresses)
+        if changed:
+            # Told by an older network; what is true now comes within a round trip.
+            self.reflexive.clear()
+            self.thread.post(lambda stun: stun.start(time.monotonic()))
+            self.thread.wake()
+        return changed
+
+    def set_ready(self) -> None:
+        """It may be used."""
+        self._post(SetReady(ready=True))
+
+    def set_stun_servers(self, servers: tuple[Address, ...]) -> None:
+        """Ask these from now on."""
+        self.thread.post(lambda stun: stun.set_servers(servers, time.monotonic()))
+        self.thread.wake()
+
+    def candidates(self, advertised: Iterable[str]) -> list[Candidate]:
+        """Where peers may reach it; nowhere while it is suspended. `advertised` are further addresses."""
+        if self.suspended:
+            return []
+        number, port = self.thread.link.identity.interface_id, self.thread.port
+        hosts = [(address, port) for address in (*self.interface.addresses, *advertised)]
+        found = [Candidate(number, self.name, CandidateKind.HOST, address) for address in hosts]
+        found.extend(
+            Candidate(number, self.name, CandidateKind.SERVER_REFLEXIVE, address)
+            for address in self.reflexive.values()
+            if address not in hosts
+        )
+        return found
+
+    def stop(self) -> int:
+        """End the thread; returns the first packet number that the interface's next link may use."""
+        self.thread.stop(STOP_TIMEOUT_S)
+        return self.thread.link.next_number
+
+    def _post(self, command: SetCarrier | Rebind | SetReady) -> None:
+        self.thread.post(command)
+        self.thread.wake()

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import queue
+import socket
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from sidecar.net import stun_names
+from sidecar.net.stun_names import StunNames
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from protos.model import Address
+
+TIMEOUT_S = 30.0
+
+
+@pytest.fixture
+def found() -> Iterator[tuple[StunNames, queue.Queue[tuple[Address, ...]]]]:
+    results: queue.Queue[tuple[Address, ...]] = queue.Queue()
+    names = StunNames(results.put)
+    yield names, results
+    names.stop()
+
+
+def test_numeric_addresses_are_found_at_once_and_again_only_when_they_change(
+    found: tuple[StunNames, queue.Queue[tuple[Address, ...]]],
+) -> None:
+    names, results = found
+    names.look_up(("192.0.2.1:3478", "[2001:db8::1]:3479"))
+    names.start()
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.1", 3478), ("2001:db8::1", 3479))
+    names.look_up(("192.0.2.1:3478", "[2001:db8::1]:3479"))
+    names.look_up(("192.0.2.2:3478",))
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.2", 3478),)
+    assert results.empty()
+
+
+def test_a_name_without_address_is_logged_once_and_tried_again(
+    found: tuple[StunNames, queue.Queue[tuple[Address, ...]]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    asked = threading.Semaphore(0)
+    failures = 3
+
+    def getaddrinfo(host: str, port: int, **_: Any) -> list[Any]:
+        nonlocal failures
+        asked.release()
+        if failures:
+            failures -= 1
+            raise socket.gaierror("no such host")
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("192.0.2.9", port))]
+
+    monkeypatch.setattr(stun_names, "RETRY_S", 0.01)
+    monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
+    names, results = found
+    names.look_up(("stun.example:3478",))
+    names.start()
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.9", 3478),)
+    assert caplog.text.count("no such host") == 1
