@@ -123,6 +123,12 @@ def _requests(stats: EngineStats) -> Iterator[Metric]:
         {(): stats.duplicate_responses},
     )
     yield counter(
+        "plr_copies_called_off",
+        "Copies of requests no longer awaited, since another copy was answered.",
+        ("interface", "peer", "service"),
+        stats.called_off,
+    )
+    yield counter(
         "plr_late_responses_dropped",
         "Responses after the deadline that drop_late kept from the application.",
         ("service",),

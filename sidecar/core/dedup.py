@@ -3,6 +3,9 @@
 A request is running (copies wait for its result), answered (copies get the cached answer) or forgotten: its id is
 kept as a tombstone after the answer had to go, so that a very late copy is refused and not run again. An id is let go
 only when no copy can come any more: its sender gives a request up when its lifetime is over.
+
+A robot that has its answer calls a request off. It does not run then if the local server has not got it yet; nobody
+is answered any more, and copies that still come are ignored.
 """
 
 from __future__ import annotations
@@ -12,7 +15,15 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from sidecar.core.events import AbandonExecution, ExecuteRequest, ExecutionId, RejectReason, RequestId
+from sidecar.core.cancels import EarlyCancels
+from sidecar.core.events import (
+    AbandonExecution,
+    CancelExecution,
+    ExecuteRequest,
+    ExecutionId,
+    RejectReason,
+    RequestId,
+)
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 from sidecar.core.rules import MAX_LIFETIME_S
 from sidecar.core.shares import Shares
@@ -79,6 +90,7 @@ class _Execution:
     payload: bytes | None = None
     processing_s: float = 0.0
     refusal: tuple[RejectReason, str] | None = None
+    cancelled: bool = False
 
     @property
     def ends(self) -> float:
@@ -104,6 +116,7 @@ class ExecutionTable:
         self._cached_bytes = 0
         self._timers: list[tuple[float, ExecutionId]] = []
         self._next_id = 0
+        self._early_cancels = EarlyCancels(stats)
 
     @property
     def running(self) -> int:
@@ -130,6 +143,9 @@ class ExecutionTable:
             if execution.service != message.service or execution.robot != path.peer:
                 self._stats.dropped["request_id_mismatch"] += 1
                 return None
+            if execution.cancelled:
+                count[message.service, "cancelled"] += 1
+                return None
             if running is not None:
                 if len(execution.waiters) < MAX_WAITERS and waiter not in execution.waiters:
                     execution.waiters.append(waiter)
@@ -140,6 +156,9 @@ class ExecutionTable:
             count[message.service, "cached"] += 1
             return self._reply(execution, waiter, now + lifetime)
         self._forget_old(now)
+        if self._early_cancels.holds(path.peer, message.request_id, now):
+            count[message.service, "cancelled"] += 1
+            return None
         if not (self._running_shares.fits(path.peer) and self._finished_shares.fits(path.peer)):
             self._stats.dropped["executions_full"] += 1
             return self.refuse_unseen(waiter, message, RejectReason.OVERLOADED, "too many requests", now)
@@ -202,6 +221,8 @@ class ExecutionTable:
         if execution is None:
             return []
         self._remember(execution, now)
+        if execution.cancelled:
+            return []
         execution.payload = payload
         execution.processing_s = processing_s
         self._cache(execution)
@@ -212,11 +233,29 @@ class ExecutionTable:
         execution = self._finish(execution_id)
         if execution is None:
             return []
-        if not reason.certainly_not_run:
+        if execution.cancelled or not reason.certainly_not_run:
             self._remember(execution, now)
-        self._stats.executions[execution.service, "refused"] += 1
+        result = "cancelled" if reason is RejectReason.CANCELLED else "refused"
+        self._stats.executions[execution.service, result] += 1
         execution.refusal = (reason, text)
         return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
+
+    def cancel(self, robot: NodeName, request_id: RequestId, now: float) -> CancelExecution | None:
+        """The robot wants no further answer; returns what to tell the application, if anything."""
+        execution = self._by_request.get(request_id) or self._finished.get(request_id)
+        if execution is None:
+            self._early_cancels.add(robot, request_id, now)
+            return None
+        if execution.robot != robot:
+            self._stats.dropped["request_id_mismatch"] += 1
+            return None
+        if execution.cancelled:
+            return None
+        execution.cancelled = True
+        execution.waiters.clear()
+        execution.payload = None
+        self._uncache(request_id)
+        return CancelExecution(execution.id) if execution.id in self._running else None
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
@@ -289,6 +328,7 @@ class ExecutionTable:
         while self._forget_at and self._forget_at[0][0] <= now:
             request_id = heapq.heappop(self._forget_at)[1]
             self._finished_shares.give_back(self._finished.pop(request_id).robot)
-            size = self._cached.pop(request_id, None)
-            if size is not None:
-                self._cached_bytes -= size
+            self._uncache(request_id)
+
+    def _uncache(self, request_id: RequestId) -> None:
+        self._cached_bytes -= self._cached.pop(request_id, 0)

@@ -40,6 +40,7 @@ from sidecar.core.link_events import (
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
 from sidecar.core.messages import (
+    CancelMessage,
     RequestMessage,
     ResponseMessage,
     decode_message,
@@ -283,6 +284,11 @@ class Engine:
                 self.stats.dropped["request_to_a_robot"] += 1
             else:
                 self._on_request(path, message, now)
+        elif isinstance(message, CancelMessage):
+            if robot:
+                self.stats.dropped["cancel_to_a_robot"] += 1
+            else:
+                self._on_cancel(path.peer, message, now)
         elif not robot:
             self.stats.dropped["response_to_a_cloud"] += 1
         elif isinstance(message, ResponseMessage):
@@ -311,6 +317,12 @@ class Engine:
         elif isinstance(outcome, Reply):
             self._reply([outcome])
 
+    def _on_cancel(self, robot: NodeName, message: CancelMessage, now: float) -> None:
+        event = self._executions.cancel(robot, message.request_id, now)
+        if event is not None:
+            self._events.append(event)
+        self._outbox.drop_answers(robot, message.request_id)
+
     def _reply(self, replies: list[Reply]) -> None:
         for reply in replies:
             path = reply.waiter.path
@@ -322,6 +334,7 @@ class Engine:
                 priority=reply.priority,
                 deadline=reply.deadline,
                 expires=reply.expires,
+                answers=reply.message.request_id,
             )
 
     def _on_path_changed(self, event: PathChanged, now: float) -> None:

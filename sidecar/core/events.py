@@ -36,6 +36,8 @@ class RejectReason(enum.IntEnum):
     """It ran, but the cached answer has been dropped."""
     TOO_LARGE = 8
     """It ran, but its answer is larger than a message may be."""
+    CANCELLED = 9
+    """The robot called it off before the local server got it."""
 
     @property
     def certainly_not_run(self) -> bool:
@@ -116,6 +118,13 @@ class AbandonExecution:
     execution: ExecutionId
 
 
+@dataclass(frozen=True, slots=True)
+class CancelExecution:
+    """The robot has its answer: refuse this execution as CANCELLED unless the local server has it already."""
+
+    execution: ExecutionId
+
+
 ApplicationEvent = (
     OfferService
     | WithdrawService
@@ -124,4 +133,5 @@ ApplicationEvent = (
     | RequestFailed
     | ExecuteRequest
     | AbandonExecution
+    | CancelExecution
 )

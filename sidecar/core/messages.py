@@ -4,9 +4,10 @@
                   n (16) service name m (16) type name, payload
     response   2  request id (16 bytes) copy (8) processing time in us (32), payload
     rejection  3  request id (16 bytes) copy (8) reason (8) n (16) text
+    cancel     4  request id (16 bytes) 0 (8)
 
 `copy` numbers the copies of one request; the answer repeats it, so that each copy's latency is known whichever path
-the answer takes. A deadline that is over has 0 left.
+the answer takes. A deadline that is over has 0 left. A cancel is about all copies of its request.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _HEAD = struct.Struct(f">B{REQUEST_ID_BYTES}sB")
 _REQUEST_TIMES = struct.Struct(">BII")
 _U32 = struct.Struct(">I")
 _U16 = struct.Struct(">H")
-_REQUEST, _RESPONSE, _REJECTION = 1, 2, 3
+_REQUEST, _RESPONSE, _REJECTION, _CANCEL = 1, 2, 3, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,14 @@ class RejectionMessage:
     text: str
 
 
-Message = RequestMessage | ResponseMessage | RejectionMessage
+@dataclass(frozen=True, slots=True)
+class CancelMessage:
+    """The robot wants no (further) answer to this request."""
+
+    request_id: RequestId
+
+
+Message = RequestMessage | ResponseMessage | RejectionMessage | CancelMessage
 
 
 def encode_message(message: Message) -> bytes:
@@ -98,6 +106,8 @@ def encode_message(message: Message) -> bytes:
                 message.payload,
             )
         )
+    if isinstance(message, CancelMessage):
+        return _HEAD.pack(_CANCEL, message.request_id, 0)
     text = message.text.encode(errors="replace")[:MAX_TEXT_BYTES]
     return b"".join(
         (
@@ -155,10 +165,15 @@ def _decode_rejection(request_id: RequestId, copy: int, view: memoryview, positi
     return RejectionMessage(request_id, copy, reason, text)
 
 
+def _decode_cancel(request_id: RequestId, _copy: int, _view: memoryview, _position: int) -> Message:
+    return CancelMessage(request_id)
+
+
 _DECODERS: dict[int, Callable[[RequestId, int, memoryview, int], Message]] = {
     _REQUEST: _decode_request,
     _RESPONSE: _decode_response,
     _REJECTION: _decode_rejection,
+    _CANCEL: _decode_cancel,
 }
 
 

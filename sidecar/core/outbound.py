@@ -9,6 +9,7 @@ from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
     from protos.model import NodeName
+    from sidecar.core.events import RequestId
     from sidecar.core.path_id import PathId
 
 
@@ -21,6 +22,7 @@ class OutboundMessage:
 
     __slots__ = (
         "acked",
+        "answers",
         "count",
         "data",
         "deadline",
@@ -44,6 +46,7 @@ class OutboundMessage:
         deadline: float,
         expires: float,
         symbol: int = BASE_SYMBOL_BYTES,
+        answers: RequestId | None = None,
     ) -> None:
         self.number = number
         self.path = path
@@ -57,6 +60,8 @@ class OutboundMessage:
         self.symbol = symbol
         self.count = symbol_count(len(data), symbol)
         self.acked = bytearray(self.count)
+        self.answers = answers
+        """The request that it answers; the engine's, links do not look at this."""
         self.over = False
         """Delivered, called off, expired or cut anew: nothing of it needs to travel any more."""
         self.successor: OutboundMessage | None = None
@@ -93,6 +98,7 @@ class OutboundMessage:
             deadline=self.deadline,
             expires=self.expires,
             symbol=symbol,
+            answers=self.answers,
         )
         return self.successor
 

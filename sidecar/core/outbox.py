@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import InterfaceName, NodeName
+    from sidecar.core.events import RequestId
     from sidecar.core.path_id import PathId
     from sidecar.core.priority import Priority
     from sidecar.core.routes import Routes
@@ -35,6 +36,8 @@ class Outbox:
         self._parked: dict[NodeName, dict[int, OutboundMessage]] = {}
         self._shares_of_messages = Shares(MAX_MESSAGES)
         self._shares_of_bytes = Shares(MAX_BYTES)
+        self._answers: dict[tuple[NodeName, RequestId], list[OutboundMessage]] = {}
+        """Undelivered answers by the robot and request they are for: one for each copy that asked."""
         self._next_number = 1
 
     def __len__(self) -> int:
@@ -55,9 +58,19 @@ class Outbox:
         )
 
     def send(
-        self, path: PathId, data: bytes, *, priority: Priority, deadline: float, expires: float
+        self,
+        path: PathId,
+        data: bytes,
+        *,
+        priority: Priority,
+        deadline: float,
+        expires: float,
+        answers: RequestId | None = None,
     ) -> OutboundMessage | None:
-        """Send a message over `path`; None (counted) when there is no room."""
+        """Send a message over `path`; None (counted) when there is no room.
+
+        `answers`: the request that it answers, by which `drop_answers` finds it.
+        """
         if not self.has_room(path.peer, len(data)):
             self._stats.dropped["outbox_full"] += 1
             return None
@@ -69,6 +82,7 @@ class Outbox:
             deadline=deadline,
             expires=expires,
             symbol=self._routes.symbol_to(path.peer),
+            answers=answers,
         )
         self._enter(message)
         return message
@@ -80,6 +94,8 @@ class Outbox:
 
     def _enter(self, message: OutboundMessage) -> None:
         self._messages[message.number] = message
+        if message.answers is not None:
+            self._answers.setdefault((message.peer, message.answers), []).append(message)
         self._shares_of_messages.take(message.peer)
         self._shares_of_bytes.take(message.peer, len(message.data))
         self._command(Send(message.path, message))
@@ -100,6 +116,19 @@ class Outbox:
             self._shares_of_messages.give_back(message.peer)
             self._shares_of_bytes.give_back(message.peer, len(message.data))
             self._parked.get(message.peer, {}).pop(message.number, None)
+            if message.answers is not None:
+                self._forget_answer((message.peer, message.answers), message)
+
+    def drop_answers(self, peer: NodeName, request: RequestId) -> None:
+        """The peer called this request off: what is unsent of its answers stays here."""
+        for message in self._answers.get((peer, request), ())[:]:
+            self.drop(message)
+
+    def _forget_answer(self, key: tuple[NodeName, RequestId], message: OutboundMessage) -> None:
+        answers = self._answers[key]
+        answers.remove(message)
+        if not answers:
+            del self._answers[key]
 
     def drop_peer(self, peer: NodeName) -> None:
         """The peer's session is over: what was meant for it can not arrive."""

@@ -1,20 +1,24 @@
 """Robot side: replicate a request, take the first valid response, notice the deadline (paper, figure "Workflow
 Diagram", request steps 3 to 10).
 
-A copy is one sending of a request to one server. Every copy's latency is measured, also when it lost the race. Once
-the deadline is over and another copy has won, what is left unsent of a copy is called off and counts as lost: its
-latency is known to be beyond the deadline, which is all that the prediction needs.
+A copy is one sending of a request to one server. When the first answer wins, the other copies are called off: what
+is unsent of them stays here, and their servers are told. What a called-off copy would have taken, nobody knows, and to
+measure only those that were not called off would flatter every path. So one request in `OBSERVED_ONE_IN` is a full
+race whose copies are all measured, and the others are not measured at all (docs/architecture.md, "What is measured").
+In a race, once the deadline is over and another copy has won, a copy that has not arrived is called off and counts as
+lost: its latency is known to be beyond the deadline, which is all that the prediction needs.
 """
 
 from __future__ import annotations
 
-import enum
 import heapq
-from dataclasses import dataclass, field
+from collections import OrderedDict
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
 from protos.model import Assignment
+from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.events import (
     ApplicationEvent,
     DeadlineMissed,
@@ -25,12 +29,14 @@ from sidecar.core.events import (
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
     MAX_PAYLOAD_BYTES,
+    CancelMessage,
     RejectionMessage,
     RequestMessage,
     ResponseMessage,
     encode_message,
 )
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,7 +45,6 @@ if TYPE_CHECKING:
     from sidecar.core.mapping import MappingTable
     from sidecar.core.measurements import Measurements
     from sidecar.core.offers import Offers
-    from sidecar.core.outbound import OutboundMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.rules import ServiceRule
@@ -49,54 +54,11 @@ MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""
 MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""
-
-
-class CopyState(enum.Enum):
-    """What became of a copy."""
-
-    PENDING = "pending"
-    ANSWERED = "answered"
-    REJECTED = "rejected"
-    DEAD = "dead"
-    """Its server's session ended, or it was called off."""
-
-
-@dataclass(slots=True)
-class Copy:
-    """One sending of a request to one server."""
-
-    path: PathId
-    sent_at: float
-    message: OutboundMessage
-    state: CopyState = CopyState.PENDING
-    certainly_not_run: bool = False
-
-
-@dataclass(slots=True)
-class Request:
-    """A request until all its copies are settled."""
-
-    id: RequestId
-    service: ServiceName
-    type: str
-    rule: ServiceRule
-    payload: bytes | None
-    submitted_at: float
-    copies: list[Copy] = field(default_factory=list)
-    done: bool = False
-    """The application got its response, or the request failed."""
-    missed: bool = False
-
-    @property
-    def deadline_at(self) -> float:
-        return self.submitted_at + self.rule.deadline_s
-
-    @property
-    def expires_at(self) -> float:
-        return self.submitted_at + self.rule.lifetime_s
-
-    def pending(self) -> list[Copy]:
-        return [copy for copy in self.copies if copy.state is CopyState.PENDING]
+MAX_CALLED_OFF = 1024
+"""Ids of requests whose copies were called off, kept to tell answers that were on their way from strays."""
+CANCEL_DEADLINE_S = 0.1
+"""A cancel is worth most at once: a server that has not begun need not. Among what is urgent, others go first only if
+their own time is shorter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +81,7 @@ class RequestTable:
         self._parts = parts
         self._requests: dict[RequestId, Request] = {}
         self._timers: list[tuple[float, RequestId]] = []
+        self._called_off: OrderedDict[RequestId, None] = OrderedDict()
         self.unanswered = 0
 
     # -- the application ------------------------------------------------------------------------------------------
@@ -169,6 +132,7 @@ class RequestTable:
         idempotent = request.rule.idempotent
         for path in self._parts.mapping.choose(request.service, servers, idempotent=idempotent):
             self._send_copy(request, path, now)
+        request.choose_observation()
 
     def _send_copy(self, request: Request, path: PathId, now: float) -> None:
         if request.payload is None or len(request.copies) >= MAX_COPIES:
@@ -204,16 +168,18 @@ class RequestTable:
         if copy.state is CopyState.ANSWERED:
             self._parts.stats.duplicate_responses += 1
             return
-        was_pending = copy.state is CopyState.PENDING
+        measure = request.observed and copy.state is CopyState.PENDING
         copy.state = CopyState.ANSWERED
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
         self._parts.outbox.drop(copy.message)
-        if was_pending:
+        if measure:
             self._parts.measurements.answered(copy.path, request.service, now - copy.sent_at, response.processing_s)
         if request.done:
             self._parts.stats.duplicate_responses += 1
         else:
             self._deliver(request, copy, response, now)
+            if not request.observed:
+                self._call_off(request, request.pending(), now)
         self._settle(request, now)
 
     def _deliver(self, request: Request, copy: Copy, response: ResponseMessage, now: float) -> None:
@@ -260,7 +226,10 @@ class RequestTable:
         dropped = self._parts.stats.dropped
         request = self._requests.get(request_id)
         if request is None:
-            dropped["answer_to_unknown_request"] += 1
+            if request_id in self._called_off:
+                self._parts.stats.duplicate_responses += 1
+            else:
+                dropped["answer_to_unknown_request"] += 1
             return None
         if number >= len(request.copies):
             dropped["answer_to_unknown_copy"] += 1
@@ -277,7 +246,7 @@ class RequestTable:
             hit = [copy for copy in request.pending() if copy.path.peer == peer]
             for copy in hit:
                 copy.state = CopyState.DEAD
-                self._parts.measurements.lost(copy.path, request.service)
+                self._lost(request, copy)
             if hit and not request.done:
                 self._rescue(request, now)
                 if not request.pending() and not request.rule.idempotent:
@@ -339,7 +308,6 @@ class RequestTable:
                 continue
             heapq.heappush(self._timers, (request.expires_at, request_id))
             if request.done:
-                self._call_off(request)
                 self._settle(request, now)
             elif not request.missed:
                 self._miss(request)
@@ -351,18 +319,37 @@ class RequestTable:
         copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
 
-    def _call_off(self, request: Request) -> None:
-        for copy in request.pending():
-            if not copy.message.newest.over:
-                self._parts.outbox.drop(copy.message)
-                copy.state = CopyState.DEAD
-                self._parts.measurements.lost(copy.path, request.service)
+    def _call_off(self, request: Request, copies: list[Copy], now: float) -> None:
+        """Send no more of these copies, and tell their servers, except where another copy is still awaited."""
+        for copy in copies:
+            copy.state = CopyState.DEAD
+            self._parts.outbox.drop(copy.message)
+            self._parts.stats.called_off[copy.path.interface, copy.path.peer, request.service] += 1
+        servers = {copy.path.peer for copy in copies} - {copy.path.peer for copy in request.pending()}
+        for server in servers:
+            path = self._parts.routes.best_to(server)
+            if path is not None:
+                self._parts.outbox.send(
+                    path,
+                    encode_message(CancelMessage(request.id)),
+                    priority=Priority.HIGH,
+                    deadline=now + CANCEL_DEADLINE_S,
+                    expires=request.expires_at,
+                )
+        if copies:
+            self._called_off[request.id] = None
+            if len(self._called_off) > MAX_CALLED_OFF:
+                self._called_off.popitem(last=False)
+
+    def _lost(self, request: Request, copy: Copy) -> None:
+        if request.observed:
+            self._parts.measurements.lost(copy.path, request.service)
 
     def _expire(self, request: Request, now: float) -> None:
         for copy in request.pending():
             copy.state = CopyState.DEAD
             self._parts.outbox.drop(copy.message)
-            self._parts.measurements.lost(copy.path, request.service)
+            self._lost(request, copy)
         if not request.done:
             why = "no answer" if request.copies else "no path to any server"
             self._fail(request, "failed", f"{why} within {request.rule.lifetime_s:g} s", now)
@@ -382,9 +369,10 @@ class RequestTable:
 
     def _settle(self, request: Request, now: float) -> None:
         """Forget a request whose copies have all come to an end."""
+        if request.done and request.deadline_at <= now:
+            undelivered = [copy for copy in request.pending() if not copy.message.newest.over]
+            for copy in undelivered:
+                self._lost(request, copy)
+            self._call_off(request, undelivered, now)
         if request.done and not request.pending():
             self._requests.pop(request.id, None)
-        elif request.done and request.deadline_at <= now:
-            self._call_off(request)
-            if not request.pending():
-                self._requests.pop(request.id, None)

@@ -51,9 +51,11 @@ class EngineStats:
     """Seconds from submit to the first response, since start."""
     wins: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
     duplicate_responses: int = 0
+    called_off: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
+    """Copies no longer awaited since another won."""
     late_dropped: Counter[ServiceName] = field(default_factory=Counter)
     executions: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
-    """Cloud: (service, result: run | coalesced | cached | refused | abandoned)."""
+    """Cloud: (service, result: run | coalesced | cached | cancelled | refused | abandoned)."""
     dropped: Counter[str] = field(default_factory=Counter)
     """Messages and table entries by the reason they were dropped for."""
     mapping_version: int = 0

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceOffer
-from sidecar.core.events import AbandonExecution, ExecuteRequest, RejectReason
+from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest, RejectReason
 from sidecar.core.rules import find_rule
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
@@ -69,6 +69,8 @@ class CloudSide:
                 self._execute(event, now)
             case AbandonExecution():
                 self._abandon(event)
+            case CancelExecution():
+                self._cancel(event)
             case _:
                 self._stats.dropped["event_for_other_role"] += 1
 
@@ -120,6 +122,16 @@ class CloudSide:
         runner.abandon(execution)
         self._stats.abandoned[runner.name] += 1
         self._stats.pending = len(self._executions)
+
+    def _cancel(self, event: CancelExecution) -> None:
+        """The robot has its answer: what its server has not got yet needs not run."""
+        known = self._executions.get(event.execution)
+        if known is None:
+            return  # it was answered a moment ago
+        runner, execution = known
+        if execution.number is None:
+            runner.abandon(execution)
+            self._refuse_executions([execution], runner.name, RejectReason.CANCELLED, "called off")
 
     # -- what the local servers answer -----------------------------------------------------------------------------
 

@@ -14,7 +14,14 @@ from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.fragments import FINISHED_REMEMBERED, MAX_PEER_BYTES, MAX_PEER_MESSAGES
 from sidecar.core.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
 from sidecar.core.link import MAX_PENDING_FRAMES
-from sidecar.core.messages import Message, RejectionMessage, RequestMessage, ResponseMessage, encode_message
+from sidecar.core.messages import (
+    CancelMessage,
+    Message,
+    RejectionMessage,
+    RequestMessage,
+    ResponseMessage,
+    encode_message,
+)
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES
 from sidecar.core.path_id import PathState
 from sidecar.core.priority import Priority
@@ -48,6 +55,7 @@ def some_message(rng: random.Random) -> Message:
         ),
         ResponseMessage(request_id, copy, 0.1, b"lie"),
         RejectionMessage(request_id, copy, rng.choice(list(RejectReason)), "lie"),
+        CancelMessage(request_id),
     ]
     return rng.choice(choices)
 

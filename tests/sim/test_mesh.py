@@ -67,7 +67,7 @@ def test_replicates_over_both_interfaces_to_both_servers() -> None:
     assert_each_answered_once(robot, calls)
     assert len(one.executed) == len(two.executed) == calls
     assert_at_most_once(one, two)
-    assert robot.engine.stats.duplicate_responses == calls
+    assert robot.engine.stats.duplicate_responses == calls, "both were on their way when the first came"
 
 
 def test_not_idempotent_runs_on_one_server_only() -> None:
@@ -195,7 +195,9 @@ def test_a_slow_server_beside_a_fast_one() -> None:
     mesh.run(5.0)
     assert_each_answered_once(robot, calls)
     assert max(event.elapsed_s for event in robot.responses()) < 0.05
-    assert robot.engine.stats.duplicate_responses == calls
+    stats = robot.engine.stats
+    assert 0 < stats.duplicate_responses < calls / 3, "only full races wait for the slow one"
+    assert stats.duplicate_responses + stats.called_off[InterfaceName("wlan0"), NodeName("cloud-a"), SERVICE] == calls
 
 
 def test_hundreds_in_flight_come_back_in_any_order() -> None:

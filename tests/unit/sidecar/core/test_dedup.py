@@ -14,7 +14,7 @@ from sidecar.core.dedup import (
     Reply,
     Waiter,
 )
-from sidecar.core.events import ExecuteRequest, ExecutionId, RejectReason
+from sidecar.core.events import CancelExecution, ExecuteRequest, ExecutionId, RejectReason
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
 from sidecar.core.rules import MAX_LIFETIME_S
 from sidecar.core.stats import EngineStats
@@ -148,6 +148,58 @@ def test_an_id_used_for_another_service_or_by_another_robot_is_dropped() -> None
     (reply,) = executions.complete(ExecutionId(0), b"secret", 0.0, 1.2)
     assert reply.waiter.path == ROBOT
     assert executions.on_request(OTHER, request(1, copy=1), 1.3) is None, "nor does the cache tell strangers"
+
+
+def test_a_request_called_off_before_its_server_got_it_never_runs_and_nobody_is_told() -> None:
+    executions = table()
+    execution = run(executions, request()).execution
+    assert executions.cancel(ROBOT.peer, request().request_id, 1.1) == CancelExecution(execution)
+    assert executions.cancel(ROBOT.peer, request().request_id, 1.1) is None, "a duplicate"
+    assert executions.on_request(ROBOT_2ND, request(copy=1), 1.2) is None
+    assert executions.refuse(execution, RejectReason.CANCELLED, "", 1.3) == []
+    assert executions.on_request(ROBOT_2ND, request(copy=2), 1.4) is None
+    stats = executions._stats.executions
+    assert (stats[ECHO, "run"], stats[ECHO, "cancelled"]) == (1, 3)
+
+
+def test_a_request_called_off_while_it_runs_is_remembered_and_its_answer_is_not() -> None:
+    executions = table()
+    execution = run(executions, request()).execution
+    executions.cancel(ROBOT.peer, request().request_id, 1.1)
+    assert executions.complete(execution, b"answer", 0.05, 1.3) == []
+    assert executions._cached_bytes == 0
+    assert executions.on_request(ROBOT_2ND, request(copy=1), 1.4) is None
+
+
+def test_a_request_called_off_after_it_ran_frees_its_cached_answer() -> None:
+    executions = table()
+    executions.complete(run(executions, request()).execution, b"answer", 0.05, 1.1)
+    assert executions.cancel(ROBOT.peer, request().request_id, 1.2) is None
+    assert executions._cached_bytes == 0
+    assert executions.on_request(ROBOT_2ND, request(copy=1), 1.4) is None
+    run(executions, request(2), 1.2 + 2 * MIN_REMEMBER_S)
+    assert not executions.knows(request().request_id)
+
+
+def test_a_cancel_that_overtakes_its_request_holds() -> None:
+    executions = table()
+    executions.cancel(ROBOT.peer, request().request_id, 1.0)
+    assert executions.on_request(ROBOT, request(), 1.1) is None
+    assert executions.on_request(ROBOT_2ND, request(copy=1), 1.2) is None
+    assert executions.running == 0
+    run(executions, request(2), 1.3)
+
+
+def test_a_cancel_by_another_robot_changes_nothing() -> None:
+    executions = table()
+    assert executions.cancel(OTHER.peer, request(2).request_id, 0.9) is None
+    execution = run(executions, request()).execution
+    run(executions, request(2))
+    assert executions.cancel(OTHER.peer, request().request_id, 1.1) is None
+    assert executions._stats.dropped["request_id_mismatch"] == 1
+    assert len(executions.complete(execution, b"answer", 0.05, 1.2)) == 1
+    assert executions.cancel(OTHER.peer, request().request_id, 1.3) is None
+    assert isinstance(executions.on_request(ROBOT, request(copy=1), 1.4), Reply)
 
 
 def test_waiters_are_capped() -> None:

@@ -21,6 +21,7 @@ from sidecar.core.engine import SWEEP_EVERY_S, Engine, EngineConfig
 from sidecar.core.events import (
     AbandonExecution,
     ApplicationEvent,
+    CancelExecution,
     ExecuteRequest,
     OfferService,
     RejectReason,
@@ -39,6 +40,7 @@ from sidecar.core.link_events import (
     SetPeers,
 )
 from sidecar.core.messages import (
+    CancelMessage,
     Message,
     RejectionMessage,
     RequestMessage,
@@ -175,6 +177,7 @@ def test_a_draining_cloud_refuses_the_new_and_answers_the_old() -> None:
 def test_messages_of_the_wrong_direction_or_broken_ones_are_dropped_and_counted() -> None:
     for sidecar, message, reason in (
         (robot(), request(), "request_to_a_robot"),
+        (robot(), CancelMessage(request_id(1)), "cancel_to_a_robot"),
         (cloud(), ResponseMessage(request_id(1), 0, 0.0, b""), "response_to_a_cloud"),
         (cloud(), b"\xff" * 40, "malformed_message"),
         (robot(), b"", "malformed_message"),
@@ -184,6 +187,24 @@ def test_messages_of_the_wrong_direction_or_broken_ones_are_dropped_and_counted(
         commands, events = sidecar.take()
         assert [type(command) for command in commands] == [SendFinished]
         assert events == []
+
+
+def test_a_cancel_stops_what_has_not_started_and_what_is_being_sent() -> None:
+    sidecar = cloud()
+    sidecar.receive(request(1))
+    sidecar.receive(request(2))
+    _, executions = sidecar.take()
+    first, second = (event for event in executions if isinstance(event, ExecuteRequest))
+    sidecar.engine.complete(first.execution, b"answer", 0.1, 0.2)
+    assert sidecar.engine.busy == 2
+    for number in (1, 2, 1, 2, 3):
+        sidecar.receive(CancelMessage(request_id(number)))
+    assert sidecar.take()[1] == [CancelExecution(second.execution)]
+    assert sidecar.engine.busy == 1, "the answer is not sent any more"
+    sidecar.engine.refuse(second.execution, RejectReason.CANCELLED, "", 0.3)
+    sidecar.receive(request(3))
+    assert sidecar.take()[1] == []
+    assert sidecar.engine.busy == 0
 
 
 def test_fragments_of_a_session_that_is_over_are_dropped() -> None:

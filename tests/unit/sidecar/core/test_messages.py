@@ -8,6 +8,7 @@ from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.messages import (
     MAX_PAYLOAD_BYTES,
     MAX_TEXT_BYTES,
+    CancelMessage,
     Message,
     RejectionMessage,
     RequestMessage,
@@ -28,6 +29,7 @@ GOLDENS: dict[str, tuple[Message, str]] = {
         RejectionMessage(ID, 0, RejectReason.OVERLOADED, "full"),
         "03" + ID.hex() + "00 04 0004 66756c6c",
     ),
+    "cancel": (CancelMessage(ID), "04" + ID.hex() + "00"),
 }
 
 
@@ -42,7 +44,7 @@ def test_the_bytes_of_each_message(kind: str) -> None:
 @pytest.mark.parametrize("kind", GOLDENS)
 def test_a_message_cut_within_its_head_is_refused(kind: str) -> None:
     encoded = encode_message(GOLDENS[kind][0])
-    head = len(encoded) - (3 if kind != "rejection" else 0)
+    head = len(encoded) - (3 if kind in ("request", "response") else 0)
     for length in range(head):
         with pytest.raises(DecodeError):
             decode_message(memoryview(encoded[:length]))
@@ -50,7 +52,7 @@ def test_a_message_cut_within_its_head_is_refused(kind: str) -> None:
 
 def test_other_kinds_reasons_and_text_are_refused() -> None:
     for bad in (
-        "04" + ID.hex() + "00",
+        "05" + ID.hex() + "00",
         "03" + ID.hex() + "00 ff 0000",
         "01" + ID.hex() + "00 00 00000000 00000000 0001 ff 0000",
         "01" + ID.hex() + "00 03 00000000 00000000 0001 61 0000",

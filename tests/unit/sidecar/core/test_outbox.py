@@ -3,10 +3,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core import outbox as outbox_module
+from sidecar.core.events import RequestId
 from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES, Outbox
-from sidecar.core.path_id import PathId, PathState
+from sidecar.core.path_id import PathState
 from sidecar.core.pmtu import BASE_BYTES
 from sidecar.core.priority import Priority
 from sidecar.core.routes import Routes
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     import pytest
 
     from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.path_id import PathId
 
 OVER_WLAN, OVER_WWAN, TO_B = path(WLAN), path(WWAN), path(WLAN, B)
 
@@ -119,6 +121,27 @@ def test_losses_of_a_message_past_its_time_end_it() -> None:
     assert message.over
     assert not box.commands
     assert len(box.outbox) == 0
+
+
+def test_the_answers_to_a_request_are_dropped_together_and_nothing_else() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN, TO_B)
+    asked, other = RequestId(bytes(16)), RequestId(bytes(15) + b"x")
+
+    def answer(over: PathId, request: RequestId) -> OutboundMessage:
+        message = box.outbox.send(over, b"x", priority=Priority.NORMAL, deadline=1.0, expires=10.0, answers=request)
+        assert message is not None
+        return message
+
+    dropped = [answer(OVER_WLAN, asked), answer(OVER_WWAN, asked)]
+    stay = [answer(OVER_WLAN, other), answer(TO_B, asked), box.send(OVER_WLAN)]
+    delivered = answer(OVER_WLAN, asked)
+    box.outbox.on_finished(A, delivered.number)
+    for _ in range(2):
+        box.outbox.drop_answers(A, asked)
+    assert [message.over for message in (*dropped, *stay)] == [True, True, False, False, False]
+    for message in stay:
+        box.outbox.drop(message)
+    assert not box.outbox._answers
 
 
 def test_dropping_a_peer_ends_its_messages_and_nobody_elses() -> None:

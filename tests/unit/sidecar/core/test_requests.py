@@ -3,12 +3,21 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core import requests as requests_module
-from sidecar.core.events import ApplicationEvent, DeadlineMissed, RejectReason, RequestFailed, ResponseArrived
+from sidecar.core.copies import OBSERVED_ONE_IN
+from sidecar.core.events import (
+    ApplicationEvent,
+    DeadlineMissed,
+    RejectReason,
+    RequestFailed,
+    RequestId,
+    ResponseArrived,
+)
 from sidecar.core.link_events import LinkCommand, Send
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
 from sidecar.core.messages import (
     MAX_PAYLOAD_BYTES,
+    CancelMessage,
     RejectionMessage,
     RequestMessage,
     ResponseMessage,
@@ -18,7 +27,7 @@ from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.priority import Priority
-from sidecar.core.requests import MAX_COPIES, RequestParts, RequestTable
+from sidecar.core.requests import MAX_CALLED_OFF, MAX_COPIES, RequestParts, RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
 from sidecar.core.stats import EngineStats
@@ -26,6 +35,8 @@ from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path,
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
 SERVERS = {A: WLAN_A, B: WWAN_B}
+RACE = OBSERVED_ONE_IN
+"""Number of a request whose copies are all measured."""
 
 
 class Table:
@@ -55,6 +66,22 @@ class Table:
         paths = [command.path for command in self.commands if isinstance(command, Send)]
         self.commands.clear()
         return paths
+
+    def cancelled(self) -> list[tuple[PathId, RequestId]]:
+        """What was cancelled where; those messages count as delivered."""
+        found = []
+        for message in list(self.outbox._messages.values()):
+            content = decode_message(memoryview(bytes(message.data)))
+            if isinstance(content, CancelMessage):
+                assert message.priority is Priority.HIGH
+                found.append((message.path, content.request_id))
+                self.outbox.drop(message)
+        return found
+
+    def latencies(self) -> dict[str, tuple[int, int]]:
+        """(answered, lost) by server."""
+        reports = self.measurements.take(self.routes, []).latencies
+        return {report.server: (sum(report.latency.counts), report.latency.lost) for report in reports}
 
     def respond(self, server: str = A, copy: int = 0, number: int = 1, now: float = 0.1) -> None:
         response = ResponseMessage(request_id(number), copy, 0.01, b"from " + server.encode())
@@ -90,13 +117,14 @@ def test_copies_are_numbered_and_carry_what_is_left_of_the_lifetime() -> None:
     assert table.sent() == [WLAN_A, WWAN_B]
 
 
-def test_the_first_response_wins_and_the_second_is_counted_and_measured() -> None:
+def test_the_first_response_wins_and_in_a_race_the_second_is_counted_and_measured() -> None:
     table = Table()
-    table.submit()
-    table.respond(B, copy=1, now=0.2)
+    table.submit(RACE)
+    table.respond(B, copy=1, number=RACE, now=0.2)
     (arrived,) = table.events
-    assert arrived == ResponseArrived(request_id(1), ECHO, b"from cloud-b", B, WWAN, 0.2, late=False)
-    table.respond(A, copy=0, now=0.3)
+    assert arrived == ResponseArrived(request_id(RACE), ECHO, b"from cloud-b", B, WWAN, 0.2, late=False)
+    assert table.cancelled() == []
+    table.respond(A, copy=0, number=RACE, now=0.3)
     assert len(table.events) == 1
     assert table.stats.duplicate_responses == 1
     latencies = table.measurements.take(table.routes, []).latencies
@@ -149,7 +177,7 @@ def test_a_late_answer_may_be_dropped_but_the_request_still_ends() -> None:
 
 def test_a_request_that_nobody_answers_ends_with_its_lifetime() -> None:
     table = Table()
-    table.submit()
+    table.submit(RACE)
     for now in (1.0, 10.0, 99.0):
         table.table.handle_timer(now)
     assert table.only_failure().outcome == "failed"
@@ -157,22 +185,98 @@ def test_a_request_that_nobody_answers_ends_with_its_lifetime() -> None:
     table.assert_empty()
 
 
-def test_after_a_win_the_loser_is_called_off_at_the_deadline_and_counts_once() -> None:
+def test_in_a_race_the_loser_is_called_off_at_the_deadline_and_counts_once() -> None:
     table = Table()
-    table.submit()
-    table.respond(A, copy=0)
+    table.submit(RACE)
+    table.respond(A, copy=0, number=RACE)
+    assert len(table.table._requests) == 1
     table.table.handle_timer(1.0)
+    assert table.cancelled() == [(WWAN_B, request_id(RACE))]
     table.assert_empty()
-    table.respond(B, copy=1, now=1.2)
+    table.respond(B, copy=1, number=RACE, now=1.2)
+    assert table.stats.duplicate_responses == 1
     latencies = {report.server: report.latency for report in table.measurements.take(table.routes, []).latencies}
     assert (latencies[B].lost, sum(latencies[B].counts)) == (1, 0)
 
 
-def test_an_answer_from_a_server_given_up_still_counts_but_is_not_measured_twice() -> None:
+def test_the_first_response_calls_the_other_copies_off() -> None:
     table = Table()
     table.submit()
-    table.table.on_peer_gone(A, 0.1)
+    table.respond(B, copy=1)
+    assert table.cancelled() == [(WLAN_A, request_id(1))]
+    assert table.stats.called_off == {(WLAN, A, ECHO): 1}
+    table.assert_empty()
     table.respond(A, copy=0)
+    assert table.stats.duplicate_responses == 1
+    assert not table.stats.dropped
+    assert table.latencies() == {}, "to measure the winner alone would flatter its path"
+
+
+def test_a_cancel_takes_the_best_path_to_its_server_and_none_when_there_is_none() -> None:
+    table = Table()
+    other = path(WWAN, A)
+    table.submit()
+    table.routes.set_state(other, PathState.UP)
+    table.routes.set_state(WLAN_A, PathState.UNSTABLE)
+    table.respond(B, copy=1)
+    assert table.cancelled() == [(other, request_id(1))]
+    table.submit(2)
+    for down in (WLAN_A, other):
+        table.routes.set_state(down, PathState.DOWN)
+    table.respond(B, copy=1, number=2)
+    assert table.cancelled() == []
+
+
+def test_all_copies_at_one_server_are_called_off_with_one_cancel() -> None:
+    """It has run already where it won: what the cancel saves is the second answer."""
+    table = Table(idempotent=False)
+    table.routes.set_state(WWAN_B, PathState.DOWN)
+    table.routes.set_state(path(WWAN, A), PathState.UP)
+    table.submit()
+    assert table.sent() == [WLAN_A, path(WWAN, A)]
+    table.respond(A, copy=0)
+    assert table.cancelled() == [(WLAN_A, request_id(1))]
+    assert table.stats.called_off == {(WWAN, A, ECHO): 1}
+    table.assert_empty()
+
+
+def test_a_single_copy_is_always_measured() -> None:
+    table = Table()
+    table.routes.set_state(WWAN_B, PathState.DOWN)
+    table.submit()
+    table.respond(A, copy=0)
+    assert table.latencies() == {A: (1, 0)}
+    assert table.cancelled() == []
+
+
+def test_a_request_is_measured_with_all_its_copies_or_not_at_all() -> None:
+    table = Table()
+    for number in range(1, 65):
+        table.submit(number)
+        table.respond(A, copy=0, number=number)
+        if number % 2:
+            table.respond(B, copy=1, number=number, now=0.2)
+    for now in (1.0, 10.0):
+        table.table.handle_timer(now)
+    races = 64 // OBSERVED_ONE_IN
+    assert table.latencies() == {A: (races, 0), B: (0, races)}, "all races have even numbers"
+    table.cancelled()
+    table.assert_empty()
+
+
+def test_ids_of_what_was_called_off_are_kept_for_a_while_only() -> None:
+    table = Table()
+    for number in range(1, 2 * MAX_CALLED_OFF):
+        table.submit(number)
+        table.respond(A, number=number)
+    assert len(table.table._called_off) == MAX_CALLED_OFF
+
+
+def test_an_answer_from_a_server_given_up_still_counts_but_is_not_measured_twice() -> None:
+    table = Table()
+    table.submit(RACE)
+    table.table.on_peer_gone(A, 0.1)
+    table.respond(A, copy=0, number=RACE)
     assert isinstance(table.events[0], ResponseArrived)
     latencies = {report.server: report.latency for report in table.measurements.take(table.routes, []).latencies}
     assert (latencies[A].lost, sum(latencies[A].counts)) == (1, 0)

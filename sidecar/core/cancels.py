@@ -1,0 +1,59 @@
+"""Cloud side: requests called off before any copy of them came. Such a copy, when it comes, is not run."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import TYPE_CHECKING
+
+from sidecar.core.shares import Shares
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+    from sidecar.core.events import RequestId
+    from sidecar.core.stats import EngineStats
+
+MAX_EARLY_CANCELS = 16_384
+"""Ids kept; one robot may fill half: 130 requests a second, all overtaken, for REMEMBER_CANCEL_S. What is not kept may
+run once, as if it had not been called off."""
+REMEMBER_CANCEL_S = 60.0
+"""What a datagram may spend in the queues of the network."""
+
+
+class EarlyCancels:
+    """Ids of requests that were called off before they came, with the robot that did so."""
+
+    __slots__ = ("_ids", "_shares", "_stats")
+
+    def __init__(self, stats: EngineStats) -> None:
+        self._stats = stats
+        self._shares = Shares(MAX_EARLY_CANCELS)
+        # In the order in which they are forgotten: all are kept equally long.
+        self._ids: OrderedDict[RequestId, tuple[NodeName, float]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._ids)
+
+    def add(self, robot: NodeName, request_id: RequestId, now: float) -> None:
+        """`robot` does not want this request any more."""
+        self._forget_old(now)
+        if request_id in self._ids:
+            return
+        if not self._shares.fits(robot):
+            self._stats.dropped["early_cancels_full"] += 1
+            return
+        self._shares.take(robot)
+        self._ids[request_id] = robot, now + REMEMBER_CANCEL_S
+
+    def holds(self, robot: NodeName, request_id: RequestId, now: float) -> bool:
+        """Whether this robot called the request off."""
+        self._forget_old(now)
+        known = self._ids.get(request_id)
+        return known is not None and known[0] == robot
+
+    def _forget_old(self, now: float) -> None:
+        while self._ids:
+            request_id, (robot, forget_at) = next(iter(self._ids.items()))
+            if forget_at > now:
+                return
+            del self._ids[request_id]
+            self._shares.give_back(robot)

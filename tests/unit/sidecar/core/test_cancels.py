@@ -1,0 +1,34 @@
+from __future__ import annotations
+
+from protos.model import NodeName
+from sidecar.core.cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
+from sidecar.core.stats import EngineStats
+from tests.unit.sidecar.core.builders import request_id
+
+ROBOT, OTHER = NodeName("robot"), NodeName("other")
+
+
+def test_an_id_holds_for_its_robot_until_it_is_forgotten() -> None:
+    cancels = EarlyCancels(EngineStats())
+    cancels.add(ROBOT, request_id(1), 5.0)
+    cancels.add(ROBOT, request_id(1), 9.0)
+    cancels.add(OTHER, request_id(1), 9.0)
+    assert cancels.holds(ROBOT, request_id(1), 5.0)
+    assert not cancels.holds(OTHER, request_id(1), 5.0)
+    assert not cancels.holds(ROBOT, request_id(2), 5.0)
+    assert cancels.holds(ROBOT, request_id(1), 4.9 + REMEMBER_CANCEL_S)
+    assert not cancels.holds(ROBOT, request_id(1), 5.0 + REMEMBER_CANCEL_S)
+    assert len(cancels) == 0
+
+
+def test_one_robot_fills_half_and_another_still_has_room() -> None:
+    stats = EngineStats()
+    cancels = EarlyCancels(stats)
+    for number in range(MAX_EARLY_CANCELS):
+        cancels.add(ROBOT, request_id(number), 1.0)
+    assert len(cancels) == MAX_EARLY_CANCELS // 2
+    assert stats.dropped["early_cancels_full"] == MAX_EARLY_CANCELS // 2
+    cancels.add(OTHER, request_id(MAX_EARLY_CANCELS), 1.0)
+    assert cancels.holds(OTHER, request_id(MAX_EARLY_CANCELS), 1.0)
+    cancels.add(ROBOT, request_id(MAX_EARLY_CANCELS + 1), 1.0 + REMEMBER_CANCEL_S)
+    assert len(cancels) == 1, "what is forgotten makes room"
