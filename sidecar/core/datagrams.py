@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 BURST_DATAGRAMS = 64
 """Datagrams built in one go before the driver looks at the socket again (about 70 kB, some milliseconds)."""
 
+MTU_PROBE_TIMEOUTS = 3
+"""A probe of the path's MTU is given up after this many of its probe timeouts, if that is longer than its own limit."""
+
 
 @dataclass(frozen=True, slots=True)
 class LinkIdentity:
@@ -46,6 +49,8 @@ class DatagramBuilder:
         before = len(out)
         if probing and path.probe_at is not None and path.probe_at <= now:
             self._add_probe(path, out, now)
+        if probing and path.mtu.timer is not None and path.mtu.timer <= now:
+            self._add_mtu_probe(path, out, now)
         self._add_control(path, out, now)
         complete = self._add_fragments(path, out, now)
         sent = sum(len(datagram) for _, datagram in out[before:])
@@ -110,6 +115,16 @@ class DatagramBuilder:
         for address in path.destinations():
             out.append((address, self._header(path, path.recovery.take_number()) + probe))
             self._stats.datagrams["sent", "control"] += 1
+
+    def _add_mtu_probe(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+        """Add a padded probe. Nobody waits for its acknowledgement, and its loss says nothing of the rest."""
+        probe_id = path.take_probe_id()
+        size = path.mtu.next_probe(probe_id, now, MTU_PROBE_TIMEOUTS * path.recovery.rtt.probe_timeout(0.0))
+        if size is None or path.remote is None:
+            return
+        head = self._header(path, path.recovery.take_number()) + frame.encode_probe(frame.Probe(probe_id))
+        out.append((path.remote, head + frame.encode_padding(size - len(head))))
+        self._stats.datagrams["sent", "control"] += 1
 
     def _header(self, path: Path, number: int) -> bytes:
         me = self._identity

@@ -20,6 +20,7 @@ from sidecar.core.link_events import (
     MessageFinished,
     PathChanged,
     PathMeasured,
+    PathMtuChanged,
     PeerClosed,
     PeerRestarted,
     Rebind,
@@ -28,9 +29,11 @@ from sidecar.core.link_events import (
     SendClose,
     SendFinished,
     SetCarrier,
+    SetMtu,
     SetPeers,
     SetReady,
 )
+from sidecar.core.link_mtu import LinkMtu
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.paths import Path
 from sidecar.core.stats import LinkStats, PathStats
@@ -67,6 +70,7 @@ class Link:
         self._carrier = True
         self._closing = False
         self._events: deque[LinkEvent] = deque()
+        self._mtu = LinkMtu(self._events)
         self._dirty: dict[PathId, Path] = {}
         self._timers: Timers[PathId] = Timers()
         self._measure_at = now + MEASURE_EVERY_S
@@ -103,7 +107,8 @@ class Link:
             return
         if header.packet_number > path.largest_received:
             path.largest_received = header.packet_number
-            path.remote = source
+            if source != path.remote:
+                self._mtu.moved(path, source, now)
         if path.state is PathState.DOWN:
             path.hasten_probe(now)
         self._dirty[path.id] = path
@@ -135,6 +140,9 @@ class Link:
                     if not on and path.state is not PathState.DOWN:
                         self._take_down(path, "no carrier")
                 self._probe_what_is_down(now)
+            case SetMtu(mtu):
+                self._mtu.set_interface(mtu, self._paths.values(), now)
+                self._dirty.update((path.id, path) for path in self._paths.values())
             case Rebind():
                 for path in self._paths.values():
                     self._rebind(path, now)
@@ -160,6 +168,13 @@ class Link:
         self._rearm()
         timer = self._timers.next()
         return self._measure_at if timer is None else min(timer, self._measure_at)
+
+    def on_too_big(self, destination: Address, size: int, now: float) -> None:
+        """The kernel refused to send a datagram of this many bytes over the interface (EMSGSIZE)."""
+        for path in self._paths.values():
+            if path.remote == destination:
+                self._mtu.too_big(path, size, now)
+                self._dirty[path.id] = path
 
     def next_event(self) -> LinkEvent | None:
         """Return the oldest event not taken yet."""
@@ -206,11 +221,15 @@ class Link:
                     pass  # an answer would bring us back to life over there
                 case frame.Probe(probe_id):
                     self._owe(path, frame.encode_probe_reply(frame.ProbeReply(probe_id)))
+                case frame.ProbeReply(probe_id) if self._mtu.answered(path, probe_id, now):
+                    pass
                 case frame.ProbeReply(probe_id):
                     if not path.answered_probe(probe_id, now):
                         self.stats.dropped["unasked_probe_reply"] += 1
-                    elif path.made_progress(now):
-                        self._path_up(path)
+                    else:
+                        path.mtu.on_delivered(0)
+                        if path.made_progress(now):
+                            self._path_up(path, now)
                 case frame.Finished(number):
                     eliciting = True
                     events.append(MessageFinished(path.peer, number))
@@ -237,15 +256,17 @@ class Link:
             if datagram.fragment is not None:
                 message, index = datagram.fragment
                 message.acked[index] = 1
+        path.mtu.on_delivered(max(datagram.size for datagram in newly))
         path.window.on_acked(newly, recovery.acked_bytes, recovery.rtt, now)
         path.note_rtt()
         if path.made_progress(now):
-            self._path_up(path)
-        self._report_lost(path, recovery.detect_lost(now))
+            self._path_up(path, now)
+        self._lost(path, recovery.detect_lost(now), now)
 
-    def _path_up(self, path: Path) -> None:
+    def _path_up(self, path: Path, now: float) -> None:
         self._report_measured(path)  # before its first request, so that its round-trip time counts in the choice
         self._events.append(PathChanged(path.id, PathState.UP, "answers"))
+        self._mtu.search(path, now)
 
     @property
     def _may_probe(self) -> bool:
@@ -269,6 +290,10 @@ class Link:
             self._events.append(PathChanged(path_id, PathState.DOWN, "not usable here"))
             self._events.append(FragmentsLost(path_id, message, tuple(indices)))
             return None
+        if message.datagram_bytes > path.mtu.size:
+            self._events.append(PathMtuChanged(path_id, path.mtu.size))
+            self._events.append(FragmentsLost(path_id, message, tuple(indices)))
+            return None
         self._dirty[path.id] = path
         return path
 
@@ -284,9 +309,9 @@ class Link:
     def _path_timer(self, path: Path, now: float) -> None:
         recovery = path.recovery
         if recovery.loss_timer is not None and recovery.loss_timer <= now:
-            self._report_lost(path, recovery.detect_lost(now))
+            self._lost(path, recovery.detect_lost(now), now)
         elif recovery.pto_timer is not None and recovery.pto_timer <= now:
-            self._report_lost(path, recovery.on_probe_timeout(now), timed_out=True)
+            self._lost(path, recovery.on_probe_timeout(now), now, timed_out=True)
         state = path.check_silence(now)
         if state is not None:
             if state is PathState.DOWN:
@@ -305,11 +330,16 @@ class Link:
     def _rebind(self, path: Path, now: float) -> None:
         """What is under way left from where we no longer are, or its answers go there: it travels again elsewhere."""
         was_up = path.state is PathState.UP
+        self._mtu.start_afresh(path)
         path.start_afresh(now)
         self._dirty[path.id] = path
         if was_up:
             self._events.append(PathChanged(path.id, path.state, "rebinding"))
         self._report_lost(path, path.recovery.give_up_all(), timed_out=True)
+
+    def _lost(self, path: Path, lost: list[Sent], now: float, *, timed_out: bool = False) -> None:
+        self._mtu.lost(path, lost, now)
+        self._report_lost(path, lost, timed_out=timed_out)
 
     def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
         by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}
@@ -357,6 +387,7 @@ class Link:
                 datagrams_sent=path.recovery.total_sent,
                 datagrams_lost=path.recovery.total_lost,
                 bytes_sent=path.bytes_sent,
+                max_datagram=path.mtu.size,
             )
             for name, path in best.items()
         }
@@ -404,6 +435,7 @@ class Link:
         recovery = path.recovery
         timers = (
             path.probe_at if self._may_probe else None,
+            path.mtu.timer if self._may_probe else None,
             path.received.ack_at,
             recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
             path.silence_timer,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.pacing import SendQueue, Window
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.pmtu import PathMtu
 from sidecar.core.received import ReceivedPackets
 from sidecar.core.recovery import Recovery
 from sidecar.core.rtt import RttEstimator
@@ -47,6 +48,7 @@ class Path:
         "candidates",
         "id",
         "largest_received",
+        "mtu",
         "pending",
         "probe_at",
         "queue",
@@ -75,6 +77,7 @@ class Path:
         self.recovery = Recovery(first_number)
         self.received = ReceivedPackets()
         self.window = Window()
+        self.mtu = PathMtu()
         self.queue = SendQueue()
         self.pending: list[bytes] = []
         """Encoded control frames that wait for the next datagram."""
@@ -107,8 +110,7 @@ class Path:
     def next_probe(self, now: float, rng: random.Random) -> int:
         """Return the id of a probe that leaves now, and plan the next one."""
         self._probed_at = now
-        probe_id = self._next_probe_id
-        self._next_probe_id = (probe_id + 1) & 0xFFFFFFFF
+        probe_id = self.take_probe_id()
         self._probes_out[probe_id] = now
         if len(self._probes_out) > MAX_PROBES_OUT:
             del self._probes_out[next(iter(self._probes_out))]
@@ -121,6 +123,12 @@ class Path:
             gap = self._probe_gap
             self._probe_gap = min(gap * PROBE_BACKOFF, MAX_PROBE_S)
         self.probe_at = now + gap * rng.uniform(0.9, 1.1)
+        return probe_id
+
+    def take_probe_id(self) -> int:
+        """Return the id of the next probe, of liveness or of size."""
+        probe_id = self._next_probe_id
+        self._next_probe_id = (probe_id + 1) & 0xFFFFFFFF
         return probe_id
 
     def hasten_probe(self, now: float) -> None:
@@ -204,3 +212,4 @@ class Path:
         self.state = PathState.DOWN
         self._waiting_since = None
         self._probes_out.clear()
+        self.mtu.stop()

@@ -56,6 +56,7 @@ class PathMtu:
         "_row",
         "_small_passed",
         "_target",
+        "_told",
         "_tries",
         "size",
     )
@@ -63,7 +64,9 @@ class PathMtu:
     def __init__(self) -> None:
         self.size = BASE_BYTES
         """Largest datagram that may be sent, in bytes."""
+        self._told = BASE_BYTES
         self._limit = BASE_BYTES
+        """What is looked for: as told, or less after the kernel refused more."""
         self._at: float | None = None
         self._target: int | None = None
         """The size under test; None between two searches."""
@@ -76,19 +79,17 @@ class PathMtu:
 
     # -- the path's life ------------------------------------------------------------------------------------------
 
-    def start(self, limit: int, now: float) -> None:
-        """The path is up: look for the largest size up to `limit` (see `largest_payload`), at once."""
-        self._limit = limit
-        self._target = None
-        self._at = now
+    def start(self, limit: int, now: float) -> bool:
+        """The path is up, over an interface that takes `limit` (see `largest_payload`): search, unless that was known.
 
-    def set_limit(self, limit: int, now: float) -> bool:
-        """The interface takes another size than it did; True when that makes datagrams smaller."""
-        if limit == self._limit or self._at is None:
+        True when it makes datagrams smaller.
+        """
+        if self._at is not None and limit == self._told:
             return False
         lowered = self.size > limit
         self.size = min(self.size, limit)
-        self.start(limit, now)
+        self._told = limit
+        self._search(limit, now)
         return lowered
 
     def stop(self) -> bool:
@@ -137,6 +138,11 @@ class PathMtu:
                 self._at = now
         return True
 
+    def _search(self, limit: int, now: float) -> None:
+        self._limit = limit
+        self._target = None
+        self._at = now
+
     def _above(self) -> int | None:
         """The next size worth testing."""
         for step in STEPS:
@@ -181,7 +187,7 @@ class PathMtu:
                 self._target, self._at = None, now
             return False
         self.size = max((step for step in (BASE_BYTES, *STEPS) if step < size), default=BASE_BYTES)
-        self.start(self._limit, now)
+        self._search(self._limit, now)
         return True
 
     def _forgive(self) -> None:

@@ -24,6 +24,8 @@ class PathStats:
     datagrams_sent: int = 0
     datagrams_lost: int = 0
     bytes_sent: int = 0
+    max_datagram: int = 0
+    """Bytes of UDP payload."""
 
 
 @dataclass(slots=True)

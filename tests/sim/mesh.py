@@ -28,6 +28,7 @@ from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestId, ResponseArrived
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
+from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.request_id import make_request_id
 from sidecar.core.rules import ServiceRule
 
@@ -51,6 +52,8 @@ class Wire:
     cut: bool = False
     bytes_per_s: float = 0.0
     """0 means no limit."""
+    mtu: int = 65_535
+    """Longer packets vanish without a word; datagrams count with IPv4's headers."""
     busy_until: float = 0.0
     carried: int = 0
 
@@ -252,7 +255,7 @@ class Mesh:
         wire.carried += len(data)
         copies = 2 if self.rng.random() < wire.duplicate else 1
         for _ in range(copies):
-            if wire.cut or self.rng.random() < wire.loss:
+            if wire.cut or len(data) + HEADERS_V4 > wire.mtu or self.rng.random() < wire.loss:
                 continue
             start = max(self.now, wire.busy_until)
             if wire.bytes_per_s:

@@ -25,12 +25,14 @@ from sidecar.core.link_events import (
     LinkCommand,
     LinkEvent,
     LinkPeer,
+    SetMtu,
     SetPeers,
     SetReady,
 )
 from sidecar.core.messages import RequestMessage
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.path_id import PathId
+from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4
 from sidecar.core.priority import Priority
 from sidecar.core.rules import ServiceRule
 
@@ -104,6 +106,7 @@ class Bench:
         identity = LinkIdentity(WLAN, InterfaceId(3), OUR_SESSION, OUR_TOKEN, 7)
         self.link = Link(identity, random.Random(1), self.now, self.first_number)
         self.know()
+        self.link.execute(SetMtu(BASE_BYTES + HEADERS_V4), self.now)  # no search: tests count datagrams
         self.link.execute(SetReady(ready=True), self.now)
 
     def know(self, *, session: SessionId = PEER_SESSION, incarnation: int = 1, name: NodeName = A) -> None:

@@ -304,9 +304,9 @@ def test_down_means_back_to_the_base_and_no_probes() -> None:
 def test_the_interface_changes_its_mtu() -> None:
     carrier = Carrier(takes=1472, limit=1472)
     carrier.run(10.0)
-    assert carrier.mtu.set_limit(1252, carrier.now)
+    assert carrier.mtu.start(1252, carrier.now)
     assert carrier.mtu.size == 1252
-    assert not carrier.mtu.set_limit(1472, carrier.now)
+    assert not carrier.mtu.start(1472, carrier.now)
     carrier.run(1.0)
     assert carrier.mtu.size == 1472
-    assert not carrier.mtu.set_limit(1472, carrier.now)
+    assert not carrier.mtu.start(1472, carrier.now)

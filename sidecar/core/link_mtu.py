@@ -1,0 +1,85 @@
+"""What one link does about the MTU of its paths: starts the search, tells the engine, hands back what is too long."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.link_events import FragmentsLost, PathMtuChanged
+from sidecar.core.path_id import PathState
+from sidecar.core.pmtu import BASE_BYTES, largest_payload
+
+if TYPE_CHECKING:
+    from collections import deque
+    from collections.abc import Iterable
+
+    from protos.model import Address
+    from sidecar.core.link_events import LinkEvent
+    from sidecar.core.paths import Path
+    from sidecar.core.recovery import Sent
+
+DEFAULT_MTU = 1500
+"""Ethernet's, in bytes; until the interface's own is known."""
+
+
+class LinkMtu:
+    """The MTU of one interface, and what follows from it for the link's paths."""
+
+    __slots__ = ("_events", "_mtu")
+
+    def __init__(self, events: deque[LinkEvent]) -> None:
+        self._events = events
+        self._mtu = DEFAULT_MTU
+
+    def set_interface(self, mtu: int, paths: Iterable[Path], now: float) -> None:
+        """The interface takes packets of this many bytes, IP header included."""
+        self._mtu = mtu
+        for path in paths:
+            if path.state is not PathState.DOWN:
+                self.search(path, now)
+
+    def search(self, path: Path, now: float) -> None:
+        """The path is up: look for the longest datagram that it carries."""
+        if path.remote is not None and path.mtu.start(largest_payload(self._mtu, ipv6=":" in path.remote[0]), now):
+            self._fell(path)
+
+    def start_afresh(self, path: Path) -> None:
+        """Nothing is known of the path any more; the search begins when it is up."""
+        if path.mtu.stop():
+            self._fell(path)
+
+    def moved(self, path: Path, source: Address, now: float) -> None:
+        """The peer's datagrams come from elsewhere: another route, unless only a NAT gave it another port."""
+        elsewhere = path.remote is not None and source[0] != path.remote[0]
+        path.remote = source
+        if elsewhere and path.mtu.timer is not None:
+            self.start_afresh(path)
+            self.search(path, now)
+
+    def answered(self, path: Path, probe_id: int, now: float) -> bool:
+        """A PROBE_REPLY came; False when it answers no probe of the size."""
+        before = path.mtu.size
+        answers = path.mtu.on_reply(probe_id, now)
+        if path.mtu.size != before:
+            self._events.append(PathMtuChanged(path.id, path.mtu.size))
+        return answers
+
+    def lost(self, path: Path, lost: list[Sent], now: float) -> None:
+        """These datagrams were found lost at once; call it before they are sent again."""
+        # Those that are longer than what is sent now left before it fell, and say nothing of what is sent now.
+        large = sum(BASE_BYTES < datagram.size <= path.mtu.size for datagram in lost)
+        if large and path.mtu.on_lost(large, now):
+            self._fell(path)
+
+    def too_big(self, path: Path, size: int, now: float) -> None:
+        """The kernel refused to send a datagram of this many bytes over the interface."""
+        if path.mtu.on_too_big(size, now):
+            self._fell(path)
+
+    def _fell(self, path: Path) -> None:
+        """Hand back what waits in datagrams that the path does not carry any more; what is on its way gets lost."""
+        self._events.append(PathMtuChanged(path.id, path.mtu.size))
+        for message, indices in path.queue.clear():
+            if message.datagram_bytes <= path.mtu.size:
+                path.queue.resend(message, indices)
+            else:
+                self._events.append(FragmentsLost(path.id, message, indices))
