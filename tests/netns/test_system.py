@@ -7,13 +7,14 @@ they leave behind.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
 from bench.echo import journal_ids
 from bench.netlab import Lab, LabConfig, LinkProfile
-from bench.system import Part, System, read_json
+from bench.system import Part, System
+from tests.netns.calling import Call, assert_flawless, counter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -62,40 +63,6 @@ def start_cloud(system: System, cloud: str, *server_options: str) -> None:
     system.start_node(f"{cloud}.echo", cloud, argv)
     system.start_node(f"{cloud}.planner", cloud, ["-m", "examples.motion_planning.server"])
     system.start_cloud(cloud, CLOUD_SERVICES)
-
-
-class Call:
-    """A client of /echo in the background."""
-
-    def __init__(self, system: System, *options: str, module: str = "bench.echo call") -> None:
-        self._out = system.folder / "call.json"
-        self._out.unlink(missing_ok=True)
-        self._system = system
-        (system.folder / "client.log").unlink(missing_ok=True)
-        argv = ["-m", *module.split(), "--grace-s", "25", "--json", str(self._out), *options]
-        self._part = system.start_node("client", "robot", argv)
-
-    def wait_until_sending(self) -> None:
-        self._system.wait("the client to call", lambda: " sent " in self._part.log.read_text())
-
-    def result(self) -> dict[str, Any]:
-        self._part.process.wait(90)
-        assert self._out.exists(), self._part.tail()
-        return read_json(self._out)
-
-
-def assert_flawless(run: dict[str, Any]) -> None:
-    summary = run["summary"]
-    assert summary["answered_once"] == summary["sent"] > 0, summary
-    assert summary["missing"] == summary["answered_twice"] == summary["invalid"] == summary["strangers"] == 0, summary
-
-
-def counter(system: System, name: str, **labels: str) -> float:
-    return sum(
-        value
-        for series, value in system.metrics("robot").items()
-        if series.partition("{")[0] == name and all(f'{key}="{wanted}"' in series for key, wanted in labels.items())
-    )
 
 
 def offered(robot: Part, service: str) -> bool:
