@@ -12,12 +12,12 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test lint format protos interfaces lock bench clean distclean
+.PHONY: help setup demo test lint format protos interfaces lock bench bench-dataplane clean distclean
 
 help: ## this list
 	@echo 'usage: make TARGET'
 	@echo
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):[^#]*## (.*)/\1\t\2/' | while IFS=$$'\t' read -r target what; do printf '  %-11s %s\n' "$$target" "$$what"; done
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*## (.*)/\1\t\2/' | while IFS=$$'\t' read -r target what; do printf '  %-15s %s\n' "$$target" "$$what"; done
 	@echo
 	@echo 'options:'
 	@echo "  make test PYTEST_ARGS='tests/unit -k histogram'"
@@ -50,6 +50,9 @@ lock: setup ## lock dependencies anew from pyproject.toml (LOCK_ARGS=--upgrade f
 
 bench: setup ## measure: scenarios over the network lab, reports into bench/results
 	@$(PY) -m bench $(BENCH_ARGS)
+
+bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP, QUIC and zenoh (15 minutes, as root)
+	@$(PY) -m bench dataplane $(BENCH_ARGS)
 
 clean: ## remove caches and build output
 	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis *.egg-info

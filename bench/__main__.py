@@ -2,7 +2,8 @@
 
 examples:
   make bench                                   every measurement, reports into bench/results
-  make bench BENCH_ARGS='calls --seconds 60'   the call through two sidecars, and the silent blackhole
+  make bench-dataplane                         the data plane against its targets, with a page of plots
+  make bench-dataplane BENCH_ARGS='--quick --only one_way'
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import sys
 
 from bench import calls
+from bench.dataplane import command as dataplane
 
 
 def main() -> int:
@@ -20,8 +22,9 @@ def main() -> int:
     )
     commands = parser.add_subparsers(dest="command", metavar="MEASUREMENT")
     calls.add_arguments(commands.add_parser("calls", help="proxied and direct service calls, the silent blackhole"))
-    arguments = sys.argv[1:]
-    return calls.run(parser.parse_args(arguments or ["calls"]))
+    dataplane.add_arguments(commands.add_parser("dataplane", help="the data plane against its targets"))
+    options = parser.parse_args(sys.argv[1:] or ["dataplane"])
+    return dataplane.run(options) if options.command == "dataplane" else calls.run(options)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,60 @@
+"""All that one run found, as the JSON file and the page have it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.dataplane.targets import TARGETS
+
+if TYPE_CHECKING:
+    from bench.dataplane.section import Figure, Findings, Section
+
+
+@dataclass(slots=True)
+class Report:
+    """All that one run found."""
+
+    machine: dict[str, Any]
+    quick: bool
+    repeats: int
+    figures: dict[str, Figure] = field(default_factory=dict)
+    sections: dict[str, Findings] = field(default_factory=dict)
+    titles: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def add(self, section: Section, findings: Findings, seconds: float) -> None:
+        """Take what a section found."""
+        self.figures.update(findings.figures)
+        self.sections[section.name] = findings
+        self.titles[section.name] = section.title
+        self.seconds[section.name] = round(seconds, 1)
+
+    def as_json(self) -> dict[str, Any]:
+        """The figures by their names at the top; what stands behind them below."""
+        return {
+            **self.figures,
+            "verdicts": {target.key: target.met(self.figures) for target in TARGETS},
+            "machine": self.machine,
+            "quick": self.quick,
+            "repeats": self.repeats,
+            "seconds": self.seconds,
+            "sections": {name: asdict(findings) for name, findings in self.sections.items()},
+        }
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "cpu": models[0] if models else platform.machine(),
+        "cpus": os.cpu_count(),
+        "kernel": platform.release(),
+        "python": platform.python_version(),
+        "measured_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }

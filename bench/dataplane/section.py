@@ -1,0 +1,77 @@
+"""What a section gets and what it brings back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from bench.dataplane.statistics import Row
+
+Figure = float | int | None
+"""None: not measured, and a note says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """How thoroughly to measure, and where."""
+
+    folder: Path
+    """For logs; gone after the run."""
+    repeats: int
+    quick: bool
+    say: Callable[[str], None]
+    """Shows what is being measured right now."""
+
+    def scaled(self, count: int, at_least: int = 1) -> int:
+        """A number of requests, or a fifth of it in a quick run."""
+        return max(at_least, count // 5) if self.quick else count
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of text or numbers for people."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str | Figure, ...], ...]
+
+    @classmethod
+    def of_rows(cls, title: str, rows: Sequence[Row]) -> Table:
+        """The usual table of runs of requests."""
+        columns = ("", "requests", "lost", "P50 ms", "P99 ms", "worst ms")
+        return cls(title, columns, tuple((r.name, r.sent, r.lost, r.p50_ms, r.p99_ms, r.max_ms) for r in rows))
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Bars (a number for each name) or lines (points for each name)."""
+
+    title: str
+    x_label: str
+    y_label: str
+    bars: dict[str, float | None] = field(default_factory=dict)
+    lines: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    log_y: bool = False
+
+
+@dataclass(slots=True)
+class Findings:
+    """What a section measured."""
+
+    figures: dict[str, Figure] = field(default_factory=dict)
+    tables: list[Table] = field(default_factory=list)
+    plots: list[Plot] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the run."""
+
+    name: str
+    title: str
+    measure: Callable[[Context], Findings]

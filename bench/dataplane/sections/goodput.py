@@ -1,0 +1,93 @@
+"""What one path carries on loopback and what it costs: bulk messages, and many small requests."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+from bench.dataplane.ours import SERVICE, Ours
+from bench.dataplane.remote import Remote
+from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.statistics import MS, Calls, median, ratio
+
+if TYPE_CHECKING:
+    from bench.dataplane.section import Context
+
+BULK_BYTES = 1_000_000
+AT_ONCE = 8
+OURS_COUNT = 100
+AIOQUIC_COUNT = 25
+"""It needs many times longer for each."""
+WARM_UP = 10
+SMALL_BYTES = 1_000
+SMALL_COUNT = 3_000
+SMALL_AT_ONCE = 32
+PATIENT = {**SERVICE, "deadline_ms": 20_000.0, "lifetime_ms": 60_000.0}
+
+
+def measure(context: Context) -> Findings:
+    """Measure."""
+    ours_runs: list[tuple[float | None, float]] = []
+    aioquic_runs: list[tuple[float | None, float]] = []
+    small: list[float | None] = []
+    with contextlib.ExitStack() as stack:
+        start = stack.enter_context
+        ours = start(Ours(context.folder, clouds={"cloud_a": None}, service=PATIENT))
+        server = start(Remote.start("quic", context.folder, name="quic.server"))
+        client = start(Remote.start("quic", context.folder, name="quic.client"))
+        client.ask("connect", host="127.0.0.1", port=server.ask("listen"))
+        aioquic = (client, server)
+        context.say("goodput: warming up")
+        _bulk(ours.robot, WARM_UP)
+        _bulk(client, WARM_UP)
+        for repeat in range(context.repeats):
+            context.say(f"goodput: ours, {repeat + 1} of {context.repeats}")
+            ours_runs.append(_costed((ours.robot, *ours.clouds.values()), context.scaled(OURS_COUNT, WARM_UP)))
+            context.say(f"goodput: aioquic, {repeat + 1} of {context.repeats}")
+            aioquic_runs.append(_costed(aioquic, context.scaled(AIOQUIC_COUNT, WARM_UP)))
+            context.say(f"requests a second: {repeat + 1} of {context.repeats}")
+            count = context.scaled(SMALL_COUNT)
+            calls = ours.call(size=SMALL_BYTES, count=count, at_once=SMALL_AT_ONCE, grace_s=20.0)
+            small.append(ratio(_answered(calls), calls.duration_s()))
+    figures = {
+        "goodput_mbit_s": median(run[0] for run in ours_runs),
+        "aioquic_goodput_mbit_s": median(run[0] for run in aioquic_runs),
+        "goodput_over_aioquic": median(
+            ratio(one[0], other[0]) for one, other in zip(ours_runs, aioquic_runs, strict=True)
+        ),
+        "cpu_ms_per_mb": median(run[1] for run in ours_runs),
+        "aioquic_cpu_ms_per_mb": median(run[1] for run in aioquic_runs),
+        "requests_per_s": median(small),
+    }
+    rows: tuple[tuple[str, float | None, float | None], ...] = (
+        ("ours", figures["goodput_mbit_s"], figures["cpu_ms_per_mb"]),
+        ("aioquic", figures["aioquic_goodput_mbit_s"], figures["aioquic_cpu_ms_per_mb"]),
+    )
+    title = f"{AT_ONCE} messages of 1 MB in flight, loopback, two processes"
+    return Findings(
+        figures=dict(figures),
+        tables=[Table(title, ("", "Mbit/s", "CPU ms/MB, both processes"), rows)],
+        plots=[Plot("goodput of one path", "", "Mbit/s", bars={row[0]: row[1] for row in rows})],
+        notes=[f"requests_per_s: 1 kB, {SMALL_AT_ONCE} in flight, engine to engine, one path."],
+    )
+
+
+def _bulk(program: Remote, count: int) -> Calls:
+    fields = {"size": BULK_BYTES, "count": count, "at_once": AT_ONCE, "grace_s": 60.0}
+    return Calls.of(program.ask("call", timeout_s=120.0, **fields))
+
+
+def _costed(programs: tuple[Remote, ...], count: int) -> tuple[float | None, float]:
+    """Mbit/s of `count` messages sent by the first program, and CPU milliseconds for each MB of all programs."""
+    before = sum(program.ask("usage")["cpu_s"] for program in programs)
+    calls = _bulk(programs[0], count)
+    cpu_s = sum(program.ask("usage")["cpu_s"] for program in programs) - before
+    megabytes = _answered(calls) * BULK_BYTES / 1e6
+    return ratio(megabytes * 8, calls.duration_s()), cpu_s * MS / max(megabytes, 1e-9)
+
+
+def _answered(calls: Calls) -> int:
+    return sum(latency is not None for latency in calls.latency_s)
+
+
+SECTION = Section("goodput", "Goodput, its cost, and requests a second", measure)

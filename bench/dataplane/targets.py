@@ -1,0 +1,84 @@
+"""What the figures are held against. A figure that was not measured has no verdict: it is neither met nor missed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from bench.dataplane.section import Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A figure's bounds, both included."""
+
+    key: str
+    meaning: str
+    at_least: float | None = None
+    at_most: float | None = None
+    or_key: str | None = None
+    """Another figure that also meets the target when it is at least `or_at_least`."""
+    or_at_least: float = 0.0
+
+    def met(self, figures: Mapping[str, Figure]) -> bool | None:
+        """Whether it is met; None when it was not measured."""
+        value = figures.get(self.key)
+        if value is None:
+            return None
+        other = figures.get(self.or_key) if self.or_key else None
+        if other is not None and other >= self.or_at_least:
+            return True
+        return (self.at_least is None or value >= self.at_least) and (self.at_most is None or value <= self.at_most)
+
+    @property
+    def wanted(self) -> str:
+        """The bounds for people."""
+        bounds = []
+        if self.at_least is not None:
+            bounds.append(f"≥ {self.at_least:g}")
+        if self.at_most is not None:
+            bounds.append(f"≤ {self.at_most:g}")
+        text = " and ".join(bounds)
+        return f"{text}, or {self.or_key} ≥ {self.or_at_least:g}" if self.or_key else text
+
+
+RTT_MS = 50.0
+"""Round trip of the links of the section `loss`."""
+
+TARGETS = (
+    Target("engine_150k_over_aioquic", "one-way time of 150 kB on loopback, ours over aioquic's", at_most=0.25),
+    Target(
+        "goodput_mbit_s",
+        "goodput of one path on loopback, Mbit/s",
+        at_least=800,
+        or_key="goodput_over_aioquic",
+        or_at_least=5,
+    ),
+    Target("proxied_over_direct_1k", "median ROS call of 1 kB through two sidecars over the direct call", at_most=5),
+    Target("proxied_over_direct_150k", "the same with 150 kB", at_most=7),
+    Target("blackhole_lost", "requests lost after one of two paths went silent", at_most=0),
+    Target("blackhole_p99_ms", "P99 of the requests after it", at_most=3),
+    Target("blackhole_mptcp_worst_over_ours", "worst of the kernel's multipath TCP over our P99", at_least=20),
+    Target("fec_p99_over_lossfree_2pct", "2 % loss, FEC auto: P99 over that without loss", at_most=1.15),
+    Target(
+        "arq_p99_minus_lossfree_ms_2pct",
+        "2 % loss, no FEC: P99 above that without loss, ms (one round trip and 20 ms)",
+        at_most=RTT_MS + 20,
+    ),
+    Target("loss_lost", "requests lost in all runs with losses", at_most=0),
+    Target(
+        "overload_p99_over_undisturbed",
+        "P99 over the good path while the other is overloaded, over that while it is not",
+        at_most=1.1,
+    ),
+    Target("overload_memory_growth_mb", "resident memory that the overload added to the robot's side", at_most=32),
+    Target(
+        "outage_first_over_lossfree_p99",
+        "first request sent after a 10 s outage, over the P99 before it",
+        at_most=1.25,
+    ),
+    Target("tcp_share_ratio", "goodput of one TCP flow over ours at one bottleneck", at_least=0.25, at_most=4),
+)

@@ -1,0 +1,68 @@
+"""The labs of the sections: a robot with two carriers and a server, over plain kernel cables or emulated links."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bench.netlab import HostSpec, InterfaceSpec, LabConfig, LabError, LinkProfile, server
+
+if TYPE_CHECKING:
+    from bench.netlab import Lab
+
+ROBOT = "robot"
+CLOUD = "cloud_a"
+CARRIERS = ("wlan0", "wwan0")
+CLOUD_INTERFACE = "eth0"
+_CORE = "internet"
+_TABLE = "inet cut"
+
+
+def cables() -> LabConfig:
+    """Nothing but the kernel between the hosts: veth pairs and a forwarding namespace.
+
+    An emulator would add its own wake-ups, more than a call through us costs. No NAT, and routes by source address:
+    kernel multipath TCP, whose sockets are bound to addresses, needs both.
+    """
+    return _lab(tuple(InterfaceSpec(name, emulated=False, nat=None) for name in CARRIERS))
+
+
+def emulated(profile: LinkProfile) -> LabConfig:
+    """Both carriers with a delay, a rate or losses."""
+    return _lab(tuple(InterfaceSpec(name, nat=None, up=profile, down=profile) for name in CARRIERS))
+
+
+def _lab(interfaces: tuple[InterfaceSpec, ...]) -> LabConfig:
+    return LabConfig(
+        robots=(HostSpec(ROBOT, interfaces),), clouds=(server(CLOUD), server("cloud_b")), source_routing=True
+    )
+
+
+class SilentCut:
+    """Takes away cables in the middle: everything is lost both ways, while the carriers stay up and nobody is told."""
+
+    def __init__(self, lab: Lab) -> None:
+        self._core = lab.host(_CORE)
+        self._lab = lab
+
+    def cut(self, *interfaces: str) -> None:
+        """Lose all from and to these interfaces of the robot. Raises LabError."""
+        ports = ", ".join(f'"to{self._number(name)}"' for name in interfaces)
+        self._nft(
+            f"table {_TABLE} {{\n"
+            f" chain in {{ type filter hook prerouting priority -300; iifname {{ {ports} }} drop; }}\n"
+            f" chain out {{ type filter hook postrouting priority 300; oifname {{ {ports} }} drop; }}\n"
+            "}"
+        )
+
+    def mend(self) -> None:
+        """End the cut. Raises LabError."""
+        self._nft(f"delete table {_TABLE}")
+
+    def _number(self, interface: str) -> int:
+        """The number that the lab gives an interface: the third byte of its network."""
+        return int(self._lab.host(ROBOT).address(interface).split(".")[2])
+
+    def _nft(self, rules: str) -> None:
+        done = self._core.run(["nft", "-f", "-"], input=rules + "\n")
+        if done.returncode:
+            raise LabError(f"{_CORE}: {done.stderr.strip()}")
