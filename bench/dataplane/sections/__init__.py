@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.dataplane.sections import goodput, one_way
+from bench.dataplane.sections import blackhole, goodput, one_way
 
-SECTIONS = (one_way.SECTION, goodput.SECTION)
+SECTIONS = (one_way.SECTION, goodput.SECTION, blackhole.SECTION)
 """In the order in which they run."""
