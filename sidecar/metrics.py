@@ -165,6 +165,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     sent: dict[tuple[str, ...], float] = {}
     lost: dict[tuple[str, ...], float] = {}
     path_bytes: dict[tuple[str, ...], float] = {}
+    path_mtu: dict[tuple[str, ...], float] = {}
     for link in links:
         datagrams |= {(link.interface, *key): count for key, count in dict(link.datagrams).items()}
         dropped |= {(link.interface, key): count for key, count in dict(link.dropped).items()}
@@ -177,6 +178,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
             sent[labels] = path.datagrams_sent
             lost[labels] = path.datagrams_lost
             path_bytes[labels] = path.bytes_sent
+            path_mtu[labels] = path.max_datagram
     of_path = ("interface", "peer")
     yield counter("plr_datagrams", "UDP datagrams.", ("interface", "direction", "kind"), datagrams)
     yield counter("plr_datagrams_dropped", "Datagrams not believed or not sendable.", ("interface", "reason"), dropped)
@@ -186,6 +188,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     yield counter("plr_path_datagrams_sent", "Numbered datagrams sent over the best path.", of_path, sent)
     yield counter("plr_path_datagrams_lost", "Those of them found lost.", of_path, lost)
     yield counter("plr_path_bytes_sent", "UDP payload bytes sent over the best path.", of_path, path_bytes)
+    yield gauge("plr_path_mtu_bytes", "Longest datagram the best path is known to carry.", of_path, path_mtu)
 
 
 def _control(stats: ControlStats, connected: bool, engine: EngineStats) -> Iterator[Metric]:

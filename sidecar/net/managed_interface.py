@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import Candidate, CandidateKind
 from sidecar.core.link import Link
-from sidecar.core.link_events import Rebind, SetCarrier, SetReady
+from sidecar.core.link_events import Rebind, SetCarrier, SetMtu, SetReady
 from sidecar.core.stun_client import StunClient
 from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.sockets import BoundTo, open_socket
@@ -54,6 +54,7 @@ class ManagedInterface:
             stun = StunClient(stun_servers, random.SystemRandom(), drops=link.stats.dropped)
             stun.start(time.monotonic())
         self.thread = InterfaceThread(opened.socket, link, stun, owner)
+        self._post(SetMtu(interface.mtu))
 
     @property
     def name(self) -> InterfaceName:
@@ -80,6 +81,8 @@ class ManagedInterface:
             self._post(SetCarrier(on=True))
         if rebound:
             self._post(Rebind())
+        if interface.mtu != before.mtu:
+            self._post(SetMtu(interface.mtu))
         changed = was_suspended or rebound or set(interface.addresses) != set(before.addresses)
         if changed:
             # Told by an older network; what is true now comes within a round trip.
@@ -116,6 +119,6 @@ class ManagedInterface:
         self.thread.stop(STOP_TIMEOUT_S)
         return self.thread.link.next_number
 
-    def _post(self, command: SetCarrier | Rebind | SetReady) -> None:
+    def _post(self, command: SetCarrier | Rebind | SetMtu | SetReady) -> None:
         self.thread.post(command)
         self.thread.wake()

@@ -205,6 +205,7 @@ def test_goodbyes_and_answers_in_turn_end_nothing_for_the_others() -> None:
     states: set[PathState] = set()
     for _ in range(200):
         rogue.attack("goodbyes", 1)
+        states.update(route.state for route in cloud.engine.routes.all_to(node.name))
         mesh.run(0.05)
         states.update(route.state for route in cloud.engine.routes.all_to(node.name))
     assert states == {PathState.DOWN, PathState.UP}, "it comes back whenever it answers a probe"
