@@ -77,7 +77,7 @@ class DatagramBuilder:
             datagram = b"".join(
                 (
                     self._header(path, number),
-                    frame.encode_fragment_head(message.number, len(message.data), message.symbol, index),
+                    frame.encode_fragment_head(message.number, message.total, message.symbol, index),
                     message.symbol_data(index),
                 )
             )

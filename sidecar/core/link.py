@@ -118,7 +118,7 @@ class Link:
         """Carry out what the engine asks."""
         match command:
             case Send(path_id, message):
-                path = self._live_path(path_id, message, range(message.count))
+                path = self._live_path(path_id, message, range(message.symbols))
                 if path is not None:
                     path.queue.add(message)
             case Resend(path_id, message, indices):

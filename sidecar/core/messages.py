@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
 from protos.model import ServiceName
@@ -80,13 +80,25 @@ class CancelMessage:
 Message = RequestMessage | ResponseMessage | RejectionMessage | CancelMessage
 
 
-def encode_message(message: Message) -> bytes:
-    """Return the message's bytes (one copy of the payload, into the buffer the fragments are cut from)."""
+class Encoded(NamedTuple):
+    """A message's bytes, in two parts so that the payload need not be copied."""
+
+    head: bytes
+    payload: bytes | memoryview
+
+    @property
+    def size(self) -> int:
+        """Bytes of both."""
+        return len(self.head) + len(self.payload)
+
+
+def encode_message(message: Message) -> Encoded:
+    """Return the message's bytes."""
     if isinstance(message, RequestMessage):
         service, kind = message.service.encode(), message.type.encode()
         deadline_us = _clamped(message.deadline_left_s * 1e6)
         lifetime_ms = _clamped(message.lifetime_left_s * 1e3)
-        return b"".join(
+        head = b"".join(
             (
                 _HEAD.pack(_REQUEST, message.request_id, message.copy),
                 _REQUEST_TIMES.pack(message.priority, deadline_us, lifetime_ms),
@@ -94,29 +106,18 @@ def encode_message(message: Message) -> bytes:
                 service,
                 _U16.pack(len(kind)),
                 kind,
-                message.payload,
             )
         )
+        return Encoded(head, message.payload)
     if isinstance(message, ResponseMessage):
         processing_us = _clamped(message.processing_s * 1e6)
-        return b"".join(
-            (
-                _HEAD.pack(_RESPONSE, message.request_id, message.copy),
-                _U32.pack(processing_us),
-                message.payload,
-            )
-        )
+        head = _HEAD.pack(_RESPONSE, message.request_id, message.copy) + _U32.pack(processing_us)
+        return Encoded(head, message.payload)
     if isinstance(message, CancelMessage):
-        return _HEAD.pack(_CANCEL, message.request_id, 0)
+        return Encoded(_HEAD.pack(_CANCEL, message.request_id, 0), b"")
     text = message.text.encode(errors="replace")[:MAX_TEXT_BYTES]
-    return b"".join(
-        (
-            _HEAD.pack(_REJECTION, message.request_id, message.copy),
-            bytes((message.reason,)),
-            _U16.pack(len(text)),
-            text,
-        )
-    )
+    head = _HEAD.pack(_REJECTION, message.request_id, message.copy) + bytes((message.reason,)) + _U16.pack(len(text))
+    return Encoded(head, text)
 
 
 def decode_message(view: memoryview) -> Message:

@@ -4,27 +4,37 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, symbol_count
+from sidecar.core import fec
+from sidecar.core.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, MIN_SYMBOL_BYTES, symbol_count
 from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from protos.model import NodeName
     from sidecar.core.events import RequestId
+    from sidecar.core.messages import Encoded
     from sidecar.core.path_id import PathId
 
 
 class OutboundMessage:
     """The bytes of one message and which symbols have arrived.
 
-    Links on several threads share it without a lock: `acked` bytes and `over` only ever go from 0 to 1, and a link
-    that reads an old value merely sends a symbol that is no longer needed.
+    Links on several threads share it without a lock: `acked` bytes, `begun` and `over` only ever go from 0 to 1, and
+    a link that reads an old value merely sends a symbol that is no longer needed.
+
+    The payload is never copied as a whole: a symbol is a view of it (the first ones hold the head and are joined),
+    which goes into its datagram in the link's thread. That is the only copy on the way out.
     """
 
     __slots__ = (
+        "_lost",
+        "_lost_repairs",
         "acked",
         "answers",
+        "begun",
+        "content",
         "count",
-        "data",
         "deadline",
         "expires",
         "interfaces",
@@ -32,45 +42,62 @@ class OutboundMessage:
         "over",
         "path",
         "priority",
+        "repairs",
         "successor",
         "symbol",
+        "total",
     )
 
     def __init__(
         self,
         number: int,
         path: PathId,
-        data: bytes | memoryview,
+        content: Encoded,
         *,
         priority: Priority = Priority.NORMAL,
         deadline: float,
         expires: float,
         symbol: int = BASE_SYMBOL_BYTES,
         answers: RequestId | None = None,
+        repairs: int = 0,
     ) -> None:
         self.number = number
         self.path = path
         """Where it was sent first."""
         self.interfaces = {path.interface}
         """Those it was sent over; the engine's, links do not look at this."""
-        self.data = memoryview(data)
+        self.content = content._replace(payload=memoryview(content.payload))
+        self.total = content.size
         self.priority = priority
         self.deadline = deadline
         self.expires = expires
-        self.symbol = symbol
-        self.count = symbol_count(len(data), symbol)
-        self.acked = bytearray(self.count)
+        self.count = symbol_count(self.total, symbol)
+        """Source symbols."""
+        self.repairs = min(repairs, fec.max_repairs(self.count))
+        """Repair symbols, which follow the source symbols."""
+        # A repair symbol is as long as the longest source symbol: make them equal.
+        self.symbol = max(MIN_SYMBOL_BYTES, -(-self.total // self.count)) if repairs else symbol
+        self.acked = bytearray(self.symbols)
         self.answers = answers
         """The request that it answers; the engine's, links do not look at this."""
+        self.begun = False
+        """Something of it may have left."""
         self.over = False
         """Delivered, called off, expired or cut anew: nothing of it needs to travel any more."""
         self.successor: OutboundMessage | None = None
         """The same bytes, cut anew into smaller symbols."""
+        self._lost: set[int] = set()
+        self._lost_repairs: set[int] = set()
 
     @property
     def peer(self) -> NodeName:
         """Whom it is for."""
         return self.path.peer
+
+    @property
+    def symbols(self) -> int:
+        """Source and repair symbols."""
+        return self.count + self.repairs
 
     @property
     def newest(self) -> OutboundMessage:
@@ -83,7 +110,7 @@ class OutboundMessage:
     @property
     def datagram_bytes(self) -> int:
         """Length of its longest datagram, with the room for the tag."""
-        return min(len(self.data), self.symbol) + FRAGMENT_OVERHEAD_BYTES
+        return min(self.total, self.symbol) + FRAGMENT_OVERHEAD_BYTES
 
     def cut_anew(self, number: int, path: PathId, symbol: int) -> OutboundMessage:
         """Return the same bytes as another message, for paths that carry no more than `symbol` bytes at once.
@@ -93,24 +120,68 @@ class OutboundMessage:
         self.successor = OutboundMessage(
             number,
             path,
-            self.data,
+            self.content,
             priority=self.priority,
             deadline=self.deadline,
             expires=self.expires,
             symbol=symbol,
             answers=self.answers,
+            repairs=-(-self.repairs * symbol_count(self.total, symbol) // self.count),
         )
         return self.successor
 
     def missing(self) -> tuple[int, ...]:
-        """The symbols that still have to travel."""
-        return tuple(index for index in range(self.count) if self.needs(index))
+        """The symbols that did not arrive, as far as is known."""
+        return tuple(index for index in range(self.symbols) if self.needs(index))
 
     def needs(self, index: int) -> bool:
         """Whether this symbol still has to travel."""
         return not self.over and not self.acked[index]
 
-    def symbol_data(self, index: int) -> memoryview:
-        """Return one symbol, as a view."""
+    def symbol_data(self, index: int) -> bytes | memoryview:
+        """Return one symbol. A repair symbol is computed here, on the caller's thread, each time it is asked for."""
+        self.begun = True
+        if index >= self.count:
+            return self._repair(index - self.count)
+        head, payload = self.content
         start = index * self.symbol
-        return self.data[start : start + self.symbol]
+        end = start + self.symbol
+        before = len(head)
+        if start >= before:
+            return payload[start - before : end - before]
+        return b"".join((head[start:end], payload[: max(0, end - before)]))
+
+    def _repair(self, repair: int) -> bytes:
+        blocks = fec.block_count(self.count)
+        sources = [self.symbol_data(index) for index in range(repair % blocks, self.count, blocks)]
+        if len(sources[-1]) < self.symbol:
+            sources[-1] = bytes(sources[-1]).ljust(self.symbol, b"\0")
+        return fec.encode(sources, repair // blocks)
+
+    def lost(self, indices: Iterable[int]) -> tuple[int, ...]:
+        """Note symbols as lost; returns the source symbols that must travel again. The engine's, as `interfaces`.
+
+        Of a block that lost no more source symbols than it has repair symbols which arrived or still may, nothing
+        does; a lost repair symbol never does.
+        """
+        if not self.repairs:
+            return tuple(index for index in indices if self.needs(index))
+        blocks = fec.block_count(self.count)
+        hit = set()
+        for index in indices:
+            if not self.needs(index):
+                continue
+            if index < self.count:
+                self._lost.add(index)
+                hit.add(index % blocks)
+            else:
+                self._lost_repairs.add(index - self.count)
+                hit.add((index - self.count) % blocks)
+        again: list[int] = []
+        for block in hit:
+            uncovered = sorted(index for index in self._lost if index % blocks == block and self.needs(index))
+            repairs = range(block, self.repairs, blocks)
+            left = len(repairs) - sum(repair % blocks == block for repair in self._lost_repairs)
+            again += uncovered[: max(0, len(uncovered) - left)]
+        self._lost.difference_update(again)
+        return tuple(sorted(again))

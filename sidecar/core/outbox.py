@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, NodeName
     from sidecar.core.events import RequestId
+    from sidecar.core.messages import Encoded
     from sidecar.core.path_id import PathId
     from sidecar.core.priority import Priority
     from sidecar.core.routes import Routes
@@ -60,7 +61,7 @@ class Outbox:
     def send(
         self,
         path: PathId,
-        data: bytes,
+        content: Encoded,
         *,
         priority: Priority,
         deadline: float,
@@ -71,13 +72,13 @@ class Outbox:
 
         `answers`: the request that it answers, by which `drop_answers` finds it.
         """
-        if not self.has_room(path.peer, len(data)):
+        if not self.has_room(path.peer, content.size):
             self._stats.dropped["outbox_full"] += 1
             return None
         message = OutboundMessage(
             self._take_number(),
             path,
-            data,
+            content,
             priority=priority,
             deadline=deadline,
             expires=expires,
@@ -97,7 +98,7 @@ class Outbox:
         if message.answers is not None:
             self._answers.setdefault((message.peer, message.answers), []).append(message)
         self._shares_of_messages.take(message.peer)
-        self._shares_of_bytes.take(message.peer, len(message.data))
+        self._shares_of_bytes.take(message.peer, message.total)
         self._command(Send(message.path, message))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
@@ -114,7 +115,7 @@ class Outbox:
         message.over = True
         if self._messages.pop(message.number, None) is not None:
             self._shares_of_messages.give_back(message.peer)
-            self._shares_of_bytes.give_back(message.peer, len(message.data))
+            self._shares_of_bytes.give_back(message.peer, message.total)
             self._parked.get(message.peer, {}).pop(message.number, None)
             if message.answers is not None:
                 self._forget_answer((message.peer, message.answers), message)
@@ -144,7 +145,7 @@ class Outbox:
         if message.expires <= now:
             self.drop(message)
             return
-        indices = tuple(index for index in event.indices if message.needs(index))
+        indices = message.lost(event.indices)
         if not indices:
             return
         path = self._routes.best_to(
@@ -170,7 +171,7 @@ class Outbox:
     def on_path_up(self, path: PathId) -> None:
         """Send what waited for a path to this peer."""
         for message in self._parked.pop(path.peer, {}).values():
-            missing = message.missing()
+            missing = message.lost(message.missing())
             if missing:
                 self._resend(message, path, missing)
 

@@ -69,7 +69,7 @@ class _Entry:
             index = self.resend.popleft()
             if message.needs(index):
                 return index
-        while self.next < message.count:
+        while self.next < message.symbols:
             index = self.next
             self.next += 1
             if message.needs(index):
@@ -78,7 +78,7 @@ class _Entry:
 
     def remaining(self) -> tuple[int, ...]:
         message = self.message
-        return tuple(filter(message.needs, (*self.resend, *range(self.next, message.count))))
+        return tuple(filter(message.needs, (*self.resend, *range(self.next, message.symbols))))
 
 
 class SendQueue:
@@ -105,7 +105,7 @@ class SendQueue:
         entry = self._entries.get(message.number)
         if entry is None:
             entry = _Entry(message)
-            entry.next = message.count
+            entry.next = message.symbols
             self._insert(entry)
         entry.resend.extend(indices)
 

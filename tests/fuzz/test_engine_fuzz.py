@@ -40,7 +40,7 @@ def fragment(number: int, total: int, symbol: int, index: int) -> bytes:
 
 
 def whole(number: int, message: Message) -> bytes:
-    data = encode_message(message)[:BASE_SYMBOL_BYTES]
+    data = b"".join(encode_message(message))[:BASE_SYMBOL_BYTES]
     return frame.encode_fragment_head(number, len(data), BASE_SYMBOL_BYTES, 0) + data
 
 

@@ -29,7 +29,7 @@ from sidecar.core.link_events import (
     SetPeers,
     SetReady,
 )
-from sidecar.core.messages import RequestMessage
+from sidecar.core.messages import Encoded, RequestMessage
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.path_id import PathId
 from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4
@@ -58,7 +58,7 @@ def message(
     over: PathId | None = None,
 ) -> OutboundMessage:
     data = random.Random(number).randbytes(size)
-    return OutboundMessage(number, over or path(), data, deadline=deadline, expires=expires)
+    return OutboundMessage(number, over or path(), Encoded(b"", data), deadline=deadline, expires=expires)
 
 
 def request_id(number: int) -> RequestId:

@@ -86,7 +86,7 @@ class Sidecar:
         self.engine.on_link_event(PathChanged(self.path, state, ""), now)
 
     def receive(self, message: Message | bytes, *, session: int = 1, now: float = 0.1) -> None:
-        data = message if isinstance(message, bytes) else encode_message(message)
+        data = message if isinstance(message, bytes) else b"".join(encode_message(message))
         assert len(data) <= BASE_SYMBOL_BYTES
         self.number += 1
         fragment = Fragment(self.number, len(data), BASE_SYMBOL_BYTES, 0, memoryview(data))
@@ -98,7 +98,7 @@ class Sidecar:
     def replies(self) -> list[Message]:
         """What is sent to the peer, decoded."""
         sends = [command for command in self.take()[0] if isinstance(command, Send)]
-        return [decode_message(memoryview(bytes(send.message.data))) for send in sends]
+        return [decode_message(memoryview(b"".join(send.message.content))) for send in sends]
 
 
 def cloud() -> Sidecar:

@@ -6,6 +6,7 @@ from sidecar.core import outbox as outbox_module
 from sidecar.core.events import RequestId
 from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send
+from sidecar.core.messages import Encoded
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES, Outbox
 from sidecar.core.path_id import PathState
 from sidecar.core.pmtu import BASE_BYTES
@@ -35,7 +36,7 @@ class Box:
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
 
     def send(self, over: PathId = OVER_WLAN, size: int = 3000, expires: float = 10.0) -> OutboundMessage:
-        message = self.outbox.send(over, bytes(size), priority=Priority.NORMAL, deadline=1.0, expires=expires)
+        message = self.outbox.send(over, Encoded(b"", bytes(size)), priority=Priority.NORMAL, deadline=1.0, expires=expires)
         assert message is not None
         assert self.commands.pop() == Send(over, message)
         return message

@@ -109,7 +109,7 @@ def test_copies_are_numbered_and_carry_what_is_left_of_the_lifetime() -> None:
     table = Table()
     table.submit()
     sends = [command for command in table.commands if isinstance(command, Send)]
-    copies = [decode_message(memoryview(bytes(send.message.data))) for send in sends]
+    copies = [decode_message(memoryview(b"".join(send.message.content))) for send in sends]
     assert copies == [
         RequestMessage(request_id(1), copy, Priority.NORMAL, 1.0, 10.0, ECHO, TYPE, memoryview(b"question"))
         for copy in (0, 1)
