@@ -70,7 +70,9 @@ def test_a_payload_over_the_limit_is_refused() -> None:
 
 def test_a_rejection_carries_any_text_cut_to_its_limit() -> None:
     for text in ("\u00fc" * MAX_TEXT_BYTES, "lone surrogate \udc80", "x" * 10_000):
-        decoded = decode_message(memoryview(b"".join(encode_message(RejectionMessage(ID, 0, RejectReason.BAD_PAYLOAD, text)))))
+        decoded = decode_message(
+            memoryview(b"".join(encode_message(RejectionMessage(ID, 0, RejectReason.BAD_PAYLOAD, text))))
+        )
         assert isinstance(decoded, RejectionMessage)
         assert decoded.text[:10] == text[:10].replace("\udc80", "?")
         assert len(decoded.text) <= MAX_TEXT_BYTES

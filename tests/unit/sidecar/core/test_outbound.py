@@ -53,7 +53,9 @@ def test_repair_symbols_belong_to_the_blocks_in_turn(count: int) -> None:
     outbound = coded(count, min(count, 2 * blocks))
     last = outbound.count - 1
     block = last % blocks
-    sources = [bytes(outbound.symbol_data(index)).ljust(outbound.symbol, b"\0") for index in range(block, count, blocks)]
+    sources = [
+        bytes(outbound.symbol_data(index)).ljust(outbound.symbol, b"\0") for index in range(block, count, blocks)
+    ]
     repair = bytes(outbound.symbol_data(count + block))
     assert fec.decode([*sources[:-1], None], {0: repair}) == [(len(sources) - 1, sources[-1])]
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_id import PathId
 
+SMALL = Encoded(b"", b"x")
 OVER_WLAN, OVER_WWAN, TO_B = path(WLAN), path(WWAN), path(WLAN, B)
 
 
@@ -36,7 +37,9 @@ class Box:
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
 
     def send(self, over: PathId = OVER_WLAN, size: int = 3000, expires: float = 10.0) -> OutboundMessage:
-        message = self.outbox.send(over, Encoded(b"", bytes(size)), priority=Priority.NORMAL, deadline=1.0, expires=expires)
+        message = self.outbox.send(
+            over, Encoded(b"", bytes(size)), priority=Priority.NORMAL, deadline=1.0, expires=expires
+        )
         assert message is not None
         assert self.commands.pop() == Send(over, message)
         return message
@@ -129,7 +132,7 @@ def test_the_answers_to_a_request_are_dropped_together_and_nothing_else() -> Non
     asked, other = RequestId(bytes(16)), RequestId(bytes(15) + b"x")
 
     def answer(over: PathId, request: RequestId) -> OutboundMessage:
-        message = box.outbox.send(over, b"x", priority=Priority.NORMAL, deadline=1.0, expires=10.0, answers=request)
+        message = box.outbox.send(over, SMALL, priority=Priority.NORMAL, deadline=1.0, expires=10.0, answers=request)
         assert message is not None
         return message
 
@@ -181,7 +184,7 @@ def test_what_moved_to_another_interface_is_not_left_behind_there_either() -> No
 def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
     box = Box(OVER_WLAN, TO_B)
     taken = 0
-    while box.outbox.send(OVER_WLAN, b"x", priority=Priority.NORMAL, deadline=1.0, expires=10.0) is not None:
+    while box.outbox.send(OVER_WLAN, SMALL, priority=Priority.NORMAL, deadline=1.0, expires=10.0) is not None:
         taken += 1
     assert taken == MAX_MESSAGES // 2
     assert box.stats.dropped["outbox_full"] == 1

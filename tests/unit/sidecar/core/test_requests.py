@@ -18,6 +18,7 @@ from sidecar.core.measurements import Measurements
 from sidecar.core.messages import (
     MAX_PAYLOAD_BYTES,
     CancelMessage,
+    Encoded,
     RejectionMessage,
     RequestMessage,
     ResponseMessage,
@@ -71,7 +72,7 @@ class Table:
         """What was cancelled where; those messages count as delivered."""
         found = []
         for message in list(self.outbox._messages.values()):
-            content = decode_message(memoryview(bytes(message.data)))
+            content = decode_message(memoryview(b"".join(message.content)))
             if isinstance(content, CancelMessage):
                 assert message.priority is Priority.HIGH
                 found.append((message.path, content.request_id))
@@ -385,12 +386,13 @@ def test_what_cannot_be_sent_is_rejected_at_once(monkeypatch: pytest.MonkeyPatch
 
 def test_a_full_outbox_towards_one_server_sends_to_the_other_only_and_two_full_ones_reject() -> None:
     table = Table()
-    while table.outbox.send(WLAN_A, bytes(8_000_000), priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
+    huge = Encoded(b"", bytes(8_000_000))
+    while table.outbox.send(WLAN_A, huge, priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
         pass
     table.sent()
     table.submit(1, payload=bytes(8_000_000))
     assert table.sent() == [WWAN_B]
-    while table.outbox.send(WWAN_B, bytes(8_000_000), priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
+    while table.outbox.send(WWAN_B, huge, priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
         pass
     table.submit(2, payload=bytes(8_000_000))
     assert table.only_failure().outcome == "rejected"
