@@ -90,7 +90,9 @@ class CloudSide:
         except RosBridgeError as error:
             self.refuse(event, RejectReason.BAD_PAYLOAD, str(error), now)
             return
-        execution = Execution(event.execution, request, now, now + event.expires_s)
+        execution = Execution(
+            event.execution, request, now, event.priority, now + event.deadline_s, now + event.expires_s
+        )
         self._executions[event.execution] = (runner, execution)
         self._stats.pending = len(self._executions)
         if not runner.add(execution, now):

@@ -5,6 +5,9 @@ first one out, and that call never returns. A network that was dark hands over m
 gets a few at once and the rest spaced (docs/adr/0008-pacing-for-shallow-queues.md). A client that asks one thing at a
 time is never held back: each of its requests earns an answer.
 
+Of those held back, answers in time go before late ones: what was asked before an outage does not delay the answer to
+what is asked after it.
+
 This makes losses rare, not impossible: how many answers lie unread cannot be asked.
 """
 
@@ -28,7 +31,12 @@ T = TypeVar("T")
 class _Client(Generic[T]):
     tokens: float
     updated_at: float
-    waiting: deque[T] = field(default_factory=deque)
+    in_time: deque[T] = field(default_factory=deque)
+    late: deque[T] = field(default_factory=deque)
+
+    def next_waiting(self) -> deque[T]:
+        """The queue whose turn it is; empty when nothing waits."""
+        return self.in_time or self.late
 
 
 class ReplyPacer(Generic[T]):
@@ -48,11 +56,12 @@ class ReplyPacer(Generic[T]):
         state = self._refreshed(client, now)
         state.tokens = min(self._burst, state.tokens + 1.0)
 
-    def offer(self, client: bytes, reply: T, now: float) -> bool:
+    def offer(self, client: bytes, reply: T, now: float, *, late: bool) -> bool:
         """Return True when `reply` may go now; otherwise it is kept for `take_due`."""
         state = self._refreshed(client, now)
-        if state.waiting or state.tokens < 1.0:
-            state.waiting.append(reply)
+        overtakes = not late and not state.in_time
+        if state.tokens < 1.0 or (state.next_waiting() and not overtakes):
+            (state.late if late else state.in_time).append(reply)
             self._waiting[client] = state
             self.queued += 1
             return False
@@ -60,14 +69,14 @@ class ReplyPacer(Generic[T]):
         return True
 
     def take_due(self, now: float) -> list[T]:
-        """Return the kept answers whose time has come, oldest first for each client."""
+        """Return the kept answers whose time has come, for each client those in time first, then the oldest."""
         due: list[T] = []
         for client in list(self._waiting):
             state = self._refreshed(client, now)
-            while state.waiting and state.tokens >= 1.0:
+            while (waiting := state.next_waiting()) and state.tokens >= 1.0:
                 state.tokens -= 1.0
-                due.append(state.waiting.popleft())
-            if not state.waiting:
+                due.append(waiting.popleft())
+            if not state.next_waiting():
                 del self._waiting[client]
         self.queued -= len(due)
         return due
@@ -94,6 +103,6 @@ class ReplyPacer(Generic[T]):
 
     def _forget_quietest(self) -> None:
         for client, state in self._clients.items():
-            if not state.waiting:
+            if not state.next_waiting():
                 del self._clients[client]
                 return

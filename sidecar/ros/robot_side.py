@@ -140,7 +140,7 @@ class RobotSide:
             )
             return
         answer = _PacedAnswer(pending.proxy, pending.rmw_request_id, response)
-        if self._pacer.offer(pending.client, answer, now):
+        if self._pacer.offer(pending.client, answer, now, late=event.late):
             self._send(answer, now)
         else:
             self._stats.answers_paced += 1

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
     from sidecar.core.events import ExecutionId
+    from sidecar.core.priority import Priority
     from sidecar.ros.types import ServiceType
 
 TAKEN_AT_ONCE = 32
@@ -28,6 +29,8 @@ class Execution:
     id: ExecutionId
     request: Message | None
     arrived_at: float
+    priority: Priority
+    deadline_at: float
     expires_at: float
     number: int | None = None
     """rmw's sequence number, once it is at the server."""
@@ -71,7 +74,7 @@ class ServiceRunner:
     @property
     def pending(self) -> int:
         """Executions at the server or waiting for it."""
-        return len(self._at_server) + len(self.window.waiting)
+        return len(self._at_server) + self.window.waiting
 
     def is_matched(self) -> bool:
         """True once requests reach the server: before, rmw would drop them without a word."""
@@ -79,9 +82,9 @@ class ServiceRunner:
 
     def add(self, execution: Execution, now: float) -> bool:
         """Send `execution` now, or as soon as the server has room; return False when it has to wait."""
-        self.window.waiting.append(execution)
+        self.window.add(execution, execution.priority, execution.deadline_at, now)
         self.release(now)
-        return not self.window.waiting
+        return not self.window.holds(execution)
 
     def release(self, now: float) -> None:
         """Send what may be sent now."""
@@ -118,13 +121,14 @@ class ServiceRunner:
         """Forget `execution`; an answer to it is stray from now on."""
         if execution.number is not None:
             self._at_server.pop(execution.number, None)
+            self.window.given_up(execution.number)
         else:
-            self.window.waiting.remove(execution)
+            self.window.remove(execution)
 
     def take_back(self) -> tuple[list[Execution], list[Execution]]:
         """Forget everything; return (executions that may have run, executions that certainly have not)."""
         sent = list(self._at_server.values())
-        unsent = list(self.window.waiting)
+        unsent = self.window.take_all()
         self._at_server.clear()
         self.window = RequestWindow()
         return sent, unsent

@@ -135,7 +135,7 @@ class Loopback:
                 payload,
                 NodeName("robot"),
                 Priority.NORMAL,
-                1.0,
+                self.faults.deadline_s,
                 self.faults.lifetime_s,
             )
         )

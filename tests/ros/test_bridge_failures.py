@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import ServiceName
-from sidecar.core.events import RejectReason
+from sidecar.core.events import CancelExecution, RejectReason
 from tests.ros.mesh import wait_until
 from tests.ros.notice_listener import NoticeListener
 
@@ -48,6 +48,24 @@ def test_a_request_that_is_never_answered_costs_itself_only(mesh: Mesh) -> None:
     assert mesh.robot.stats.unanswered == {("/plan", "failed"): 60}
     assert mesh.cloud.stats.abandoned[PLAN] == 60
     assert mesh.result(mesh.call("/plan", "--count", "20"))["answered"] == 20
+
+
+def test_what_the_robot_calls_off_runs_only_if_the_server_has_it_already(mesh: Mesh) -> None:
+    mesh.start()
+    mesh.serve("--plan", "/plan", "--busy-s", "0.2")
+    mesh.wait_carried("/plan")
+    calls = mesh.call("/plan", "--count", "40", "--timeout-s", "8")
+    wait_until(lambda: mesh.cloud.stats.requests_sent[PLAN] == 40, "all at the bridge")
+    for execution in tuple(mesh.link.executions):
+        mesh.cloud.handle(CancelExecution(execution))
+    result = mesh.result(calls)
+    refused = mesh.cloud.stats.refused[PLAN, "cancelled"]
+    assert refused >= 20
+    assert result["answered"] == 40 - refused
+    assert {reason for reason, _ in mesh.link.refusals} == {RejectReason.CANCELLED}
+    wait_until(lambda: not mesh.cloud.stats.pending, "empty tables")
+    assert mesh.cloud.stats.requests_sent[PLAN] == 40
+    assert mesh.result(mesh.call("/plan", "--count", "3"))["answered"] == 3
 
 
 def test_a_server_that_answers_nothing_at_first(mesh: Mesh) -> None:

@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import random
 from collections import deque
+from itertools import count
 
 import pytest
 
-from sidecar.ros.request_window import FIRST_SIZE, MAX_SIZE, STALL_S, RequestWindow
+from sidecar.core.priority import Priority
+from sidecar.ros.request_window import FIRST_SIZE, LATE_ONLY_S, MAX_SIZE, STALL_S, RequestWindow
+
+_items = count()
+
+
+def fill(window: RequestWindow[int], requests: int, *, deadline: float = 1e9, now: float = 0.0) -> list[int]:
+    """Let so many requests wait; return them."""
+    new = [next(_items) for _ in range(requests)]
+    for request in new:
+        window.add(request, Priority.NORMAL, deadline, now)
+    return new
 
 
 def release(window: RequestWindow[int], now: float, numbers: deque[int]) -> list[int]:
@@ -27,7 +39,7 @@ def numbers() -> deque[int]:
 
 def test_an_answer_lets_the_next_through(numbers: deque[int]) -> None:
     window: RequestWindow[int] = RequestWindow()
-    window.waiting.extend(range(20))
+    fill(window, 20)
     assert release(window, 0.0, numbers) == [1, 2, 3, 4, 5, 6, 7, 8]
     assert release(window, 0.1, numbers) == []
     window.answered(1, 0.1)
@@ -39,7 +51,7 @@ def test_an_answer_lets_the_next_through(numbers: deque[int]) -> None:
 
 def test_answers_out_of_order_widen_the_window(numbers: deque[int]) -> None:
     window: RequestWindow[int] = RequestWindow()
-    window.waiting.extend(range(20))
+    fill(window, 20)
     release(window, 0.0, numbers)
     window.answered(5, 0.1)
     assert window.size == FIRST_SIZE
@@ -49,7 +61,7 @@ def test_answers_out_of_order_widen_the_window(numbers: deque[int]) -> None:
 
 def test_a_silent_server_gets_more_after_a_while(numbers: deque[int]) -> None:
     window: RequestWindow[int] = RequestWindow()
-    window.waiting.extend(range(60))
+    fill(window, 60)
     assert len(release(window, 5.0, numbers)) == 8
     assert window.next_due() == 5.0 + STALL_S
     assert release(window, 5.0 + STALL_S * 0.9, numbers) == []
@@ -61,7 +73,7 @@ def test_a_silent_server_gets_more_after_a_while(numbers: deque[int]) -> None:
 
 def test_a_server_that_never_answers_does_not_stop_the_window_for_good(numbers: deque[int]) -> None:
     window: RequestWindow[int] = RequestWindow()
-    window.waiting.extend(range(5 * MAX_SIZE))
+    fill(window, 5 * MAX_SIZE)
     now = 0.0
     while window.waiting:
         release(window, now, numbers)
@@ -72,9 +84,9 @@ def test_a_server_that_never_answers_does_not_stop_the_window_for_good(numbers: 
 
 def test_a_window_that_is_not_full_does_not_grow(numbers: deque[int]) -> None:
     window: RequestWindow[int] = RequestWindow()
-    window.waiting.append(0)
+    fill(window, 1)
     release(window, 0.0, numbers)
-    window.waiting.append(1)
+    fill(window, 1)
     release(window, 10 * STALL_S, numbers)
     assert window.size == FIRST_SIZE
     assert window.next_due() is None
@@ -100,7 +112,7 @@ def test_a_serial_server_with_a_queue_of_ten_loses_nothing(seed: int) -> None:
             times.append(due)
         now = max(now, min(times))
         while arrivals and arrivals[0] <= now:
-            window.waiting.append(0)
+            fill(window, 1)
             arrivals.pop(0)
         if working is not None and working[0] <= now:
             if working[1] not in never:
@@ -115,3 +127,89 @@ def test_a_serial_server_with_a_queue_of_ten_loses_nothing(seed: int) -> None:
             queue.extend(release(window, now, numbers))
             assert len(queue) <= 10, "the server's queue overflowed"
     assert taken == list(range(1, 151))
+
+
+def test_one_late_request_at_a_time_and_whatever_is_fresh_beside_it(numbers: deque[int]) -> None:
+    window: RequestWindow[int] = RequestWindow()
+    fill(window, 50, deadline=5.0, now=10.0)
+    assert release(window, 10.0, numbers) == [1]
+    fill(window, 3, deadline=20.0, now=10.1)
+    assert release(window, 10.1, numbers) == [2, 3, 4], "fresh ones do not wait for the late one"
+    window.answered(2, 10.2)
+    assert release(window, 10.2, numbers) == []
+    window.answered(1, 10.3)
+    assert release(window, 10.3, numbers) == [5]
+    window.given_up(5)
+    assert release(window, 10.3, numbers) == [6]
+    assert window.next_due() == pytest.approx(10.3 + STALL_S)
+    assert release(window, 10.29 + STALL_S, numbers) == []
+    assert release(window, 10.31 + STALL_S, numbers) == [7], "the server may never answer"
+
+
+def test_late_requests_fill_the_window_when_nothing_else_comes(numbers: deque[int]) -> None:
+    window: RequestWindow[int] = RequestWindow()
+    now = 10.0
+    fill(window, 50, deadline=5.0, now=now)
+    released = 0
+    while now < 10.0 + LATE_ONLY_S:
+        for number in release(window, now, numbers):
+            released += 1
+            window.answered(number, now)
+            break
+        due = window.next_due()
+        assert due is not None
+        now += 0.5
+    assert released <= 5
+    assert len(release(window, now, numbers)) == FIRST_SIZE
+    fill(window, 1, deadline=20.0, now=now)
+    window.answered(numbers[0] - 1, now)
+    assert len(release(window, now, numbers)) == 2, "the fresh one, and one late"
+
+
+def test_a_request_that_becomes_late_while_it_waits_goes_behind_the_fresh_ones(numbers: deque[int]) -> None:
+    window: RequestWindow[int] = RequestWindow(size=2)
+    first = fill(window, 6, deadline=1.0)
+    assert release(window, 0.0, numbers) == [1, 2]
+    (fresh,) = fill(window, 1, deadline=9.0, now=2.0)
+    window.answered(1, 2.0)
+    assert next(window.release(2.0)) == fresh
+    window.sent(3, 2.0)
+    window.answered(2, 2.1)
+    assert next(window.release(2.1)) == first[2]
+    assert window.take_all() == first[3:]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_after_an_outage_what_is_asked_now_does_not_wait_for_the_backlog(seed: int) -> None:
+    """A serial server, 20 ms a request; 100 late requests come at once, and then ten a second with a deadline."""
+    rng = random.Random(seed)
+    window: RequestWindow[int] = RequestWindow()
+    numbers = deque(range(1, 100_000))
+    stale = set(fill(window, 100, deadline=0.0, now=100.0))
+    arrivals = deque(100.0 + 0.1 * turn + rng.uniform(0.0, 0.01) for turn in range(50))
+    asked: dict[int, float] = {}
+    queue: deque[int] = deque()
+    request_of: dict[int, int] = {}
+    ends, working = float("inf"), -1
+    done: list[int] = []
+    while len(done) < 150:
+        now = min(ends, arrivals[0] if arrivals else float("inf"), window.next_due() or float("inf"))
+        if arrivals and arrivals[0] <= now:
+            arrivals.popleft()
+            asked[fill(window, 1, deadline=now + 0.1, now=now)[0]] = now
+        if ends <= now:
+            window.answered(working, now)
+            request = request_of[working]
+            done.append(request)
+            if request in asked:
+                assert now - asked[request] <= 0.0401, "at most one late request was before it"
+            ends = float("inf")
+        for request in window.release(now):
+            number = numbers.popleft()
+            request_of[number] = request
+            window.sent(number, now)
+            queue.append(number)
+        if ends == float("inf") and queue:
+            working = queue.popleft()
+            ends = now + 0.02
+    assert stale <= set(done)

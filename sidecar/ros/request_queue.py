@@ -1,0 +1,96 @@
+"""Cloud: requests that wait for a local server, in the order in which they should run.
+
+What is more urgent goes first; then what can still make its deadline before what is late already; then the earlier
+deadline. The late are served last, not dropped: their robots still want the answers, until they expire.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+from itertools import count
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from sidecar.core.priority import Priority
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable
+
+REMOVED_SLACK = 64
+"""Removed requests that may lie in the heaps before they are swept out."""
+
+T = TypeVar("T", bound="Hashable")
+
+
+@dataclass(slots=True)
+class _Class(Generic[T]):
+    """Waiting requests of one priority: heaps of (deadline, order of arrival, request)."""
+
+    fresh: list[tuple[float, int, T]] = field(default_factory=list)
+    late: list[tuple[float, int, T]] = field(default_factory=list)
+
+
+class RequestQueue(Generic[T]):
+    """Requests by priority, lateness and deadline. Times are seconds; the caller caps their number."""
+
+    __slots__ = ("_classes", "_order", "_waiting")
+
+    def __init__(self) -> None:
+        self._classes: dict[Priority, _Class[T]] = {priority: _Class() for priority in sorted(Priority)}
+        self._waiting: dict[T, None] = {}
+        """Those that the heaps hold, in order of arrival; what was removed stays in its heap until it comes up."""
+        self._order = count()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def __contains__(self, request: T) -> bool:
+        return request in self._waiting
+
+    def add(self, request: T, priority: Priority, deadline: float) -> None:
+        """Let a request wait."""
+        self._waiting[request] = None
+        heapq.heappush(self._classes[priority].fresh, (deadline, next(self._order), request))
+
+    def remove(self, request: T) -> None:
+        """It is not wanted any more."""
+        del self._waiting[request]
+        held = sum(len(waiting.fresh) + len(waiting.late) for waiting in self._classes.values())
+        if held > 2 * len(self._waiting) + REMOVED_SLACK:
+            for waiting in self._classes.values():
+                waiting.fresh = self._without_removed(waiting.fresh)
+                waiting.late = self._without_removed(waiting.late)
+
+    def take(self, now: float, *, late_too: bool) -> tuple[T, bool] | None:
+        """Return the request whose turn it is and whether it is late; None if there is none of those wanted."""
+        for waiting in self._classes.values():
+            self._sort_out(waiting, now)
+            heap = waiting.fresh or (waiting.late if late_too else None)
+            if heap:
+                request = heapq.heappop(heap)[2]
+                del self._waiting[request]
+                return request, heap is waiting.late
+        return None
+
+    def _sort_out(self, waiting: _Class[T], now: float) -> None:
+        """Bring to the top of both heaps what may be taken."""
+        while waiting.fresh and (waiting.fresh[0][0] <= now or waiting.fresh[0][2] not in self._waiting):
+            entry = heapq.heappop(waiting.fresh)
+            if entry[2] in self._waiting:
+                heapq.heappush(waiting.late, entry)
+        while waiting.late and waiting.late[0][2] not in self._waiting:
+            heapq.heappop(waiting.late)
+
+    def take_all(self) -> list[T]:
+        """Return all of them, in order of arrival, and let none wait any more."""
+        requests = list(self._waiting)
+        self._waiting.clear()
+        for waiting in self._classes.values():
+            waiting.fresh.clear()
+            waiting.late.clear()
+        return requests
+
+    def _without_removed(self, heap: list[tuple[float, int, T]]) -> list[tuple[float, int, T]]:
+        kept = [entry for entry in heap if entry[2] in self._waiting]
+        heapq.heapify(kept)
+        return kept
