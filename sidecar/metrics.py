@@ -166,10 +166,12 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     lost: dict[tuple[str, ...], float] = {}
     path_bytes: dict[tuple[str, ...], float] = {}
     path_mtu: dict[tuple[str, ...], float] = {}
+    offload: dict[tuple[str, ...], float] = {}
     for link in links:
         datagrams |= {(link.interface, *key): count for key, count in dict(link.datagrams).items()}
         dropped |= {(link.interface, key): count for key, count in dict(link.dropped).items()}
         transferred |= {(link.interface, key): count for key, count in dict(link.bytes).items()}
+        offload |= {(link.interface, key): on for key, on in dict(link.offload).items()}
         for peer, path in dict(link.paths).items():
             labels = (link.interface, peer)
             up[labels] = path.up
@@ -183,6 +185,9 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     yield counter("plr_datagrams", "UDP datagrams.", ("interface", "direction", "kind"), datagrams)
     yield counter("plr_datagrams_dropped", "Datagrams not believed or not sendable.", ("interface", "reason"), dropped)
     yield counter("plr_bytes", "UDP payload bytes.", ("interface", "direction"), transferred)
+    yield gauge(
+        "plr_udp_offload", "Whether the kernel cuts or joins our datagrams.", ("interface", "direction"), offload
+    )
     yield gauge("plr_path_up", "Whether the best path to the peer is alive.", of_path, up)
     yield gauge("plr_path_rtt_seconds", "Smoothed round-trip time of the best path to the peer.", of_path, rtt)
     yield counter("plr_path_datagrams_sent", "Numbered datagrams sent over the best path.", of_path, sent)

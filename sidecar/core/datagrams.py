@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core import frame
 from sidecar.core.frame import BASE_FRAMES_BYTES, Header
@@ -32,6 +32,20 @@ class LinkIdentity:
     session: SessionId
     token: bytes
     incarnation: int
+
+
+class Batch(NamedTuple):
+    """Datagrams to one address, back to back: at most 64 of them and 65,000 bytes."""
+
+    address: Address
+    data: bytes | bytearray | memoryview
+    segment: int
+    """Bytes of each datagram; the last may be shorter."""
+
+    @property
+    def datagrams(self) -> int:
+        """How many datagrams they are."""
+        return -(-len(self.data) // self.segment)
 
 
 class DatagramBuilder:

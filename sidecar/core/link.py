@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core import frame
-from sidecar.core.datagrams import BURST_DATAGRAMS, DatagramBuilder
+from sidecar.core.datagrams import BURST_DATAGRAMS, Batch, DatagramBuilder
 from sidecar.core.frame import HEADER_BYTES, Header
 from sidecar.core.link_events import (
     FragmentReceived,
@@ -114,6 +114,11 @@ class Link:
         self._dirty[path.id] = path
         self._receive_frames(path, frames, now)
 
+    def receive_batch(self, data: memoryview, segment: int, source: Address, now: float) -> None:
+        """Take datagrams of one sender, `segment` bytes each, the last may be shorter. Events view `data`."""
+        for start in range(0, len(data), segment):
+            self.receive_datagram(data[start : start + segment], source, now)
+
     def execute(self, command: LinkCommand, now: float) -> None:
         """Carry out what the engine asks."""
         match command:
@@ -179,6 +184,14 @@ class Link:
     def next_event(self) -> LinkEvent | None:
         """Return the oldest event not taken yet."""
         return self._events.popleft() if self._events else None
+
+    def in_use(self, address: Address) -> bool:
+        """Whether a path that is not down leads to this address."""
+        return any(path.remote == address and path.state is not PathState.DOWN for path in self._paths.values())
+
+    def batches_to_send(self, now: float) -> list[Batch]:
+        """Build what may leave now; call again until nothing comes."""
+        return [Batch(address, data, len(data)) for address, data in self.datagrams_to_send(now)]
 
     def datagrams_to_send(self, now: float) -> list[tuple[Address, bytes]]:
         """Build what may leave now, at most about BURST_DATAGRAMS; call again until nothing comes."""

@@ -41,6 +41,8 @@ class LinkStats:
     """Direction: sent | received; UDP payload bytes."""
     paths: dict[NodeName, PathStats] = field(default_factory=dict)
     """The best path to each peer."""
+    offload: dict[str, bool] = field(default_factory=dict)
+    """Direction: send | receive; whether the kernel cuts or joins datagrams for this socket."""
 
 
 @dataclass(slots=True)

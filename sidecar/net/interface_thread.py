@@ -5,17 +5,18 @@ It only moves bytes, commands and events and arms one timer; every decision is i
 
 from __future__ import annotations
 
-import errno
 import logging
 import threading
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
+from sidecar.core.datagrams import Batch
 from sidecar.core.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
 from sidecar.core.link_events import PathChanged
+from sidecar.core.path_id import PathState
+from sidecar.net.batch_socket import BatchSocket
 from sidecar.net.path_log import PathLog
-from sidecar.net.sockets import normalise, to_sockaddr
 from sidecar.net.waiter import Waiter
 
 if TYPE_CHECKING:
@@ -30,10 +31,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RECEIVE_BATCH = 64
-"""Datagrams read before anything else is looked at."""
-RECEIVE_BYTES = MAX_DATAGRAM_BYTES + 1
-"""Longer than any datagram of ours: a longer one is truncated, hence malformed, hence dropped."""
+OURS = FIRST_BYTE & 0xF0
+"""First bytes from here on are ours, of whatever version; those below are STUN's."""
+BURSTS_PER_TURN = 4
+"""Bursts of the link that leave before timers and arrivals are looked at again: some milliseconds at most."""
+SLOW_SEND_S = 0.02
+"""A driver that takes so long for a burst is let go on only after timers had their say: paths may have gone down."""
 BLOCKED_TIMER_S = 0.005
 """While the socket takes nothing, timers are looked at this often: what is due may wait for the socket itself."""
 ERROR_PAUSE_S = 0.1
@@ -71,7 +74,10 @@ class InterfaceThread:
         self._clock = clock
         self._inbox: deque[LinkCommand | Callable[[StunClient], None]] = deque()
         self._waiter = Waiter(sock.fileno(), clock)
-        self._unsent: deque[tuple[Address, bytes]] = deque()
+        self._batches = BatchSocket(sock, link.stats, self._on_too_big)
+        self._unsent: deque[Batch] = deque()
+        """One burst at most: no more is asked for before it has left."""
+        self._more = False
         self._path_log = PathLog()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=f"plr-{link.identity.interface}", daemon=True)
@@ -133,43 +139,34 @@ class InterfaceThread:
             stun_due = self._stun.next_timer()
             if stun_due is not None:
                 due = min(due, stun_due)
-        return max(due, self._clock() + BLOCKED_TIMER_S) if self._unsent else due
+        if self._unsent:
+            return max(due, self._clock() + BLOCKED_TIMER_S)
+        return 0.0 if self._more else due
 
     def _turn(self) -> None:
-        link, clock = self.link, self._clock
         self._receive()
         self._execute()
-        link.handle_timer(clock())
+        self.link.handle_timer(self._clock())
         self._exchange()
         self._stun_turn()
-        while not self._unsent:
-            datagrams = link.datagrams_to_send(clock())
-            if not datagrams:
-                break
-            self._unsent.extend(datagrams)
-            self._flush()
-            self._exchange()
-        else:
-            self._flush()
+        self._send()
 
     def _receive(self) -> None:
-        sock, link, stun = self._socket, self.link, self._stun
-        for _ in range(RECEIVE_BATCH):
-            try:
-                data, source = sock.recvfrom(RECEIVE_BYTES)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                # ICMP errors of earlier sends surface here; the paths' own probes judge.
-                link.stats.dropped[f"receive_{errno.errorcode.get(error.errno or 0, 'error').lower()}"] += 1
-                continue
-            address = normalise(source)
-            if len(data) <= MAX_DATAGRAM_BYTES and data[:1] and data[0] >= FIRST_BYTE & 0xF0:
-                link.receive_datagram(data, address, self._clock())
-            elif stun is not None and stun.receive_datagram(data, address, self._clock()):
-                link.stats.datagrams["received", "stun"] += 1
+        link = self.link
+        for data, segment, source in self._batches.receive():
+            if data[0] >= OURS and segment <= MAX_DATAGRAM_BYTES:
+                link.receive_batch(data, segment, source, self._clock())
             else:
-                link.stats.dropped["malformed"] += 1
+                self._receive_stun(data, segment, source)
+
+    def _receive_stun(self, data: memoryview, segment: int, source: Address) -> None:
+        stats = self.link.stats
+        for start in range(0, len(data), segment):
+            datagram = bytes(data[start : start + segment])
+            if self._stun is not None and self._stun.receive_datagram(datagram, source, self._clock()):
+                stats.datagrams["received", "stun"] += 1
+            else:
+                stats.dropped["malformed"] += 1
 
     def _execute(self) -> None:
         inbox = self._inbox
@@ -191,12 +188,19 @@ class InterfaceThread:
                 events.append(event)
             if events:
                 self._owner.on_link_events(events)
-                for event in events:
-                    if isinstance(event, PathChanged):
-                        self._path_log.note(event)
+                self._note_paths(events)
             if not self._inbox and not events:
                 return
             self._execute()
+
+    def _note_paths(self, events: list[LinkEvent]) -> None:
+        down = False
+        for event in events:
+            if isinstance(event, PathChanged):
+                self._path_log.note(event)
+                down = down or event.state is PathState.DOWN
+        if down:
+            self._drop_unsent()
 
     def _stun_turn(self) -> None:
         stun = self._stun
@@ -204,29 +208,45 @@ class InterfaceThread:
             return
         stun.handle_timer(self._clock())
         for data, address in stun.datagrams_to_send():
-            self._send(data, address)
+            self._batches.send(Batch(address, data, len(data)))  # what finds no room is sent again in time
             self.link.stats.datagrams["sent", "stun"] += 1
         while (event := stun.next_event()) is not None:
             self._owner.on_stun_event(self.interface, event)
 
-    def _flush(self) -> None:
-        unsent = self._unsent
-        while unsent:
-            address, data = unsent[0]
-            if not self._send(data, address):
+    def _send(self) -> None:
+        self._more = True
+        for _ in range(BURSTS_PER_TURN):
+            if not self._flush():
                 return
-            unsent.popleft()
+            batches = self.link.batches_to_send(self._clock())
+            if not batches:
+                self._more = False
+                return
+            self._unsent.extend(batches)
+            self._exchange()
+        self._flush()
 
-    def _send(self, data: bytes, address: Address) -> bool:
-        """Send one datagram; False when the socket's buffer is full and it must wait."""
-        destination = to_sockaddr(self._socket.family, address)
-        if destination is None:
-            return True
-        try:
-            self._socket.sendto(data, destination)
-        except BlockingIOError:
-            self.link.stats.dropped["send_buffer_full_waits"] += 1
-            return False
-        except OSError as error:
-            self.link.stats.dropped[f"unsendable_{errno.errorcode.get(error.errno or 0, 'error').lower()}"] += 1
+    def _flush(self) -> bool:
+        """Send what waits; False when it has to go on waiting."""
+        unsent = self._unsent
+        began = self._clock()
+        while unsent:
+            rest = self._batches.send(unsent.popleft())
+            if rest is not None:
+                unsent.appendleft(rest)
+                return False
+            if unsent and self._clock() - began > SLOW_SEND_S:
+                return False
         return True
+
+    def _drop_unsent(self) -> None:
+        """Forget what waits for the paths that went down: they handed it back, and nothing stale shall leave."""
+        unsent, self._unsent = self._unsent, deque()
+        for batch in unsent:
+            if self.link.in_use(batch.address):
+                self._unsent.append(batch)
+            else:
+                self.link.stats.dropped["unsent_of_path_down"] += batch.datagrams
+
+    def _on_too_big(self, destination: Address, size: int) -> None:
+        self.link.on_too_big(destination, size, self._clock())

@@ -25,7 +25,7 @@ from protos.model import (
     SessionId,
     Version,
 )
-from sidecar.core.datagrams import LinkIdentity
+from sidecar.core.datagrams import Batch, LinkIdentity
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import (
     ApplicationEvent,
@@ -179,6 +179,6 @@ def test_timers_do_not_spin_while_the_socket_takes_nothing() -> None:
     overdue = thread.link.next_timer() + 1.0
     thread._clock = lambda: overdue
     assert thread._due() < overdue
-    thread._unsent.append((("127.0.0.1", 9), b"x"))
+    thread._unsent.append(Batch(("127.0.0.1", 9), b"x", 1))
     assert thread._due() == overdue + BLOCKED_TIMER_S
     thread._socket.close()
