@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.link_events import FragmentsLost, PathMtuChanged
 from sidecar.core.path_id import PathState
-from sidecar.core.pmtu import BASE_BYTES, largest_payload
+from sidecar.core.pmtu import BASE_BYTES, payloads
 
 if TYPE_CHECKING:
     from collections import deque
@@ -39,7 +39,7 @@ class LinkMtu:
 
     def search(self, path: Path, now: float) -> None:
         """The path is up: look for the longest datagram that it carries."""
-        if path.remote is not None and path.mtu.start(largest_payload(self._mtu, ipv6=":" in path.remote[0]), now):
+        if path.remote is not None and path.mtu.start(payloads(self._mtu, ipv6=":" in path.remote[0]), now):
             self._fell(path)
 
     def start_afresh(self, path: Path) -> None:

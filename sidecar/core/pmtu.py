@@ -1,7 +1,7 @@
 """How large a datagram one path carries: packetization layer path MTU discovery (RFC 8899; RFC 9000 section 14.3).
 
 Sizes are bytes of UDP payload. Every path starts at BASE_BYTES, which need not be proven. Probes, padded to the size
-under test and answered by a small PROBE_REPLY, go up the STEPS to what the local interface takes; what is confirmed
+under test and answered by a small PROBE_REPLY, go up common sizes to what the local interface takes; what is confirmed
 holds at once. ICMP is never believed. A lost probe is neither congestion nor a failure of the path.
 
 Two things bring a path back to the base: full-sized datagrams that vanish while small ones pass (a black hole,
@@ -10,13 +10,15 @@ RFC 8899 section 4.3: the route changed), and the path having been down (it may 
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 BASE_BYTES = 1200
 """What every path of the Internet carries (RFC 9000 section 14; BASE_PLPMTU)."""
 MAX_BYTES = 8952
 """Jumbo frames of 9000 bytes less the headers of IPv6 and UDP; larger ones gain nothing more."""
-STEPS = (1252, 1372, 1452, 1472, 2048, 4096, MAX_BYTES)
-"""Sizes tried, where the interface takes them: MTU 1280, tunnels and mobile networks, Ethernet with IPv6, with IPv4,
-jumbo frames. What the interface itself takes is always tried last."""
+COMMON_MTUS = (1280, 1400, 1420, 1492, 1500, 4096, 9000)
+"""MTUs tried, where the interface takes them: IPv6's least, mobile networks, WireGuard, PPPoE, Ethernet, jumbo frames.
+What the interface itself takes is always tried last."""
 MAX_PROBES = 3
 """Unanswered probes after which a size does not pass (RFC 8899 section 5.1.2)."""
 PROBE_TIMEOUT_S = 1.0
@@ -38,9 +40,12 @@ PROBES_REMEMBERED = 2 * MAX_PROBES
 """Probes whose late reply still counts."""
 
 
-def largest_payload(mtu: int, *, ipv6: bool) -> int:
-    """Return the UDP payload that an interface of this MTU (bytes) takes, within BASE_BYTES and MAX_BYTES."""
-    return min(max(mtu - (HEADERS_V6 if ipv6 else HEADERS_V4), BASE_BYTES), MAX_BYTES)
+@lru_cache(maxsize=64)
+def payloads(mtu: int, *, ipv6: bool) -> tuple[int, ...]:
+    """Return what to try on an interface of this MTU (bytes), ascending: all above BASE_BYTES, up to MAX_BYTES."""
+    headers = HEADERS_V6 if ipv6 else HEADERS_V4
+    sizes = {min(candidate, mtu) - headers for candidate in COMMON_MTUS} | {mtu - headers}
+    return tuple(sorted({min(size, MAX_BYTES) for size in sizes if size > BASE_BYTES}))
 
 
 class PathMtu:
@@ -50,10 +55,10 @@ class PathMtu:
         "_at",
         "_hole_at",
         "_holes",
-        "_limit",
         "_out",
         "_reports",
         "_row",
+        "_sizes",
         "_small_passed",
         "_target",
         "_told",
@@ -64,8 +69,8 @@ class PathMtu:
     def __init__(self) -> None:
         self.size = BASE_BYTES
         """Largest datagram that may be sent, in bytes."""
-        self._told = BASE_BYTES
-        self._limit = BASE_BYTES
+        self._told: tuple[int, ...] = ()
+        self._sizes: tuple[int, ...] = ()
         """What is looked for: as told, or less after the kernel refused more."""
         self._at: float | None = None
         self._target: int | None = None
@@ -79,17 +84,18 @@ class PathMtu:
 
     # -- the path's life ------------------------------------------------------------------------------------------
 
-    def start(self, limit: int, now: float) -> bool:
-        """The path is up, over an interface that takes `limit` (see `largest_payload`): search, unless that was known.
+    def start(self, sizes: tuple[int, ...], now: float) -> bool:
+        """The path is up, over an interface that takes these `payloads`: search, unless that was known.
 
         True when it makes datagrams smaller.
         """
-        if self._at is not None and limit == self._told:
+        if self._at is not None and sizes == self._told:
             return False
+        limit = sizes[-1] if sizes else BASE_BYTES
         lowered = self.size > limit
         self.size = min(self.size, limit)
-        self._told = limit
-        self._search(limit, now)
+        self._told = sizes
+        self._search(sizes, now)
         return lowered
 
     def stop(self) -> bool:
@@ -130,7 +136,7 @@ class PathMtu:
         size = self._out.pop(probe_id, None)
         if size is None:
             return False
-        if self.size < size <= self._limit:
+        if size > self.size:
             self.size = size
             self._forgive()
             if self._target is not None and self._target <= size:
@@ -138,17 +144,15 @@ class PathMtu:
                 self._at = now
         return True
 
-    def _search(self, limit: int, now: float) -> None:
-        self._limit = limit
+    def _search(self, sizes: tuple[int, ...], now: float) -> None:
+        self._sizes = sizes
         self._target = None
+        self._out.clear()
         self._at = now
 
     def _above(self) -> int | None:
         """The next size worth testing."""
-        for step in STEPS:
-            if self.size < step < self._limit:
-                return step
-        return self._limit if self.size < self._limit else None
+        return next((size for size in self._sizes if size > self.size), None)
 
     def _rest(self, now: float) -> None:
         self._target = None
@@ -181,14 +185,14 @@ class PathMtu:
         """The kernel refused to send this many bytes over the interface; True when datagrams get smaller by it."""
         if size <= BASE_BYTES or self._at is None:
             return False
-        self._limit = min(self._limit, size - 1)
-        if size > self.size:
-            if self._target is not None and self._target >= size:
-                self._target, self._at = None, now
+        lowered = self.size >= size
+        if not lowered and (self._target is None or self._target < size):
             return False
-        self.size = max((step for step in (BASE_BYTES, *STEPS) if step < size), default=BASE_BYTES)
-        self._search(self._limit, now)
-        return True
+        smaller = tuple(known for known in self._sizes if known < size)
+        if lowered:
+            self.size = smaller[-1] if smaller else BASE_BYTES
+        self._search(smaller, now)
+        return lowered
 
     def _forgive(self) -> None:
         self._row = 0
