@@ -40,6 +40,8 @@ STARTUP_GAIN = 2.0
 """The rate at most doubles with each round at first, as in slow start."""
 DRAIN_GAIN = 0.5
 """After start-up, until its queue is gone."""
+DRAIN_ROUNDS = 3
+"""Draining ends after so many rounds: what still stands then is not ours."""
 CYCLE = (1.25, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
 """Pacing gains round by round: ask for more, drain what that queued, cruise (BBR's ProbeBW)."""
 FULL_GROWTH = 1.25
@@ -47,12 +49,20 @@ FULL_ROUNDS = 3
 """The path is full when the rate did not grow by FULL_GROWTH within FULL_ROUNDS."""
 QUEUE_FACTOR = 0.25
 """A round trip this much above the minimum shows a queue."""
+PROBE_AGAIN_S = 1.0
+"""A queue that stands although we keep to our window makes us look for the minimum no more often than this."""
+FLOOR_MEMORY_S = 60.0
+"""How long the least round trip of all counts when a loss is judged."""
 MINIMUM_STALE_S = 5.0
 """A minimum round trip not seen for this long is looked for, with half the window, before it is forgotten."""
 CUT = 0.7
 """What a loss with a standing queue leaves of the ceiling (CUBIC's beta, RFC 9438 section 4.6)."""
 CUBIC_C = 0.4
 """Growth of the ceiling, datagrams per cubed second (RFC 9438 section 5)."""
+SIGNIFICANT = 2.0
+"""A queue's losses are congestion when they are this many times as frequent as those without a queue."""
+LOSS_MEMORY_BYTES = 500 * DATAGRAM_BYTES
+"""Over how much the frequency of losses without a queue is measured."""
 HEAVY_LOSS = 0.2
 """Losing this much of a round's bytes is congestion even without a queue: a policer, or a tiny buffer."""
 OUTAGE_FRACTION = 0.5
@@ -87,23 +97,33 @@ class CongestionController:
     """Window and pacing of one path. Sizes in bytes, rates in bytes a second, times in seconds."""
 
     __slots__ = (
+        "_believed_before",
         "_ceiling",
         "_cut_at",
         "_cycle",
+        "_drained_at",
         "_epoch_at",
         "_epoch_ceiling",
         "_first_window",
+        "_floor_at",
+        "_floor_rtt",
         "_full_rate",
         "_full_rounds",
+        "_idle_bytes",
+        "_idle_lost",
         "_last_ack_at",
-        "_phase_until",
+        "_phase_rounds",
+        "_probe_min_rtt",
         "_probed_rtt_at",
+        "_queue_stood",
         "_release_at",
         "_round_acked",
         "_round_in_flight",
         "_round_lost",
         "_round_min_rtt",
+        "_round_queued",
         "_rtt",
+        "_standing_rounds",
         "phase",
         "rate",
     )
@@ -118,8 +138,14 @@ class CongestionController:
         self._cycle = 2
         self._full_rate = 0.0
         self._full_rounds = 0
-        self._phase_until = 0.0
+        self._phase_rounds = 0
+        self._standing_rounds = 0
+        self._believed_before = 0.0
         self._probed_rtt_at: float | None = None
+        self._probe_min_rtt = float("inf")
+        self._drained_at: float | None = None
+        self._idle_bytes = 0.0
+        self._idle_lost = 0.0
         self._ceiling: float | None = None
         self._epoch_at = 0.0
         self._epoch_ceiling = 0.0
@@ -128,6 +154,10 @@ class CongestionController:
         self._round_lost = 0
         self._round_in_flight = 0
         self._round_min_rtt = float("inf")
+        self._round_queued = False
+        self._queue_stood = False
+        self._floor_rtt = float("inf")
+        self._floor_at = 0.0
 
     # -- asking ---------------------------------------------------------------------------------------------------
 
@@ -156,7 +186,8 @@ class CongestionController:
         model = self._model_window()
         if self._ceiling is not None:
             model = min(model, self._ceiling)
-        return min(max(model, MIN_WINDOW_BYTES), MAX_WINDOW_BYTES)
+        least = MIN_WINDOW_BYTES if self.phase is not Phase.PROBE_RTT else MIN_WINDOW_BYTES / 2
+        return min(max(model, least), MAX_WINDOW_BYTES)
 
     def _model_window(self) -> float:
         rate = self.rate.best
@@ -202,11 +233,16 @@ class CongestionController:
         self._last_ack_at = now
         self._round_acked += sample.acked_bytes
         if sample.rtt_s:
+            self._note_floor(sample.rtt_s, rtt, now)
+            self._round_queued |= self._queue_stands(rtt)
             self._round_min_rtt = min(self._round_min_rtt, sample.rtt_s)
             if self._probed_rtt_at is None or sample.rtt_s <= 1.05 * rtt.minimum + 1e-4:
                 self._probed_rtt_at = now
+            if self.phase is Phase.PROBE_RTT:
+                self._probe_rtt(sample, rtt, now)
         limit = STARTUP_GAIN * (self.rate.settled or self._first_window / max(rtt.minimum, 1e-4))
-        round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit)
+        probing_rtt = self.phase is Phase.PROBE_RTT
+        round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit, held_back=probing_rtt)
         if self._ceiling is not None:
             self._grow_ceiling(now)
         if self.phase is Phase.DRAIN and sample.in_flight <= self.rate.best * rtt.minimum:
@@ -214,8 +250,8 @@ class CongestionController:
         if round_over:
             self._end_round(rtt, now)
 
-    def on_lost(self, lost_bytes: int, in_flight: int, now: float) -> None:
-        """These bytes were lost; `in_flight` is what is left."""
+    def on_lost(self, lost_bytes: int, sent_at: float, in_flight: int, now: float) -> None:
+        """These bytes were lost, the newest of them sent at `sent_at`; `in_flight` is what is left."""
         self._round_lost += lost_bytes
         rtt = self._rtt
         if rtt is None or self._last_ack_at is None:
@@ -224,11 +260,18 @@ class CongestionController:
         if now - self._last_ack_at > PERSISTENT_FACTOR * timeout:
             self._collapse(rtt)
             return
-        if now - self._cut_at < rtt.smoothed:
-            return
-        heavy = self._round_lost > max(HEAVY_LOSS * (self._round_lost + self._round_acked), 8 * DATAGRAM_BYTES)
-        if heavy or self._queue_stands(rtt):
+        if sent_at <= self._cut_at:
+            return  # left before the last cut could help (RFC 9002 section 7.3.2)
+        carried = self._round_lost + self._round_acked
+        heavy = self._round_lost > max(HEAVY_LOSS * carried, 8 * DATAGRAM_BYTES)
+        if heavy or (self._queue_stands(rtt) and self._round_lost > SIGNIFICANT * self._usual_loss(carried)):
             self._cut(in_flight + lost_bytes, now)
+
+    def _usual_loss(self, size: int) -> float:
+        """How many of so many bytes are lost without a queue; a little more where there are such losses at all."""
+        if self._idle_lost <= 0.005 * self._idle_bytes:
+            return 0.0
+        return self._idle_lost / self._idle_bytes * size + DATAGRAM_BYTES
 
     def on_path_down(self, now: float) -> None:
         """The path is dead."""
@@ -248,21 +291,54 @@ class CongestionController:
     def _end_round(self, rtt: RttEstimator, now: float) -> None:
         standing = self._round_min_rtt - rtt.minimum if self._round_min_rtt < float("inf") else 0.0
         queued = standing > QUEUE_FACTOR * rtt.minimum + END_HOST_S
-        if standing > rtt.minimum + 2 * END_HOST_S:
+        self._phase_rounds += 1
+        self._standing_rounds = self._standing_rounds + 1 if standing > rtt.minimum + 2 * END_HOST_S else 0
+        if self._standing_rounds:
+            self._believed_before = max(self._believed_before, self.rate.best)
             self.rate.believe_latest()
+        if not self._queue_stood and not self._round_queued:
+            self._note_usual_loss()
+        self._queue_stood = self._round_queued
+        self._round_queued = False
         if self.phase is Phase.STARTUP:
             self._check_full(queued=queued)
+        elif self.phase is Phase.DRAIN and self._phase_rounds > DRAIN_ROUNDS:
+            self._cruise()
         elif self.phase is Phase.CRUISE:
             self._cycle = (self._cycle + 1) % len(CYCLE)
-        elif self.phase is Phase.PROBE_RTT and now >= self._phase_until:
-            self._probed_rtt_at = now
-            self._cruise()
-        if self.phase is Phase.CRUISE and now - (self._probed_rtt_at or now) > MINIMUM_STALE_S:
-            self.phase = Phase.PROBE_RTT
-            self._phase_until = now + rtt.smoothed
+            unseen = now - (self._probed_rtt_at or now)
+            if unseen > MINIMUM_STALE_S or (self._standing_rounds > 1 and unseen > PROBE_AGAIN_S):
+                self._enter(Phase.PROBE_RTT)
+                self._drained_at = None
+                self._probe_min_rtt = float("inf")
         self._round_acked = self._round_lost = 0
         self._round_in_flight = 0
         self._round_min_rtt = float("inf")
+
+    def _note_usual_loss(self) -> None:
+        if self._idle_bytes > LOSS_MEMORY_BYTES:
+            self._idle_bytes /= 2
+            self._idle_lost /= 2
+        self._idle_bytes += self._round_acked + self._round_lost
+        self._idle_lost += self._round_lost
+
+    def _probe_rtt(self, sample: RateSample, rtt: RttEstimator, now: float) -> None:
+        """With little of ours in flight for a round trip, what remains of the queue is others'."""
+        self._probe_min_rtt = min(self._probe_min_rtt, sample.rtt_s)
+        if self._drained_at is None:
+            if sample.in_flight <= self.window:
+                self._drained_at = now
+        elif sample.sent_at >= self._drained_at:
+            if self._probe_min_rtt > 2 * rtt.minimum:
+                self.rate.restart(self._believed_before)  # the queue is others': the path is not slower than thought
+            self._believed_before = 0.0
+            rtt.restart_minimum(self._probe_min_rtt, now)
+            self._probed_rtt_at = now
+            self._cruise()
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase = phase
+        self._phase_rounds = 0
 
     def _check_full(self, *, queued: bool) -> None:
         if self.rate.limited_by_sender:
@@ -273,17 +349,24 @@ class CongestionController:
         else:
             self._full_rounds += 1
         if queued or self._full_rounds >= FULL_ROUNDS:
-            self.phase = Phase.DRAIN
+            self._enter(Phase.DRAIN)
 
     def _cruise(self) -> None:
-        self.phase = Phase.CRUISE
+        self._enter(Phase.CRUISE)
         self._cycle = 2
 
     # -- loss -----------------------------------------------------------------------------------------------------
 
+    def _note_floor(self, rtt_s: float, rtt: RttEstimator, now: float) -> None:
+        if rtt_s <= self._floor_rtt:
+            self._floor_rtt, self._floor_at = rtt_s, now
+        elif now - self._floor_at > FLOOR_MEMORY_S:
+            self._floor_rtt, self._floor_at = rtt.minimum, now
+
     def _queue_stands(self, rtt: RttEstimator) -> bool:
-        excess = min(rtt.smoothed, rtt.latest) - rtt.minimum
-        return excess > max(0.2 * rtt.minimum, 2.5 * rtt.variation, 0.001)
+        """Whether there is a queue, whosever: seen from the floor, which others' queues do not raise so soon."""
+        excess = min(rtt.smoothed, rtt.latest) - self._floor_rtt
+        return excess > max(0.2 * self._floor_rtt, 2.5 * rtt.variation, 0.001)
 
     def _cut(self, in_flight: int, now: float) -> None:
         at = float(max(in_flight, self._round_in_flight))
@@ -293,7 +376,7 @@ class CongestionController:
         self._epoch_ceiling = at
         self._epoch_at = self._cut_at = now
         if self.phase is Phase.STARTUP:
-            self.phase = Phase.DRAIN
+            self._enter(Phase.DRAIN)
 
     def _grow_ceiling(self, now: float) -> None:
         top = self._epoch_ceiling / DATAGRAM_BYTES

@@ -70,10 +70,11 @@ class DeliveryRate:
         """Nothing waits to be sent: what is sent next begins a train."""
         self._dry = True
 
-    def on_acked(self, size: int, sent_at: float, now: float, limit: float) -> bool:
+    def on_acked(self, size: int, sent_at: float, now: float, limit: float, *, held_back: bool = False) -> bool:
         """Take newly acknowledged bytes, the newest of them sent at `sent_at`; True when that ended a round.
 
-        No round is believed beyond `limit`: acknowledgements that come in clumps may show any rate.
+        A round in which the controller held back says as little against a better one as a round for want of data. No
+        round is believed beyond `limit`: acknowledgements that come in clumps may show any rate.
         """
         trains = self._trains
         begins = self._anchor_at is None
@@ -92,7 +93,7 @@ class DeliveryRate:
             self._limited = acked_s <= LIMITED_FACTOR * sent_s
             self._update()
             if sent_at >= self._anchor_at:
-                self._close(sender=False)
+                self._close(sender=held_back)
                 self._anchor(now, sent_at)
                 return True
         return False

@@ -41,7 +41,7 @@ class RttEstimator:
         if not self.has_sample:
             self.latest = self.smoothed = rtt_s
             self.variation = rtt_s / 2
-            self.forget_minimum(now)
+            self.restart_minimum(rtt_s, now)
             return
         self._note_minimum(rtt_s, now)
         if rtt_s - peer_delay_s >= self.minimum:
@@ -61,9 +61,9 @@ class RttEstimator:
             self._half_minimum = rtt_s
         self.minimum = min(self._half_minimum, self._last_minimum)
 
-    def forget_minimum(self, now: float) -> None:
-        """Start the minimum afresh from the latest sample: another network is below, or its queue was drained."""
-        self.minimum = self._half_minimum = self._last_minimum = self.latest
+    def restart_minimum(self, minimum_s: float, now: float) -> None:
+        """Forget what the minimum was: this is what the path's round trip takes now, without a queue of ours."""
+        self.minimum = self._half_minimum = self._last_minimum = minimum_s
         self._half_began = now
 
     def probe_timeout(self, peer_delay_s: float) -> float:

@@ -92,10 +92,7 @@ class Flow:
             if self.largest - other < 3:
                 break
             lost.append(other)
-        for other in lost:
-            del self.sent[other]
-        if lost:
-            self.on_lost(len(lost) * SIZE)
+        self.lose(lost)
         self.pump()
 
     def watch(self) -> None:
@@ -103,16 +100,19 @@ class Flow:
         if self.sent:
             oldest = next(iter(self.sent.values()))
             if self.net.now - oldest > self.rtt.probe_timeout(0.005) + 0.1:
-                lost = len(self.sent)
-                self.sent.clear()
-                self.on_lost(lost * SIZE)
+                self.lose(list(self.sent))
         self.pump()
         self.net.at(self.net.now + 0.05, self.watch)
+
+    def lose(self, numbers: list[int]) -> None:
+        if numbers:
+            sent_at = max(self.sent.pop(number) for number in numbers)
+            self.on_lost(len(numbers) * SIZE, sent_at)
 
     def on_acked(self, sent_at: float) -> None:
         raise NotImplementedError
 
-    def on_lost(self, size: int) -> None:
+    def on_lost(self, size: int, sent_at: float) -> None:
         raise NotImplementedError
 
     def pump(self) -> None:
@@ -132,10 +132,10 @@ class OurFlow(Flow):
         now = self.net.now
         self.control.on_acked(RateSample(SIZE, sent_at, now - sent_at, self.in_flight), self.rtt, now)
 
-    def on_lost(self, size: int) -> None:
+    def on_lost(self, size: int, sent_at: float) -> None:
         if self.want is not None:
             self.want += size
-        self.control.on_lost(size, self.in_flight, self.net.now)
+        self.control.on_lost(size, sent_at, self.in_flight, self.net.now)
 
     def pump(self) -> None:
         net, control = self.net, self.control
@@ -184,7 +184,7 @@ class Tcp(Flow):
         else:
             self.window += 0.01 / self.window
 
-    def on_lost(self, size: int) -> None:
+    def on_lost(self, size: int, sent_at: float) -> None:
         if self.largest < self.recover:
             return
         self.recover = self.next
