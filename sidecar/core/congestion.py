@@ -72,7 +72,7 @@ PERSISTENT_FACTOR = 3
 
 
 class RateSample(NamedTuple):
-    """What one acknowledgement tells."""
+    """What one acknowledgement tells of the datagrams that were reported with `on_sent`."""
 
     acked_bytes: int
     """Newly acknowledged by it."""
@@ -111,8 +111,8 @@ class CongestionController:
         "_full_rounds",
         "_idle_bytes",
         "_idle_lost",
-        "_last_ack_at",
         "_phase_rounds",
+        "_probe_credit",
         "_probe_min_rtt",
         "_probed_rtt_at",
         "_queue_stood",
@@ -123,7 +123,9 @@ class CongestionController:
         "_round_min_rtt",
         "_round_queued",
         "_rtt",
+        "_silent_since",
         "_standing_rounds",
+        "_was_down",
         "phase",
         "rate",
     )
@@ -134,7 +136,9 @@ class CongestionController:
         self._rtt: RttEstimator | None = None
         self._first_window = float(INITIAL_WINDOW_BYTES)
         self._release_at = 0.0
-        self._last_ack_at: float | None = None
+        self._probe_credit = 0
+        self._was_down = False
+        self._silent_since = 0.0
         self._cycle = 2
         self._full_rate = 0.0
         self._full_rounds = 0
@@ -165,7 +169,7 @@ class CongestionController:
         """Return the bytes that may leave now: 0, or at least one datagram."""
         room = self.window - in_flight
         if room <= 0:
-            return 0
+            return self._probe_credit
         pace = self.pacing_rate
         if pace is not None:
             if now < self._release_at:
@@ -174,9 +178,9 @@ class CongestionController:
             room = min(room, max(burst(pace), late))
         return max(int(room), DATAGRAM_BYTES)
 
-    def next_release(self, now: float, in_flight: int) -> float | None:
-        """Return when pacing lets more leave; None when only an acknowledgement can, or nothing holds it back."""
-        if self._release_at <= now or in_flight >= self.window or self.pacing_rate is None:
+    def next_release(self, in_flight: int) -> float | None:
+        """Return when pacing lets more leave (it may have passed); None when only an acknowledgement can."""
+        if in_flight >= self.window or self.pacing_rate is None:
             return None
         return self._release_at
 
@@ -218,6 +222,9 @@ class CongestionController:
     def on_sent(self, now: float, size: int, in_flight: int) -> None:
         """These bytes left; `in_flight` includes them."""
         self.rate.on_sent(now)
+        self._probe_credit = 0
+        if in_flight <= size:
+            self._silent_since = now
         self._round_in_flight = max(self._round_in_flight, in_flight)
         pace = self.pacing_rate
         if pace is not None:
@@ -230,7 +237,7 @@ class CongestionController:
     def on_acked(self, sample: RateSample, rtt: RttEstimator, now: float) -> None:
         """Learn from an acknowledgement."""
         self._rtt = rtt
-        self._last_ack_at = now
+        self._silent_since = now
         self._round_acked += sample.acked_bytes
         if sample.rtt_s:
             self._note_floor(sample.rtt_s, rtt, now)
@@ -254,11 +261,7 @@ class CongestionController:
         """These bytes were lost, the newest of them sent at `sent_at`; `in_flight` is what is left."""
         self._round_lost += lost_bytes
         rtt = self._rtt
-        if rtt is None or self._last_ack_at is None:
-            return
-        timeout = rtt.probe_timeout(END_HOST_S)
-        if now - self._last_ack_at > PERSISTENT_FACTOR * timeout:
-            self._collapse(rtt)
+        if rtt is None:
             return
         if sent_at <= self._cut_at:
             return  # left before the last cut could help (RFC 9002 section 7.3.2)
@@ -273,14 +276,25 @@ class CongestionController:
             return 0.0
         return self._idle_lost / self._idle_bytes * size + DATAGRAM_BYTES
 
-    def on_path_down(self, now: float) -> None:
+    def on_probe_timeout(self, now: float) -> None:
+        """Nothing was heard: two datagrams may leave whatever is in flight (RFC 9002 section 7.5)."""
+        self._probe_credit = 2 * DATAGRAM_BYTES
+        rtt = self._rtt
+        if rtt is not None and now - self._silent_since > PERSISTENT_FACTOR * rtt.probe_timeout(END_HOST_S):
+            self._collapse(rtt)
+
+    def on_path_down(self) -> None:
         """The path is dead."""
+        self._was_down = True
         self.rate.scale(OUTAGE_FRACTION)
         self._forget_ceiling()
 
     def on_path_up(self, now: float) -> None:
-        """The path answers again: start from a part of what it carried, and look for more."""
-        self.phase = Phase.STARTUP
+        """The path answers; after an outage, start from a part of what it carried, and look for more."""
+        if not self._was_down:
+            return
+        self._was_down = False
+        self._enter(Phase.STARTUP)
         self._first_window = float(MIN_WINDOW_BYTES) if self.rate.best else float(INITIAL_WINDOW_BYTES)
         self._full_rate = 0.0
         self._full_rounds = 0
@@ -373,7 +387,8 @@ class CongestionController:
         if self._ceiling is not None:
             at = min(at, self._ceiling)
         self._ceiling = max(CUT * at, MIN_WINDOW_BYTES)
-        self._epoch_ceiling = at
+        # Fast convergence (RFC 9438 section 4.7): who has to yield twice leaves room for others.
+        self._epoch_ceiling = at if at >= self._epoch_ceiling else at * (1 + CUT) / 2
         self._epoch_at = self._cut_at = now
         if self.phase is Phase.STARTUP:
             self._enter(Phase.DRAIN)
@@ -392,6 +407,7 @@ class CongestionController:
 
     def _forget_ceiling(self) -> None:
         self._ceiling = None
+        self._epoch_ceiling = 0.0
         self._cut_at = float("-inf")
 
     def _collapse(self, rtt: RttEstimator) -> None:
@@ -399,7 +415,7 @@ class CongestionController:
         self.rate.restart(MIN_WINDOW_BYTES / max(rtt.smoothed, 1e-3))
         self._forget_ceiling()
         self._first_window = float(MIN_WINDOW_BYTES)
-        self.phase = Phase.STARTUP
+        self._enter(Phase.STARTUP)
         self._full_rate = 0.0
         self._full_rounds = 0
 

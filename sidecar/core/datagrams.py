@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceId, InterfaceName, SessionId
     from sidecar.core.paths import Path
+    from sidecar.core.send_queue import Run
     from sidecar.core.stats import LinkStats
 
 BURST_DATAGRAMS = 64
@@ -75,19 +76,31 @@ class DatagramBuilder:
     def _add_fragments(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> bool:
         if path.state is PathState.DOWN or path.remote is None:
             return True
-        recovery = path.recovery
-        stats = self._stats
-        expired_before = path.queue.expired
+        recovery, control, queue = path.recovery, path.control, path.queue
+        expired_before = queue.expired
         complete = True
-        while recovery.in_flight < path.window.bytes:
+        budget = control.budget(now, recovery.in_flight)
+        while budget > 0:
             if len(out) >= BURST_DATAGRAMS:
                 complete = False
                 break
-            item = path.queue.pop(now)
-            if item is None:
+            run = queue.take(now, budget, control.pacing_rate or 0.0, recovery.rtt.smoothed)
+            if run is None:
+                control.ran_dry()
                 break
-            message, index = item
-            number = recovery.take_number()
+            sent = self._add_run(path, path.remote, run, out, now)
+            control.on_sent(now, sent, recovery.in_flight)
+            budget -= sent
+        if queue.expired != expired_before:
+            self._stats.dropped["expired"] += queue.expired - expired_before
+        return complete
+
+    def _add_run(self, path: Path, remote: Address, run: Run, out: list[tuple[Address, bytes]], now: float) -> int:
+        """Append a run's datagrams and return their bytes."""
+        message = run.message
+        total = 0
+        for index in range(run.first, run.first + run.symbols):
+            number = path.recovery.take_number()
             datagram = b"".join(
                 (
                     self._header(path, number),
@@ -95,13 +108,12 @@ class DatagramBuilder:
                     message.symbol_data(index),
                 )
             )
-            recovery.on_sent(number, now, len(datagram), fragment=item)
-            path.waits_for_answer(now)
-            out.append((path.remote, datagram))
-            stats.datagrams["sent", "data"] += 1
-        if path.queue.expired != expired_before:
-            stats.dropped["expired"] += path.queue.expired - expired_before
-        return complete
+            path.recovery.on_sent(number, now, len(datagram), fragment=(message, index))
+            out.append((remote, datagram))
+            total += len(datagram)
+        path.waits_for_answer(now)
+        self._stats.datagrams["sent", "data"] += run.symbols
+        return total
 
     def _add_control(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
         pending = path.pending

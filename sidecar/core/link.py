@@ -270,13 +270,15 @@ class Link:
                 message, index = datagram.fragment
                 message.acked[index] = 1
         path.mtu.on_delivered(max(datagram.size for datagram in newly))
-        path.window.on_acked(newly, recovery.acked_bytes, recovery.rtt, now)
+        if recovery.sample is not None:
+            path.control.on_acked(recovery.sample, recovery.rtt, now)
         path.note_rtt()
         if path.made_progress(now):
             self._path_up(path, now)
-        self._lost(path, recovery.detect_lost(now), now)
+        self._detect_lost(path, now)
 
     def _path_up(self, path: Path, now: float) -> None:
+        path.control.on_path_up(now)
         self._report_measured(path)  # before its first request, so that its round-trip time counts in the choice
         self._events.append(PathChanged(path.id, PathState.UP, "answers"))
         self._mtu.search(path, now)
@@ -322,8 +324,9 @@ class Link:
     def _path_timer(self, path: Path, now: float) -> None:
         recovery = path.recovery
         if recovery.loss_timer is not None and recovery.loss_timer <= now:
-            self._lost(path, recovery.detect_lost(now), now)
+            self._detect_lost(path, now)
         elif recovery.pto_timer is not None and recovery.pto_timer <= now:
+            path.control.on_probe_timeout(now)
             self._lost(path, recovery.on_probe_timeout(now), now, timed_out=True)
         state = path.check_silence(now)
         if state is not None:
@@ -332,9 +335,18 @@ class Link:
             else:
                 self._events.append(PathChanged(path.id, state, "silent"))
 
+    def _detect_lost(self, path: Path, now: float) -> None:
+        recovery = path.recovery
+        lost = recovery.detect_lost(now)
+        if lost:
+            size = sum(datagram.size for datagram in lost)
+            path.control.on_lost(size, lost[-1].at, recovery.in_flight, now)
+            self._lost(path, lost, now)
+
     def _take_down(self, path: Path, reason: str) -> None:
         """Hand back what the path still carried, then say that it is down."""
         path.go_down()
+        path.control.on_path_down()
         self._events.append(PathChanged(path.id, PathState.DOWN, reason))
         self._report_lost(path, path.recovery.give_up_all())
         for message, indices in path.queue.clear():
@@ -452,5 +464,6 @@ class Link:
             path.received.ack_at,
             recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
             path.silence_timer,
+            path.control.next_release(recovery.in_flight) if len(path.queue) else None,
         )
         self._timers.arm(path.id, min((timer for timer in timers if timer is not None), default=None))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.pacing import SendQueue, Window
+from sidecar.core.congestion import CongestionController
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
 from sidecar.core.received import ReceivedPackets
 from sidecar.core.recovery import Recovery
 from sidecar.core.rtt import RttEstimator
+from sidecar.core.send_queue import SendQueue
 
 if TYPE_CHECKING:
     import random
@@ -46,6 +47,7 @@ class Path:
         "_waiting_since",
         "bytes_sent",
         "candidates",
+        "control",
         "id",
         "largest_received",
         "mtu",
@@ -61,7 +63,6 @@ class Path:
         "rtts",
         "session",
         "state",
-        "window",
     )
 
     def __init__(
@@ -76,7 +77,7 @@ class Path:
         self.state = PathState.DOWN
         self.recovery = Recovery(first_number)
         self.received = ReceivedPackets()
-        self.window = Window()
+        self.control = CongestionController()
         self.mtu = PathMtu()
         self.queue = SendQueue()
         self.pending: list[bytes] = []
@@ -144,7 +145,7 @@ class Path:
     def start_afresh(self, now: float) -> None:
         """The way to the peer changed: nothing measured on the old one holds (RFC 9000 section 9.4)."""
         self.recovery.rtt = RttEstimator()
-        self.window = Window()
+        self.control = CongestionController()
         self._probes_out.clear()
         self._rebound = True
         self.probe_soon(now)

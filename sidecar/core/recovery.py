@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from sidecar.core.congestion import RateSample
 from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.rtt import RttEstimator
 
@@ -44,6 +45,7 @@ class Recovery:
         "largest_acked",
         "last_eliciting_at",
         "rtt",
+        "sample",
         "sent",
         "total_lost",
         "total_sent",
@@ -52,6 +54,8 @@ class Recovery:
     def __init__(self, first_number: int) -> None:
         self.rtt = RttEstimator()
         self.sent: dict[int, Sent] = {}
+        self.sample: RateSample | None = None
+        """What the last acknowledgement says of the path's rate; None when it acknowledged no fragment."""
         self.in_flight = 0
         self.acked_bytes = 0
         self.largest_acked = first_number - 1
@@ -106,6 +110,12 @@ class Recovery:
                     self.in_flight -= datagram.size
                     self.acked_bytes += datagram.size
                     newly.append(datagram)
+        self.sample = None
+        carried = [datagram for datagram in newly if datagram.fragment is not None]
+        if carried:
+            sent_at = max(datagram.at for datagram in carried)
+            size = sum(datagram.size for datagram in carried)
+            self.sample = RateSample(size, sent_at, now - sent_at if newest is not None else 0.0, self.in_flight)
         if newest is not None:
             self.rtt.sample(now - newest.at, now, ack.delay_s)
         if newly:

@@ -149,8 +149,8 @@ class OurFlow(Flow):
             self.transmit()
             control.on_sent(net.now, SIZE, self.in_flight)
             budget -= SIZE
-        release = control.next_release(net.now, self.in_flight)
-        if release is not None and not net.now < self._timer <= release:
+        release = control.next_release(self.in_flight)
+        if release is not None and release > net.now and not net.now < self._timer <= release:
             self._timer = release
             net.at(release, self.pump)
 

@@ -53,12 +53,14 @@ def message(
     number: int = 1,
     size: int = 3000,
     *,
+    priority: Priority = Priority.NORMAL,
     deadline: float = 10.0,
     expires: float = 20.0,
     over: PathId | None = None,
 ) -> OutboundMessage:
     data = random.Random(number).randbytes(size)
-    return OutboundMessage(number, over or path(), Encoded(b"", data), deadline=deadline, expires=expires)
+    content = Encoded(b"", data)
+    return OutboundMessage(number, over or path(), content, priority=priority, deadline=deadline, expires=expires)
 
 
 def request_id(number: int) -> RequestId:

@@ -1,0 +1,226 @@
+"""Symbols that wait for one path, and which of them leave next.
+
+Urgent before bulk: a message's priority comes first. Fresh before late: within a priority, those that can still make
+their deadline go first, earliest deadline first; those that can not go after them. So a backlog or an overload makes
+some messages miss, instead of each message make the next one late. No priority starves: while a lower one waits, it
+gets one symbol in SHARE.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from itertools import count
+from typing import TYPE_CHECKING, NamedTuple
+
+from sidecar.core.priority import Priority
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sidecar.core.outbound import OutboundMessage
+
+SHARE = 16
+"""A waiting lower priority gets one symbol for so many of the higher ones."""
+HASTE = 1.25
+"""A message that has not begun to leave is late when this many times its sending time does not fit any more: what is
+begun should also be finished."""
+PURGE_AT = 64
+"""Entries before the first look for messages that are over; then whenever their number has doubled."""
+MAX_RUN = 64
+"""Symbols in a run: the segments of one offload."""
+MAX_RUN_BYTES = 65_000
+"""Bytes in a run: the largest UDP payload, less a margin for other frames."""
+
+
+class Run(NamedTuple):
+    """Consecutive symbols of one message, to be sent one after the other."""
+
+    message: OutboundMessage
+    first: int
+    symbols: int
+
+
+class _Entry:
+    """One message's turn on one path."""
+
+    __slots__ = ("again", "message", "next")
+
+    def __init__(self, message: OutboundMessage) -> None:
+        self.message = message
+        self.next = 0
+        self.again: deque[int] = deque()
+        """Symbols to be sent once more."""
+
+    def take(self, most: int) -> tuple[int, int] | None:
+        """Remove and return the next consecutive symbols as (first, count), `most` of them; None when none is left."""
+        needs = self.message.needs
+        again = self.again
+        while again:
+            first = again.popleft()
+            if needs(first):
+                end = first + 1
+                while again and again[0] == end and end - first < most and needs(end):
+                    again.popleft()
+                    end += 1
+                return first, end - first
+        last = self.message.symbols
+        first = self.next
+        while first < last and not needs(first):
+            first += 1
+        end = first
+        limit = min(last, first + most)
+        while end < limit and needs(end):
+            end += 1
+        self.next = end
+        return (first, end - first) if end > first else None
+
+    def remaining(self) -> tuple[int, ...]:
+        return tuple(filter(self.message.needs, (*self.again, *range(self.next, self.message.symbols))))
+
+    def is_hopeless(self, now: float, pace: float, round_trip_s: float) -> bool:
+        """Whether its last symbol can not be answered before the deadline at this pace (bytes a second; 0: unknown)."""
+        message = self.message
+        if not pace:
+            return message.deadline <= now
+        begun = self.next > 0
+        sending_s = (len(self.again) + message.symbols - self.next) * message.symbol / pace
+        return message.deadline <= now + sending_s * (1.0 if begun else HASTE) + round_trip_s
+
+
+class _Class:
+    """Messages of one priority: those that can make their deadline, and the others."""
+
+    __slots__ = ("fresh", "late", "passed_over")
+
+    def __init__(self) -> None:
+        self.fresh: list[tuple[float, int, _Entry]] = []
+        self.late: list[tuple[float, int, _Entry]] = []
+        self.passed_over = 0
+        """Symbols of higher priorities that left while something waited here."""
+
+    def heaps(self) -> tuple[list[tuple[float, int, _Entry]], list[tuple[float, int, _Entry]]]:
+        return self.fresh, self.late
+
+
+class SendQueue:
+    """Symbols that wait for one path. How many messages there are at most is the outbox's business."""
+
+    __slots__ = ("_classes", "_entries", "_order", "_purge_at", "expired")
+
+    def __init__(self) -> None:
+        self._classes = tuple(_Class() for _ in Priority)
+        self._entries: dict[int, _Entry] = {}
+        self._order = count()
+        self._purge_at = PURGE_AT
+        self.expired = 0
+        """Messages dropped because their time was over."""
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def add(self, message: OutboundMessage) -> None:
+        """Queue all symbols of a message."""
+        if message.number not in self._entries:
+            self._insert(_Entry(message))
+
+    def resend(self, message: OutboundMessage, indices: Iterable[int]) -> None:
+        """Queue these symbols of a message again, before its others."""
+        entry = self._entries.get(message.number)
+        if entry is None:
+            entry = _Entry(message)
+            entry.next = message.symbols
+            self._insert(entry)
+        entry.again.extend(indices)
+
+    def _insert(self, entry: _Entry) -> None:
+        message = entry.message
+        if len(self._entries) >= self._purge_at:
+            self._purge()
+        self._entries[message.number] = entry
+        mine = self._classes[message.priority]
+        if not mine.fresh and not mine.late:
+            mine.passed_over = 0
+        heapq.heappush(mine.fresh, (message.deadline, next(self._order), entry))
+
+    def _purge(self) -> None:
+        """Let go of what is over but has not come up yet, so that it holds no memory."""
+        for each in self._classes:
+            for heap in each.heaps():
+                heap[:] = [item for item in heap if not item[2].message.over]
+                heapq.heapify(heap)
+        self._entries = {number: entry for number, entry in self._entries.items() if not entry.message.over}
+        self._purge_at = max(PURGE_AT, 2 * len(self._entries))
+
+    def take(self, now: float, budget: int, pace: float = 0.0, round_trip_s: float = 0.0) -> Run | None:
+        """Remove and return what leaves next, of at most about `budget` bytes but at least one symbol.
+
+        Messages that are over or expired are dropped on the way. `pace` (bytes a second, 0 when unknown) and
+        `round_trip_s` tell which can still make their deadline.
+        """
+        waiting = [each for each in self._classes if self._head(each, now, pace, round_trip_s) is not None]
+        while waiting:
+            chosen, most = waiting[0], MAX_RUN
+            for lower in reversed(waiting[1:]):
+                if lower.passed_over >= SHARE:
+                    chosen, most = lower, lower.passed_over // SHARE
+                    break
+            run = self._take(chosen, now, budget, most, pace, round_trip_s)
+            if run is None:
+                waiting.remove(chosen)
+                continue
+            self._note_turn(waiting, chosen, run.symbols)
+            return run
+        return None
+
+    def _note_turn(self, waiting: list[_Class], chosen: _Class, symbols: int) -> None:
+        higher = True
+        for each in waiting:
+            if each is chosen:
+                each.passed_over = max(0, each.passed_over - SHARE * symbols) if each is not waiting[0] else 0
+                higher = False
+            elif not higher:
+                each.passed_over = min(each.passed_over + symbols, SHARE * MAX_RUN)
+
+    def _take(self, chosen: _Class, now: float, budget: int, most: int, pace: float, round_trip_s: float) -> Run | None:
+        while (heap := self._head(chosen, now, pace, round_trip_s)) is not None:
+            entry = heap[0][2]
+            message = entry.message
+            size = message.symbol
+            run = entry.take(max(1, min(most, budget // size, MAX_RUN_BYTES // size)))
+            if run is not None:
+                return Run(message, *run)
+            self._drop(heap)
+        return None
+
+    def _head(
+        self, each: _Class, now: float, pace: float, round_trip_s: float
+    ) -> list[tuple[float, int, _Entry]] | None:
+        """Return the heap whose head goes next; heads that are over go, those that became late change places."""
+        for heap in each.heaps():
+            while heap:
+                entry = heap[0][2]
+                message = entry.message
+                if message.over:
+                    self._drop(heap)
+                elif message.expires <= now:
+                    self.expired += 1
+                    self._drop(heap)
+                elif heap is each.fresh and entry.is_hopeless(now, pace, round_trip_s):
+                    heapq.heappush(each.late, heapq.heappop(heap))
+                else:
+                    return heap
+        return None
+
+    def _drop(self, heap: list[tuple[float, int, _Entry]]) -> None:
+        del self._entries[heapq.heappop(heap)[2].message.number]
+
+    def clear(self) -> list[tuple[OutboundMessage, tuple[int, ...]]]:
+        """Empty the queue and return each message with its symbols that did not leave."""
+        left = [(entry.message, entry.remaining()) for entry in self._entries.values()]
+        for each in self._classes:
+            each.fresh.clear()
+            each.late.clear()
+        self._entries.clear()
+        self._purge_at = PURGE_AT
+        return [(message, indices) for message, indices in left if indices]
