@@ -116,16 +116,16 @@ class InterfaceThread:
         waiter = self._waiter
         try:
             while not self._stopping:
-                waiter.wait(self._due(), for_room=bool(self._unsent))
-                self._guarded_turn()
-            self._guarded_turn()
+                readable = waiter.wait(self._due(), for_room=bool(self._unsent))
+                self._guarded_turn(readable=readable)
+            self._guarded_turn(readable=False)
         finally:
             waiter.close()
             self._socket.close()
 
-    def _guarded_turn(self) -> None:
+    def _guarded_turn(self, *, readable: bool) -> None:
         try:
-            self._turn()
+            self._turn(readable=readable)
         except Exception:
             # One interface's bug must not silence the interface for good, nor hide.
             log.exception("%s: internal error; the interface goes on", self.interface)
@@ -143,8 +143,9 @@ class InterfaceThread:
             return max(due, self._clock() + BLOCKED_TIMER_S)
         return 0.0 if self._more else due
 
-    def _turn(self) -> None:
-        self._receive()
+    def _turn(self, *, readable: bool) -> None:
+        if readable:
+            self._receive()
         self._execute()
         self.link.handle_timer(self._clock())
         self._exchange()

@@ -54,28 +54,32 @@ class Waiter:
         """The thread is about to look at what others left for it: their calls until now need not end a wait."""
         self._called = False
 
-    def wait(self, due: float, *, for_room: bool = False) -> None:
+    def wait(self, due: float, *, for_room: bool = False) -> bool:
         """Wait until the socket is readable, `due` (s) has come, or somebody wakes us; a little early at times.
 
-        With `for_room` also until the socket takes datagrams again.
+        With `for_room` also until the socket takes datagrams again. Returns whether there is anything to receive.
         """
         if for_room != self._for_room:
             self._for_room = for_room
             events = select.EPOLLIN | select.EPOLLOUT if for_room else select.EPOLLIN
             self._poller.modify(self._socket_fd, events)
         if due <= self._clock():
-            self._poll(0.0)
-            return
+            return self._poll(0.0)
         self._timer.arm_at_latest(due)
         self._asleep = True
-        self._poll(0.0 if self._called else None)
+        readable = self._poll(0.0 if self._called else None)
         self._asleep = False
+        return readable
 
     def close(self) -> None:
         """Wait no more; `wake` stays harmless."""
         self._poller.close()
 
-    def _poll(self, timeout_s: float | None) -> None:
-        for fd, _ in self._poller.poll(timeout_s):
+    def _poll(self, timeout_s: float | None) -> bool:
+        readable = False
+        for fd, events in self._poller.poll(timeout_s):
             if fd == self._timer.fd:
                 self._timer.due = NEVER
+            elif fd == self._socket_fd:
+                readable = events != select.EPOLLOUT  # an error has to be taken from the socket, too
+        return readable

@@ -58,6 +58,7 @@ def test_a_datagram_ends_the_wait(waiter: Waiter, ends: tuple[socket.socket, soc
     sleeper.until_asleep()
     ends[1].send(b"x")
     assert sleeper.ended()
+    assert waiter.wait(time.monotonic() - 1.0)
 
 
 def test_a_time_ends_the_wait_again_and_again(waiter: Waiter) -> None:
@@ -80,7 +81,7 @@ def test_a_sleeping_thread_is_woken_once(waiter: Waiter) -> None:
 
 def test_a_thread_awake_costs_no_wake_up_and_does_not_sleep_over_the_call(waiter: Waiter) -> None:
     waiter.wake()
-    waiter.wait(time.monotonic() + FAR_S)
+    assert not waiter.wait(time.monotonic() + FAR_S)
     assert waiter.wakes == 0
 
 
@@ -123,4 +124,6 @@ def test_room_in_the_socket_ends_the_wait(waiter: Waiter, ends: tuple[socket.soc
     with contextlib.suppress(BlockingIOError):
         while True:
             far.recv(2000)
-    waiter.wait(time.monotonic() + FAR_S, for_room=True)
+    assert not waiter.wait(time.monotonic() + FAR_S, for_room=True)
+    far.send(b"x")
+    assert waiter.wait(time.monotonic() + FAR_S, for_room=True)
