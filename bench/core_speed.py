@@ -13,6 +13,7 @@ import random
 import time
 from collections import defaultdict
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from protos.model import (
     Candidate,
@@ -35,6 +36,9 @@ from sidecar.core.frame import BASE_SYMBOL_BYTES, symbol_count
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 SERVICE = ServiceName("/bench")
 TYPE = "bench/srv/Bytes"
@@ -80,11 +84,11 @@ class Side:
                     raise SystemExit(f"a request failed: {application_event.reason}")
             for _, command in engine.take_commands():
                 link.execute(command, now)
-            datagrams = link.datagrams_to_send(now)
-            if not datagrams:
+            batches = link.batches_to_send(now)
+            if not batches:
                 self.datagrams += len(out)
                 return out
-            out += [data for _, data in datagrams]
+            out += [bytes(datagram) for batch in batches for datagram in batch.cut()]
 
 
 class Pair:
@@ -119,10 +123,10 @@ class Pair:
             self.now = max(self.now, min(min(s.link.next_timer(), s.engine.next_timer()) for s in sides))
         for receiver, flight in flights:
             source = self.cloud.address if receiver is self.robot else self.robot.address
-            for position, data in enumerate(flight, 1):
-                receiver.link.receive_datagram(data, source, self.now)
-                if position % self.batch == 0:
-                    self.early[receiver.name] += receiver.turn(self.now)
+            for start in range(0, len(flight), self.batch):
+                for data, segment in joined(flight[start : start + self.batch]):
+                    receiver.link.receive_batch(memoryview(data), segment, source, self.now)
+                self.early[receiver.name] += receiver.turn(self.now)
         for side in (self.robot, self.cloud):
             side.engine.handle_timer(self.now)
             side.link.handle_timer(self.now)
@@ -135,6 +139,18 @@ class Pair:
             self.robot.engine.submit(RequestId(self.sent.to_bytes(16, "big")), SERVICE, payload, self.now)
         while self.robot.answered < wanted:
             self.step()
+
+
+def joined(datagrams: list[bytes]) -> Iterator[tuple[bytes, int]]:
+    """Lay datagrams of one length side by side, as the kernel does; each with that length."""
+    run: list[bytes] = []
+    for datagram in datagrams:
+        if run and (len(datagram) > len(run[0]) or len(run[-1]) < len(run[0])):
+            yield b"".join(run), len(run[0])
+            run = []
+        run.append(datagram)
+    if run:
+        yield b"".join(run), len(run[0])
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,11 @@ class Batch(NamedTuple):
         """How many datagrams they are."""
         return -(-len(self.data) // self.segment)
 
+    def cut(self) -> list[memoryview]:
+        """The datagrams one by one."""
+        view = memoryview(self.data)
+        return [view[start : start + self.segment] for start in range(0, len(view), self.segment)]
+
 
 class DatagramBuilder:
     """Turns the state of a link's paths into datagrams, and notes in it what left."""
@@ -59,7 +64,7 @@ class DatagramBuilder:
         self._stats = stats
         self._rng = rng
 
-    def build(self, path: Path, out: list[tuple[Address, bytes]], now: float, *, probing: bool) -> bool:
+    def build(self, path: Path, out: list[Batch], now: float, *, probing: bool) -> bool:
         """Append what the path may send now; False when BURST_DATAGRAMS cut it short. `probing` allows probes."""
         before = len(out)
         if probing and path.probe_at is not None and path.probe_at <= now:
@@ -68,12 +73,12 @@ class DatagramBuilder:
             self._add_mtu_probe(path, out, now)
         self._add_control(path, out, now)
         complete = self._add_fragments(path, out, now)
-        sent = sum(len(datagram) for _, datagram in out[before:])
+        sent = sum(len(batch.data) for batch in out[before:])
         path.bytes_sent += sent
         self._stats.bytes["sent"] += sent
         return complete
 
-    def _add_fragments(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> bool:
+    def _add_fragments(self, path: Path, out: list[Batch], now: float) -> bool:
         if path.state is PathState.DOWN or path.remote is None:
             return True
         recovery, control, queue = path.recovery, path.control, path.queue
@@ -95,7 +100,7 @@ class DatagramBuilder:
             self._stats.dropped["expired"] += queue.expired - expired_before
         return complete
 
-    def _add_run(self, path: Path, remote: Address, run: Run, out: list[tuple[Address, bytes]], now: float) -> int:
+    def _add_run(self, path: Path, remote: Address, run: Run, out: list[Batch], now: float) -> int:
         """Append a run's datagrams and return their bytes."""
         message = run.message
         total = 0
@@ -109,13 +114,13 @@ class DatagramBuilder:
                 )
             )
             path.recovery.on_sent(number, now, len(datagram), fragment=(message, index))
-            out.append((remote, datagram))
+            out.append(Batch(remote, datagram, len(datagram)))
             total += len(datagram)
         path.waits_for_answer(now)
         self._stats.datagrams["sent", "data"] += run.symbols
         return total
 
-    def _add_control(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+    def _add_control(self, path: Path, out: list[Batch], now: float) -> None:
         pending = path.pending
         if path.received.ack_at is not None and (pending or path.received.ack_at <= now or len(path.queue)):
             ranges, delay = path.received.take_ack(now)
@@ -130,26 +135,27 @@ class DatagramBuilder:
             if finished is not None:
                 path.recovery.on_sent(number, now, len(datagram), finished=finished)
                 path.waits_for_answer(now)
-            out.append((path.remote, datagram))
+            out.append(Batch(path.remote, datagram, len(datagram)))
             self._stats.datagrams["sent", "control"] += 1
 
-    def _add_probe(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+    def _add_probe(self, path: Path, out: list[Batch], now: float) -> None:
         probe = frame.encode_probe(frame.Probe(path.next_probe(now, self._rng)))
         if path.state is PathState.DOWN:
             me = self._identity
             probe = frame.encode_hello(frame.Hello(me.token, me.incarnation)) + probe
         for address in path.destinations():
-            out.append((address, self._header(path, path.recovery.take_number()) + probe))
+            datagram = self._header(path, path.recovery.take_number()) + probe
+            out.append(Batch(address, datagram, len(datagram)))
             self._stats.datagrams["sent", "control"] += 1
 
-    def _add_mtu_probe(self, path: Path, out: list[tuple[Address, bytes]], now: float) -> None:
+    def _add_mtu_probe(self, path: Path, out: list[Batch], now: float) -> None:
         """Add a padded probe. Nobody waits for its acknowledgement, and its loss says nothing of the rest."""
         probe_id = path.take_probe_id()
         size = path.mtu.next_probe(probe_id, now, MTU_PROBE_TIMEOUTS * path.recovery.rtt.probe_timeout(0.0))
         if size is None or path.remote is None:
             return
         head = self._header(path, path.recovery.take_number()) + frame.encode_probe(frame.Probe(probe_id))
-        out.append((path.remote, head + frame.encode_padding(size - len(head))))
+        out.append(Batch(path.remote, head + frame.encode_padding(size - len(head)), size))
         self._stats.datagrams["sent", "control"] += 1
 
     def _header(self, path: Path, number: int) -> bytes:

@@ -22,8 +22,8 @@ from sidecar.core.events import (
 )
 from sidecar.core.fragments import Progress, Reassembler
 from sidecar.core.link_events import (
-    FragmentReceived,
     FragmentsLost,
+    FragmentsReceived,
     LinkCommand,
     LinkEvent,
     MessageFinished,
@@ -234,8 +234,8 @@ class Engine:
     def on_link_event(self, event: LinkEvent, now: float) -> None:
         """Take what a link saw."""
         match event:
-            case FragmentReceived():
-                self._on_fragment(event, now)
+            case FragmentsReceived():
+                self._on_fragments(event, now)
             case MessageFinished(peer, number):
                 self._outbox.on_finished(peer, number)
             case FragmentsLost():
@@ -259,20 +259,24 @@ class Engine:
                 self._on_peer_closed(peer, now)
         self.stats.in_flight = self._requests.unanswered + self._executions.running
 
-    def _on_fragment(self, event: FragmentReceived, now: float) -> None:
+    def _on_fragments(self, event: FragmentsReceived, now: float) -> None:
         path = event.path
         if self.peers.session(path.peer) != event.session:
-            self.stats.dropped["fragment_of_old_session"] += 1
+            self.stats.dropped["fragment_of_old_session"] += len(event.fragments)
             return
         reassembler = self._reassemblers.get(path.peer)
         if reassembler is None:
             reassembler = self._reassemblers[path.peer] = Reassembler(path.peer, self.stats.dropped)
-        whole = reassembler.add(event.fragment, now)
-        if isinstance(whole, Progress):
-            if whole is Progress.ALREADY_FINISHED:
-                self._commands.append((path.interface, SendFinished(path, event.fragment.message)))
-            return
-        self._commands.append((path.interface, SendFinished(path, event.fragment.message)))
+        for fragment in event.fragments:
+            whole = reassembler.add(fragment, now)
+            if isinstance(whole, Progress):
+                if whole is Progress.ALREADY_FINISHED:
+                    self._commands.append((path.interface, SendFinished(path, fragment.message)))
+            else:
+                self._commands.append((path.interface, SendFinished(path, fragment.message)))
+                self._on_message(path, whole, now)
+
+    def _on_message(self, path: PathId, whole: memoryview, now: float) -> None:
         try:
             message = decode_message(whole)
         except DecodeError:

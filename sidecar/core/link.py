@@ -1,6 +1,6 @@
 """One interface's share of the data plane: datagrams in and out, all its paths. Owned by one thread; sans-IO.
 
-The driver feeds `receive_datagram`, `execute` and `handle_timer`, then drains `next_event` and `datagrams_to_send`.
+The driver feeds `receive_batch`, `execute` and `handle_timer`, then drains `next_event` and `batches_to_send`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from sidecar.core import frame
 from sidecar.core.datagrams import BURST_DATAGRAMS, Batch, DatagramBuilder
 from sidecar.core.frame import HEADER_BYTES, Header
 from sidecar.core.link_events import (
-    FragmentReceived,
     FragmentsLost,
+    FragmentsReceived,
     LinkCommand,
     LinkEvent,
     MessageFinished,
@@ -70,6 +70,8 @@ class Link:
         self._carrier = True
         self._closing = False
         self._events: deque[LinkEvent] = deque()
+        self._fragments: FragmentsReceived | None = None
+        """Those of the batch that is being received."""
         self._mtu = LinkMtu(self._events)
         self._dirty: dict[PathId, Path] = {}
         self._timers: Timers[PathId] = Timers()
@@ -78,15 +80,23 @@ class Link:
 
     # -- what the driver calls ------------------------------------------------------------------------------------
 
-    def receive_datagram(self, data: bytes | memoryview, source: Address, now: float) -> None:
-        """Take one datagram from the socket. Fragments in the events view `data`."""
+    def receive_batch(self, data: memoryview, segment: int, source: Address, now: float) -> None:
+        """Take datagrams that came from `source` back to back, of `segment` bytes each; the last may be shorter.
+
+        Fragments in the events view `data`: it must keep until the engine has had all events.
+        """
+        self._fragments = None
+        for start in range(0, len(data) or 1, segment):  # an empty datagram is one, too
+            self._receive_datagram(data[start : start + segment], source, now)
+
+    def _receive_datagram(self, data: memoryview, source: Address, now: float) -> None:
         stats = self.stats
         stats.bytes["received"] += len(data)
         try:
             header = frame.decode_header(data)
             peer = self._by_session.get(header.session)
             if peer is None:
-                self._receive_from_stranger(header, memoryview(data)[HEADER_BYTES:])
+                self._receive_from_stranger(header, data[HEADER_BYTES:])
                 return
             if header.receiver_interface != self.identity.interface_id:
                 stats.dropped["wrong_interface"] += 1
@@ -95,7 +105,7 @@ class Link:
             if path is None:
                 stats.dropped["unknown_path"] += 1
                 return
-            frames = frame.decode_frames(memoryview(data)[HEADER_BYTES:])
+            frames = frame.decode_frames(data[HEADER_BYTES:])
         except frame.VersionError:
             stats.dropped["version"] += 1
             return
@@ -113,11 +123,6 @@ class Link:
             path.hasten_probe(now)
         self._dirty[path.id] = path
         self._receive_frames(path, frames, now)
-
-    def receive_batch(self, data: memoryview, segment: int, source: Address, now: float) -> None:
-        """Take datagrams of one sender, `segment` bytes each, the last may be shorter. Events view `data`."""
-        for start in range(0, len(data), segment):
-            self.receive_datagram(data[start : start + segment], source, now)
 
     def execute(self, command: LinkCommand, now: float) -> None:
         """Carry out what the engine asks."""
@@ -190,12 +195,8 @@ class Link:
         return any(path.remote == address and path.state is not PathState.DOWN for path in self._paths.values())
 
     def batches_to_send(self, now: float) -> list[Batch]:
-        """Build what may leave now; call again until nothing comes."""
-        return [Batch(address, data, len(data)) for address, data in self.datagrams_to_send(now)]
-
-    def datagrams_to_send(self, now: float) -> list[tuple[Address, bytes]]:
         """Build what may leave now, at most about BURST_DATAGRAMS; call again until nothing comes."""
-        out: list[tuple[Address, bytes]] = []
+        out: list[Batch] = []
         probing = self._may_probe
         for path in list(self._dirty.values()):
             if self._builder.build(path, out, now, probing=probing):
@@ -227,7 +228,7 @@ class Link:
                 case frame.Fragment():
                     eliciting = True
                     kind = "data"
-                    events.append(FragmentReceived(path.id, path.session, item))
+                    self._add_fragment(path, item)
                 case frame.AckFrame():
                     self._receive_ack(path, item, now)
                 case frame.Probe(probe_id) if self._closing:
@@ -256,6 +257,13 @@ class Link:
         self.stats.datagrams["received", kind] += 1
         if eliciting:
             path.received.owe_ack(now)
+
+    def _add_fragment(self, path: Path, fragment: frame.Fragment) -> None:
+        event = self._fragments
+        if event is None or event.path is not path.id or event.session != path.session:
+            event = self._fragments = FragmentsReceived(path.id, path.session, [])
+            self._events.append(event)
+        event.fragments.append(fragment)
 
     def _receive_ack(self, path: Path, ack: frame.AckFrame, now: float) -> None:
         recovery = path.recovery

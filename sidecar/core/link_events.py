@@ -90,13 +90,13 @@ class SendClose:
 LinkCommand = SetPeers | SetReady | SetCarrier | Rebind | SetMtu | Send | Resend | SendFinished | SendClose
 
 
-class FragmentReceived(NamedTuple):
-    """A symbol came; its data views the received datagram."""
+class FragmentsReceived(NamedTuple):
+    """Symbols came in one batch; their data views the received datagrams."""
 
     path: PathId
     session: SessionId
     """The peer's: message numbers mean nothing beyond it."""
-    fragment: Fragment
+    fragments: list[Fragment]
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +163,7 @@ class PeerClosed:
 
 
 LinkEvent = (
-    FragmentReceived
+    FragmentsReceived
     | FragmentsLost
     | MessageFinished
     | PathChanged

@@ -103,7 +103,8 @@ class Rogue:
             for interface, header in self.numbers():
                 datagram = frame.encode_header(header) + ATTACKS[kind](self.rng)
                 target = self.victim.links[self.victim.interfaces[header.receiver_interface]]
-                target.receive_datagram(datagram, self.node.address(interface), self.mesh.now)
+                source = self.node.address(interface)
+                target.receive_batch(memoryview(datagram), len(datagram), source, self.mesh.now)
         self.mesh.pump(self.victim)
         taken = sum(link.stats.datagrams["received", "data"] for link in self.victim.links.values())
         assert taken >= count or kind != "requests", "the attack itself went wrong"

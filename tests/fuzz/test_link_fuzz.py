@@ -13,7 +13,6 @@ from sidecar.core.link_events import Send
 from sidecar.core.path_id import PathId
 from tests.unit.sidecar.core.builders import (
     OUR_TOKEN,
-    PEER_ADDRESS,
     PEER_SESSION,
     PEER_TOKEN,
     WLAN,
@@ -84,7 +83,7 @@ def test_whatever_comes_the_link_stands_and_answers_honest_probes(
     for number, (data, pause, send) in enumerate(steps):
         if send:
             bench.execute(Send(path, message(number, expires=1e9)))
-        bench.link.receive_datagram(data, PEER_ADDRESS, bench.now)
+        bench.receive_datagram(data)
         bench.events()
         bench.sent()
         bench.wait(pause)
@@ -95,7 +94,7 @@ def test_whatever_comes_the_link_stands_and_answers_honest_probes(
     assert all(not path.recovery.sent for path in bench.link._paths.values()), "everything is acknowledged or lost"
     bench.know(session=SessionId(77), incarnation=2)
     probe = frame.encode_probe(Probe(4242))
-    bench.link.receive_datagram(bench.datagram(probe, session=SessionId(77)), PEER_ADDRESS, bench.now)
+    bench.receive_datagram(bench.datagram(probe, session=SessionId(77)))
     assert frame.encode_probe_reply(ProbeReply(4242)) in b"".join(bench.sent())
 
 
@@ -111,6 +110,6 @@ def test_real_datagrams_mangled_on_the_way(plan: list[tuple[list[tuple[int, int]
             body = bytearray(bench.datagram(sent[frame.HEADER_BYTES :]))
             for position, value in changes:
                 body[position % len(body)] = value
-            bench.link.receive_datagram(bytes(body), PEER_ADDRESS, bench.now)
+            bench.receive_datagram(bytes(body))
         bench.events()
         assert_bounded(bench)

@@ -226,9 +226,10 @@ class Mesh:
             if not busy:
                 break
         for interface, link in node.links.items():
-            while datagrams := link.datagrams_to_send(now):
-                for destination, data in datagrams:
-                    self._carry(node.address(interface), destination, data)
+            while batches := link.batches_to_send(now):
+                for batch in batches:
+                    for datagram in batch.cut():
+                        self._carry(node.address(interface), batch.address, bytes(datagram))
             while (event := link.next_event()) is not None:
                 engine.on_link_event(event, now)
 
@@ -270,7 +271,7 @@ class Mesh:
         node = self.nodes.get(name)
         if node is None or not node.alive:
             return
-        node.links[InterfaceName(interface)].receive_datagram(data, source, self.now)
+        node.links[InterfaceName(interface)].receive_batch(memoryview(data), len(data), source, self.now)
         self.pump(node)
 
 

@@ -6,6 +6,7 @@ import random
 from dataclasses import dataclass, field
 
 from protos.model import (
+    Address,
     Candidate,
     CandidateKind,
     InterfaceId,
@@ -123,7 +124,10 @@ class Bench:
         return encode_header(Header(InterfaceId(0), InterfaceId(3), session, number)) + b"".join(frames)
 
     def receive(self, *frames: bytes, number: int | None = None) -> None:
-        self.link.receive_datagram(self.datagram(*frames, number=number), PEER_ADDRESS, self.now)
+        self.receive_datagram(self.datagram(*frames, number=number))
+
+    def receive_datagram(self, data: bytes, source: Address = PEER_ADDRESS) -> None:
+        self.link.receive_batch(memoryview(data), len(data) or 1, source, self.now)
 
     def execute(self, command: LinkCommand) -> None:
         self.link.execute(command, self.now)
@@ -131,8 +135,8 @@ class Bench:
     def sent(self) -> list[bytes]:
         """What the link sends now."""
         out: list[bytes] = []
-        while datagrams := self.link.datagrams_to_send(self.now):
-            out += [data for _, data in datagrams]
+        while batches := self.link.batches_to_send(self.now):
+            out += [bytes(datagram) for batch in batches for datagram in batch.cut()]
         return out
 
     def events(self) -> list[LinkEvent]:

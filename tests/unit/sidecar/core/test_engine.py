@@ -29,7 +29,7 @@ from sidecar.core.events import (
 )
 from sidecar.core.frame import BASE_SYMBOL_BYTES, Fragment
 from sidecar.core.link_events import (
-    FragmentReceived,
+    FragmentsReceived,
     LinkCommand,
     PathChanged,
     PathMeasured,
@@ -90,7 +90,7 @@ class Sidecar:
         assert len(data) <= BASE_SYMBOL_BYTES
         self.number += 1
         fragment = Fragment(self.number, len(data), BASE_SYMBOL_BYTES, 0, memoryview(data))
-        self.engine.on_link_event(FragmentReceived(self.path, SessionId(session), fragment), now)
+        self.engine.on_link_event(FragmentsReceived(self.path, SessionId(session), [fragment]), now)
 
     def take(self) -> tuple[list[LinkCommand], list[ApplicationEvent]]:
         return [command for _, command in self.engine.take_commands()], self.engine.take_events()

@@ -6,8 +6,8 @@ from protos.model import InterfaceId, InterfaceName, NodeName, SessionId
 from sidecar.core import frame, pmtu
 from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Hello, Probe, ProbeReply
 from sidecar.core.link_events import (
-    FragmentReceived,
     FragmentsLost,
+    FragmentsReceived,
     LinkPeer,
     MessageFinished,
     PathChanged,
@@ -214,10 +214,10 @@ def test_a_link_opened_anew_goes_on_with_the_packet_numbers_of_the_one_before() 
 def test_the_peers_newest_address_is_followed() -> None:
     bench = up()
     moved = ("198.51.100.1", 5)
-    bench.link.receive_datagram(bench.datagram(frame.encode_probe(Probe(1)), number=50), moved, bench.now)
-    bench.link.receive_datagram(bench.datagram(frame.encode_probe(Probe(2)), number=40), PEER_ADDRESS, bench.now)
-    ((address, _),) = bench.link.datagrams_to_send(bench.now)
-    assert address == moved
+    bench.receive_datagram(bench.datagram(frame.encode_probe(Probe(1)), number=50), moved)
+    bench.receive_datagram(bench.datagram(frame.encode_probe(Probe(2)), number=40))
+    (batch,) = bench.link.batches_to_send(bench.now)
+    assert batch.address == moved
 
 
 # -- messages ---------------------------------------------------------------------------------------------------------
@@ -261,8 +261,8 @@ def test_a_received_fragment_is_handed_up_and_acknowledged() -> None:
     bench = up()
     bench.receive(fragment())
     (event,) = bench.events()
-    assert isinstance(event, FragmentReceived)
-    assert (event.path, event.session, event.fragment.message) == (PATH, PEER_SESSION, 1)
+    assert isinstance(event, FragmentsReceived)
+    assert (event.path, event.session, [item.message for item in event.fragments]) == (PATH, PEER_SESSION, [1])
     assert bench.sent() == [], "the acknowledgement waits for company"
     (ack,) = frames(bench.wait(MAX_ACK_DELAY_S))
     assert isinstance(ack, AckFrame)
@@ -318,7 +318,7 @@ BAD = {
 def test_bad_datagrams_are_counted_and_provoke_nothing(kind: str) -> None:
     datagram, reason = BAD[kind]
     bench = up()
-    bench.link.receive_datagram(datagram, ("203.0.113.9", 666), bench.now)
+    bench.receive_datagram(datagram, ("203.0.113.9", 666))
     assert bench.link.stats.dropped == {reason: 1}
     assert bench.events() == []
     assert bench.sent() == []
@@ -387,7 +387,7 @@ def test_owed_frames_are_capped() -> None:
 def test_a_known_peers_newer_start_is_reported() -> None:
     bench = up()
     hello = frame.encode_hello(Hello(PEER_TOKEN, 2)) + PROBE
-    bench.link.receive_datagram(bench.datagram(hello, session=OTHER_SESSION), PEER_ADDRESS, bench.now)
+    bench.receive_datagram(bench.datagram(hello, session=OTHER_SESSION))
     assert bench.events() == [PeerRestarted(A, OTHER_SESSION, 2)]
     assert bench.sent() == []
 
@@ -401,7 +401,7 @@ def test_a_restarted_peer_starts_afresh_and_our_numbers_go_on() -> None:
     assert PathChanged(PATH, PathState.DOWN, "peer left or restarted") in events
     assert FragmentsLost(PATH, outbound, (0, 1, 2)) in events
     assert numbers(bench.sent())[0] > before[-1]
-    bench.link.receive_datagram(bench.datagram(PROBE, number=0, session=OTHER_SESSION), PEER_ADDRESS, bench.now)
+    bench.receive_datagram(bench.datagram(PROBE, number=0, session=OTHER_SESSION))
     assert ProbeReply(1) in frames(bench.sent())
 
 
