@@ -22,7 +22,7 @@ help: ## this list
 	@echo 'options:'
 	@echo "  make test PYTEST_ARGS='tests/unit -k histogram'"
 	@echo "  make demo DEMO_ARGS='--help'"
-	@echo "  make bench BENCH_ARGS='--help'"
+	@echo "  make bench-dataplane BENCH_ARGS='--help'"
 
 setup: ## Debian packages, .venv, locked dependencies, example interfaces (the other targets run it)
 	@deploy/dev/setup.sh
@@ -48,7 +48,7 @@ interfaces: setup ## build examples/plr_demo_interfaces into .venv
 lock: setup ## lock dependencies anew from pyproject.toml (LOCK_ARGS=--upgrade for newer versions)
 	@deploy/dev/lock.sh $(LOCK_ARGS)
 
-bench: setup ## measure: scenarios over the network lab, reports into bench/results
+bench: setup ## every measurement, reports into bench/results
 	@$(PY) -m bench $(BENCH_ARGS)
 
 bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP, QUIC and zenoh (15 minutes, as root)

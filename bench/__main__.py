@@ -1,8 +1,7 @@
 """Measurements of the system, each beside its anchor from the same run.
 
 examples:
-  make bench                                   every measurement, reports into bench/results
-  make bench-dataplane                         the data plane against its targets, with a page of plots
+  make bench-dataplane                                     the data plane against its targets, with a page of plots
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
 """
 
@@ -11,7 +10,6 @@ from __future__ import annotations
 import argparse
 import sys
 
-from bench import calls
 from bench.dataplane import command as dataplane
 
 
@@ -21,10 +19,8 @@ def main() -> int:
         prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", metavar="MEASUREMENT")
-    calls.add_arguments(commands.add_parser("calls", help="proxied and direct service calls, the silent blackhole"))
     dataplane.add_arguments(commands.add_parser("dataplane", help="the data plane against its targets"))
-    options = parser.parse_args(sys.argv[1:] or ["dataplane"])
-    return dataplane.run(options) if options.command == "dataplane" else calls.run(options)
+    return dataplane.run(parser.parse_args(sys.argv[1:] or ["dataplane"]))
 
 
 if __name__ == "__main__":

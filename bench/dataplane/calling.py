@@ -6,7 +6,9 @@ are CLOCK_MONOTONIC, which all processes and network namespaces of one host shar
 
 from __future__ import annotations
 
+import math
 import os
+import resource
 import struct
 import threading
 import time
@@ -30,6 +32,8 @@ class Plan:
     rate_hz: float | None = None
     """Requests a second, open loop; None: closed loop, `at_once` in flight."""
     at_once: int = 1
+    seconds: float = math.inf
+    """No request leaves later than this after the first, however many are left."""
     grace_s: float = 5.0
     """How long the last answers are waited for."""
 
@@ -93,6 +97,8 @@ class Caller:
                 time.sleep(max(0.0, start + position / plan.rate_hz - time.monotonic()))
             elif not log.wait_until_missing(plan.at_once - 1, plan.grace_s):
                 break
+            if time.monotonic() - start > plan.seconds:
+                break
             number = self._next
             self._next += 1
             now = time.monotonic()
@@ -104,7 +110,6 @@ class Caller:
 
 
 def usage() -> dict[str, float]:
-    """Return processor seconds and resident bytes of this process."""
-    with open("/proc/self/statm") as statm:
-        pages = int(statm.read().split()[1])
-    return {"cpu_s": time.process_time(), "rss_bytes": pages * os.sysconf("SC_PAGE_SIZE")}
+    """Return this process's processor seconds, and the most bytes that were ever resident."""
+    peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"cpu_s": time.process_time(), "peak_bytes": peak_kb * 1024}

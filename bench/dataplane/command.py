@@ -7,7 +7,7 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table as RichTable
@@ -94,7 +94,8 @@ def _rich(table: Table) -> RichTable:
 def _show_verdicts(console: Console, figures: dict[str, Figure]) -> None:
     table = RichTable(title="targets", title_justify="left")
     for column in ("figure", "value", "wanted", "verdict"):
-        table.add_column(column, justify="right" if column == "value" else "left")
+        shape: dict[str, Any] = {"justify": "right"} if column == "value" else {"no_wrap": column == "figure"}
+        table.add_column(column, **shape)
     for target in TARGETS:
         verdict = page.VERDICTS[target.met(figures)]
         table.add_row(target.key, page.text_of(figures.get(target.key)), target.wanted, verdict)

@@ -46,16 +46,18 @@ class Ours:
             }
             self.robot = start(Remote.start("engine", folder, host=robot, name=f"{name}.robot"))
             common = {"stun": {"enabled": False}, "udp_port": 0, "log_level": "warning"}
-            peers = []
+            self._peers: list[Any] = []
             for cloud, program in self.clouds.items():
                 config = {"name": cloud, "role": "cloud", "interfaces": [cloud_interface], **common}
                 services = [{"name": service["name"]}]
-                peers.append(program.ask("start", config={**config, "services": services}, answer_bytes=answer_bytes))
+                self._peers.append(
+                    program.ask("start", config={**config, "services": services}, answer_bytes=answer_bytes)
+                )
             config = {"name": "robot", "role": "robot", "interfaces": list(interfaces), **common}
             me = self.robot.ask("start", config={**config, "services": [service]})
             for program in self.clouds.values():
                 program.ask("meet", peers=[me])
-            self.robot.ask("meet", peers=peers, mapping=mapping)
+            self.map_to(mapping)
             self.robot.ask("wait_until_offered")
         except BaseException:
             self._stack.close()
@@ -68,6 +70,10 @@ class Ours:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+
+    def map_to(self, mapping: Sequence[tuple[str, str]] | None) -> None:
+        """Send every request over these (interface, cloud) pairs from now on."""
+        self.robot.ask("meet", peers=self._peers, mapping=mapping)
 
     def call(self, **plan: Any) -> Calls:
         """Send the requests of a `calling.Plan` and wait for the answers."""
@@ -86,6 +92,7 @@ class Ours:
         """One-way seconds of the requests since the last time, over all clouds."""
         return [seconds for cloud in self.clouds.values() for _, seconds in cloud.ask("take_one_way")]
 
-    def cpu_s(self) -> float:
-        """Processor seconds of all its programs."""
-        return sum(float(program.ask("usage")["cpu_s"]) for program in (self.robot, *self.clouds.values()))
+    def sent_bytes(self) -> int:
+        """Bytes of UDP payload that the robot has sent so far, over all its interfaces."""
+        links = self.robot.ask("counters")["links"].values()
+        return sum(int(link["bytes"].get("sent", 0)) for link in links)

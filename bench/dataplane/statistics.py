@@ -59,14 +59,26 @@ class Calls:
         kept = [pair for pair in zip(self.sent_s, self.latency_s, strict=True) if start_s <= pair[0] < end_s]
         return Calls(tuple(sent for sent, _ in kept), tuple(latency for _, latency in kept))
 
+    def arrivals(self) -> list[float]:
+        """When the answers came."""
+        return [sent + latency for sent, latency in self._answered()]
+
+    def line(self, zero_s: float) -> list[tuple[float, float]]:
+        """For a plot: seconds after `zero_s` and latency in milliseconds of each answered request."""
+        return [(sent - zero_s, latency * MS) for sent, latency in self._answered()]
+
+    def _answered(self) -> list[tuple[float, float]]:
+        pairs = zip(self.sent_s, self.latency_s, strict=True)
+        return [(sent, latency) for sent, latency in pairs if latency is not None]
+
     def duration_s(self) -> float | None:
         """From the first request's departure to the last answer's arrival."""
-        ends = [sent + latency for sent, latency in zip(self.sent_s, self.latency_s, strict=True) if latency]
+        ends = self.arrivals()
         return max(ends) - self.sent_s[0] if ends else None
 
     def row(self, name: str) -> Row:
         """Summarise; quantiles are over the answered ones."""
-        answered = [latency * MS for latency in self.latency_s if latency is not None]
+        answered = [latency * MS for _, latency in self._answered()]
         return Row(
             name,
             sent=len(self.latency_s),

@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from bench.netlab import Lab
 
 ROBOT = "robot"
-CLOUD = "cloud_a"
+CLOUDS = ("cloud_a", "cloud_b")
+CLOUD = CLOUDS[0]
 CARRIERS = ("wlan0", "wwan0")
 CLOUD_INTERFACE = "eth0"
 _CORE = "internet"
@@ -26,14 +27,19 @@ def cables() -> LabConfig:
     return _lab(tuple(InterfaceSpec(name, emulated=False, nat=None) for name in CARRIERS))
 
 
-def emulated(profile: LinkProfile) -> LabConfig:
-    """Both carriers with a delay, a rate or losses."""
-    return _lab(tuple(InterfaceSpec(name, nat=None, up=profile, down=profile) for name in CARRIERS))
+def emulated(*profiles: LinkProfile) -> LabConfig:
+    """Carriers with a delay, a rate or losses: one for each profile, which holds for both directions."""
+    return _lab(
+        tuple(
+            InterfaceSpec(name, nat=None, up=profile, down=profile)
+            for name, profile in zip(CARRIERS, profiles, strict=False)
+        )
+    )
 
 
 def _lab(interfaces: tuple[InterfaceSpec, ...]) -> LabConfig:
     return LabConfig(
-        robots=(HostSpec(ROBOT, interfaces),), clouds=(server(CLOUD), server("cloud_b")), source_routing=True
+        robots=(HostSpec(ROBOT, interfaces),), clouds=tuple(server(name) for name in CLOUDS), source_routing=True
     )
 
 

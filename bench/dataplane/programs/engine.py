@@ -119,7 +119,7 @@ class EngineProgram:
         return taken
 
     def usage(self) -> dict[str, Any]:
-        """Processor seconds, resident bytes, threads."""
+        """Processor seconds, peak of resident bytes, threads."""
         return {**usage(), "threads": threading.active_count()}
 
     def counters(self) -> dict[str, Any]:

@@ -83,7 +83,7 @@ class QuicProgram:
         return taken
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and resident bytes."""
+        """Processor seconds and peak of resident bytes."""
         return usage()
 
     def in_memory(self, size: int, count: int) -> list[float]:

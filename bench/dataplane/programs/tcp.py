@@ -60,7 +60,7 @@ class TcpProgram:
         return self._caller.call(Plan(**plan))
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and resident bytes."""
+        """Processor seconds and peak of resident bytes."""
         return usage()
 
     def close(self) -> None:

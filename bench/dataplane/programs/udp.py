@@ -60,7 +60,7 @@ class UdpProgram:
         return taken
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and resident bytes."""
+        """Processor seconds and peak of resident bytes."""
         return usage()
 
     def close(self) -> None:

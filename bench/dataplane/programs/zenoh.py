@@ -50,7 +50,7 @@ class ZenohProgram:
         return self._caller.call(Plan(**plan))
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and resident bytes."""
+        """Processor seconds and peak of resident bytes."""
         return usage()
 
     def close(self) -> None:

@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-from bench.dataplane.sections import blackhole, goodput, one_way
+from bench.dataplane.sections import blackhole, goodput, loss, one_way, outage, overload, ros_calls, share
 
-SECTIONS = (one_way.SECTION, goodput.SECTION, blackhole.SECTION)
+SECTIONS = (
+    one_way.SECTION,
+    goodput.SECTION,
+    ros_calls.SECTION,
+    blackhole.SECTION,
+    loss.SECTION,
+    overload.SECTION,
+    outage.SECTION,
+    share.SECTION,
+)
 """In the order in which they run."""

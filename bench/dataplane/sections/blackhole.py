@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, Table
-from bench.dataplane.statistics import MS, Calls, Row, median, ratio, worst
+from bench.dataplane.statistics import Calls, Row, median, ratio, worst
 from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, SilentCut, cables
 from bench.netlab import Lab
 
@@ -76,7 +76,7 @@ def measure(context: Context) -> Findings:
                     notes.append(f"{NAMES[key]}, repeat {repeat + 1}: {error}".splitlines()[0])
     rows = {key: [calls.between(cut).row(NAMES[key]) for calls, cut in repeats] for key, repeats in runs.items()}
     figures = _figures(rows)
-    lines = {NAMES[key]: _line(*repeats[-1]) for key, repeats in runs.items()}
+    lines = {NAMES[key]: repeats[-1][0].line(repeats[-1][1]) for key, repeats in runs.items()}
     return Findings(
         figures=figures,
         tables=[Table.of_rows("requests after the cut", [Row.of_repeats(repeats) for repeats in rows.values()])],
@@ -126,15 +126,6 @@ def _sent_bytes(host: Host) -> dict[str, int]:
         if colon:
             found[name.strip()] = int(counters.split()[8])
     return found
-
-
-def _line(calls: Calls, cut: float) -> list[tuple[float, float]]:
-    """Seconds after the cut and latency in ms of the answered requests."""
-    return [
-        (sent - cut, latency * MS)
-        for sent, latency in zip(calls.sent_s, calls.latency_s, strict=True)
-        if latency is not None
-    ]
 
 
 # -- contenders: each gives a client that is connected and ready to call ------------------------------------------

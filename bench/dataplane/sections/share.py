@@ -1,0 +1,96 @@
+"""One bottleneck, one TCP flow (iperf3) and our bulk messages: neither may starve the other.
+
+20 Mbit/s, 40 ms round trip, a queue of one bandwidth-delay product. Our messages run before the TCP flow begins and
+after it ends; both goodputs are of the TCP flow's time.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import TYPE_CHECKING
+
+from bench.dataplane.ours import SERVICE, Ours
+from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.statistics import median, ratio
+from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, emulated
+from bench.netlab import Lab, LinkProfile
+
+if TYPE_CHECKING:
+    from bench.dataplane.section import Context
+
+RATE_KBPS = 20_000
+ONE_WAY_MS = 20.0
+LINK = LinkProfile(delay_ms=ONE_WAY_MS, rate_kbps=RATE_KBPS, queue_bytes=round(RATE_KBPS / 8 * 2 * ONE_WAY_MS))
+SIZE = 100_000
+AT_ONCE = 6
+"""600 kB in flight are three times what link and queue hold."""
+FLOW_S = 12
+QUICK_FLOW_S = 4
+LEAD_S = 2.0
+"""Ours alone, before the TCP flow."""
+CUBIC = ("-C", "cubic")
+"""What most of the internet's senders use, whatever this kernel's default is (RFC 9438)."""
+PATIENT = {**SERVICE, "deadline_ms": 10_000.0, "lifetime_ms": 60_000.0}
+
+
+def measure(context: Context) -> Findings:
+    """Measure."""
+    flow_s = QUICK_FLOW_S if context.quick else FLOW_S
+    tcp: list[float | None] = []
+    ours_mbit: list[float | None] = []
+    alone: list[float | None] = []
+    with (
+        Lab(emulated(LINK)) as lab,
+        Ours(
+            context.folder,
+            robot=lab.host(ROBOT),
+            clouds={CLOUD: lab.host(CLOUD)},
+            interfaces=CARRIERS[:1],
+            cloud_interface=CLOUD_INTERFACE,
+            mapping=[(CARRIERS[0], CLOUD)],
+            service=PATIENT,
+        ) as ours,
+    ):
+        robot, cloud = lab.host(ROBOT), lab.host(CLOUD)
+        server = cloud.popen(["iperf3", "-s"], log_path=context.folder / "iperf3.log")
+        for repeat in range(context.repeats):
+            context.say(f"share: {repeat + 1} of {context.repeats}")
+            seconds = flow_s + 2 * LEAD_S
+            start = time.monotonic()
+            ours.begin(size=SIZE, count=100_000, at_once=AT_ONCE, seconds=seconds, grace_s=10.0)
+            time.sleep(LEAD_S)
+            flow_start = time.monotonic()
+            argv = ["iperf3", "-c", cloud.address(), "-B", robot.address(CARRIERS[0]), "-t", str(flow_s)]
+            flow = json.loads(robot.run([*argv, *CUBIC, "-J"], timeout=flow_s + 20).stdout)
+            flow_end = time.monotonic()
+            calls = ours.finish()
+            tcp.append(flow["end"]["sum_received"]["bits_per_second"] / 1e6 if "end" in flow else None)
+            arrivals = calls.arrivals()
+            ours_mbit.append(_rate(arrivals, flow_start, flow_end))
+            alone.append(_rate(arrivals, start + LEAD_S / 2, flow_start))
+        cloud.kill(server)
+    figures = {
+        "tcp_mbit_s": median(tcp),
+        "ours_beside_tcp_mbit_s": median(ours_mbit),
+        "ours_alone_mbit_s": median(alone),
+        "tcp_share_ratio": median(ratio(one, other) for one, other in zip(tcp, ours_mbit, strict=True)),
+    }
+    rows = (
+        ("TCP (CUBIC)", figures["tcp_mbit_s"]),
+        ("ours beside it", figures["ours_beside_tcp_mbit_s"]),
+        ("ours before it", figures["ours_alone_mbit_s"]),
+    )
+    return Findings(
+        figures=dict(figures),
+        tables=[Table("20 Mbit/s, 40 ms, queue of one bandwidth-delay product", ("", "Mbit/s"), rows)],
+        plots=[Plot("sharing 20 Mbit/s", "", "Mbit/s", bars=dict(rows))],
+    )
+
+
+def _rate(arrivals: list[float], start: float, end: float) -> float:
+    """Mbit/s of the messages answered in this stretch."""
+    return sum(start <= at < end for at in arrivals) * SIZE * 8 / 1e6 / (end - start)
+
+
+SECTION = Section("share", "A bottleneck shared with TCP", measure)
