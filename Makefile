@@ -12,7 +12,7 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test lint format protos interfaces lock bench bench-dataplane clean distclean
+.PHONY: help setup demo test lint format protos interfaces lock bench bench-dataplane bench-churn clean distclean
 
 help: ## this list
 	@echo 'usage: make TARGET'
@@ -53,6 +53,9 @@ bench: setup ## every measurement, reports into bench/results
 
 bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP, QUIC and zenoh (15 minutes, as root)
 	@$(PY) -m bench dataplane $(BENCH_ARGS)
+
+bench-churn: setup ## interfaces, servers, control plane come and go for ten minutes: nothing is lost, nothing grows
+	@$(PY) -m bench churn $(BENCH_ARGS)
 
 clean: ## remove caches and build output
 	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis *.egg-info

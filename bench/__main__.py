@@ -3,6 +3,7 @@
 examples:
   make bench-dataplane                                     the data plane against its targets, with a page of plots
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
+  make bench-churn BENCH_ARGS='--minutes 3'                interfaces, addresses, servers, sidecars come and go under load
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from bench.churn import command as churn
 from bench.dataplane import command as dataplane
 
 
@@ -20,7 +22,9 @@ def main() -> int:
     )
     commands = parser.add_subparsers(dest="command", metavar="MEASUREMENT")
     dataplane.add_arguments(commands.add_parser("dataplane", help="the data plane against its targets"))
-    return dataplane.run(parser.parse_args(sys.argv[1:] or ["dataplane"]))
+    churn.add_arguments(commands.add_parser("churn", help="minutes of trouble: requests lost or doubled, memory grown"))
+    options = parser.parse_args(sys.argv[1:] or ["dataplane"])
+    return churn.run(options) if options.command == "churn" else dataplane.run(options)
 
 
 if __name__ == "__main__":

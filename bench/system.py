@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import sys
 import time
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ CONTROL_PORT = 50051
 STUN_PORT = 3478
 METRICS_PORT = 9464
 CONTROL_METRICS_PORT = 9465
+METRICS_TIMEOUT_S = 2.0
 READY_TIMEOUT_S = 60.0
 """Python with rclpy, numpy and OR-Tools on two shared cores takes seconds to start."""
 
@@ -151,13 +153,19 @@ class System:
 
     def metrics(self, host: str, port: int = METRICS_PORT) -> dict[str, float]:
         """Scrape a program's metrics: series with labels -> value; empty while it does not answer."""
-        script = (
-            "import sys, urllib.request;"
-            f"sys.stdout.write(urllib.request.urlopen('http://127.0.0.1:{port}/metrics', timeout=2).read().decode())"
-        )
-        done = self.lab.host(host).run([sys.executable, "-S", "-E", "-c", script], timeout=10)
+        try:
+            with self.lab.host(host).socket(kind=socket.SOCK_STREAM) as connection:
+                connection.settimeout(METRICS_TIMEOUT_S)
+                connection.connect(("127.0.0.1", port))
+                connection.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
+                answer = b"".join(iter(lambda: connection.recv(1 << 16), b""))
+        except OSError:
+            return {}
+        head, _, body = answer.partition(b"\r\n\r\n")
+        if b" 200 " not in head.partition(b"\r\n")[0]:
+            return {}
         found = {}
-        for line in done.stdout.splitlines():
+        for line in body.decode().splitlines():
             if line and not line.startswith("#"):
                 series, _, value = line.rpartition(" ")
                 found[series] = float(value)

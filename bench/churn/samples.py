@@ -1,0 +1,119 @@
+"""Memory and threads of the system's processes over time, and whether they grow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from bench.system import Part
+
+MAX_GROWTH_MB = 4.0
+"""Over the second half of a run, by a straight line through it: above what the allocator's steps amount to, far below
+a leak of one object for each request of ten minutes."""
+MAX_MORE_THREADS = 2
+"""gRPC starts and ends threads of its own."""
+MIN_JUDGED_S = 120.0
+"""A second half shorter than this is all warming up: imports, caches, arenas."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One process at one moment, `at_s` seconds into the run."""
+
+    at_s: float
+    rss_mb: float
+    threads: int
+
+
+@dataclass(slots=True)
+class Life:
+    """One process from its first sample to its last; a program that is restarted has several."""
+
+    name: str
+    pid: int
+    samples: list[Sample] = field(default_factory=list)
+
+    def near(self, at_s: float, tolerance_s: float) -> Sample | None:
+        """The sample next to a moment, if there is one about then."""
+        nearest = min(self.samples, key=lambda sample: abs(sample.at_s - at_s))
+        return nearest if abs(nearest.at_s - at_s) <= tolerance_s else None
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """How a process grew over the second half of a run."""
+
+    name: str
+    span_s: float
+    rss_mb: float
+    """By a straight line through its samples."""
+    threads: int
+    judged: bool
+    """It ran through the whole second half, and that was long enough to tell."""
+
+    @property
+    def grows(self) -> bool:
+        """Whether it is judged to leak."""
+        return self.judged and (self.rss_mb > MAX_GROWTH_MB or self.threads > MAX_MORE_THREADS)
+
+
+class Watch:
+    """Takes samples of the running parts."""
+
+    def __init__(self) -> None:
+        self.lives: list[Life] = []
+
+    def take(self, at_s: float, parts: Mapping[str, Part]) -> None:
+        """Sample the processes that run now."""
+        for name, part in parts.items():
+            pid = part.process.inner_pid if part.process.poll() is None else None
+            read = None if pid is None else _read(pid)
+            if pid is None or read is None:
+                continue
+            life = next((life for life in self.lives if life.pid == pid and life.name == name), None)
+            if life is None:
+                life = Life(name, pid)
+                self.lives.append(life)
+            life.samples.append(Sample(at_s, *read))
+
+    def growths(self, length_s: float, every_s: float) -> list[Growth]:
+        """How the processes grew that ran at the end of a run of `length_s`, sampled every `every_s`."""
+        last = max((sample.at_s for life in self.lives for sample in life.samples), default=0.0)
+        newest = {life.name: life for life in self.lives if life.samples[-1].at_s >= last - 2 * every_s}
+        return [growth(life, length_s, every_s) for life in newest.values()]
+
+
+def growth(life: Life, length_s: float, every_s: float) -> Growth:
+    """How one process grew over the second half of a run of `length_s`."""
+    half = [sample for sample in life.samples if sample.at_s >= length_s / 2]
+    if len(half) < 3:
+        return Growth(life.name, 0.0, 0.0, 0, judged=False)
+    span_s = half[-1].at_s - half[0].at_s
+    whole = half[0].at_s <= length_s / 2 + 2 * every_s
+    slope = slope_of([(sample.at_s, sample.rss_mb) for sample in half])
+    threads = half[-1].threads - half[0].threads
+    return Growth(life.name, span_s, slope * span_s, threads, judged=whole and span_s >= MIN_JUDGED_S - 2 * every_s)
+
+
+def slope_of(points: Sequence[tuple[float, float]]) -> float:
+    """Slope of the straight line of least squares."""
+    count = len(points)
+    mean_x = sum(x for x, _ in points) / count
+    mean_y = sum(y for _, y in points) / count
+    spread = sum((x - mean_x) ** 2 for x, _ in points)
+    return sum((x - mean_x) * (y - mean_y) for x, y in points) / spread if spread else 0.0
+
+
+def _read(pid: int) -> tuple[float, int] | None:
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return None
+    fields = dict(line.split(":", 1) for line in lines if ":" in line)
+    if "VmRSS" not in fields:
+        return None  # it is ending
+    return int(fields["VmRSS"].split()[0]) / 1024, int(fields["Threads"])
