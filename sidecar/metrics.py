@@ -185,6 +185,12 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     yield counter("plr_datagrams", "UDP datagrams.", ("interface", "direction", "kind"), datagrams)
     yield counter("plr_datagrams_dropped", "Datagrams not believed or not sendable.", ("interface", "reason"), dropped)
     yield counter("plr_bytes", "UDP payload bytes.", ("interface", "direction"), transferred)
+    yield counter(
+        "plr_interface_hangs",
+        "Times that an interface's driver did not return for long.",
+        ("interface",),
+        by_one({link.interface: link.hangs for link in links}),
+    )
     yield gauge(
         "plr_udp_offload", "Whether the kernel cuts or joins our datagrams.", ("interface", "direction"), offload
     )

@@ -25,6 +25,7 @@ from sidecar.core.link_events import (
     PeerRestarted,
     Rebind,
     Resend,
+    ResetPaths,
     Send,
     SendClose,
     SendFinished,
@@ -146,9 +147,11 @@ class Link:
                 self._probe_what_is_down(now)
             case SetCarrier(on):
                 self._carrier = on
-                for path in self._paths.values():
-                    if not on and path.state is not PathState.DOWN:
-                        self._take_down(path, "no carrier")
+                if not on:
+                    self._take_all_down("no carrier")
+                self._probe_what_is_down(now)
+            case ResetPaths(reason):
+                self._take_all_down(reason)
                 self._probe_what_is_down(now)
             case SetMtu(mtu):
                 self._mtu.set_interface(mtu, self._paths.values(), now)
@@ -350,6 +353,11 @@ class Link:
             size = sum(datagram.size for datagram in lost)
             path.control.on_lost(size, lost[-1].at, recovery.in_flight, now)
             self._lost(path, lost, now)
+
+    def _take_all_down(self, reason: str) -> None:
+        for path in self._paths.values():
+            if path.state is not PathState.DOWN:
+                self._take_down(path, reason)
 
     def _take_down(self, path: Path, reason: str) -> None:
         """Hand back what the path still carried, then say that it is down."""

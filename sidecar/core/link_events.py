@@ -46,6 +46,13 @@ class SetCarrier:
 
 
 @dataclass(frozen=True, slots=True)
+class ResetPaths:
+    """All paths are down until they answer anew; what they carried goes back to the engine."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class Rebind:
     """The interface's address or gateway changed: what was measured is void, and peers must learn where we are."""
 
@@ -87,7 +94,7 @@ class SendClose:
     """Tell all peers that we go away."""
 
 
-LinkCommand = SetPeers | SetReady | SetCarrier | Rebind | SetMtu | Send | Resend | SendFinished | SendClose
+LinkCommand = SetPeers | SetReady | SetCarrier | ResetPaths | Rebind | SetMtu | Send | Resend | SendFinished | SendClose
 
 
 class FragmentsReceived(NamedTuple):

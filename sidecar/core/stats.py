@@ -41,6 +41,8 @@ class LinkStats:
     """Direction: sent | received; UDP payload bytes."""
     paths: dict[NodeName, PathStats] = field(default_factory=dict)
     """The best path to each peer."""
+    hangs: int = 0
+    """Times that the interface's driver did not return for long."""
     offload: dict[str, bool] = field(default_factory=dict)
     """Direction: send | receive; whether the kernel cuts or joins datagrams for this socket."""
 

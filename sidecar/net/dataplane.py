@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link_events import SendClose
+from sidecar.core.link_events import ResetPaths, SendClose
 from sidecar.net.timerfd import Timer
+from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,8 +43,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_TIMER_SLEEP_S = 1.0
-"""The timer thread looks at least this often."""
 ERROR_PAUSE_S = 0.1
 """After an internal error, which may repeat itself at every turn."""
 
@@ -69,6 +68,7 @@ class ThreadedDataPlane:
         self._lock = threading.Lock()
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
+        self._watchdog = Watchdog(self._clock())
         self._stopping = False
         self._logged_conflicts: frozenset[tuple[ServiceName, NodeName, str]] = frozenset()
         self._timer_thread = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
@@ -83,7 +83,7 @@ class ThreadedDataPlane:
         """Use these interfaces from now on; starting and stopping their threads is the caller's."""
         with self._lock:
             self._links = dict(links)
-            self._engine.set_interfaces(links, self._clock())
+            self._use_links_that_run(self._clock())
             woken = self._queue_outputs()
         self._wake(woken)
 
@@ -226,6 +226,23 @@ class ThreadedDataPlane:
         self._timer.arm_at_latest(self._engine.next_timer())
         return woken
 
+    def _use_links_that_run(self, now: float) -> None:
+        running = [name for name, link in self._links.items() if not self._watchdog.hangs(link)]
+        self._engine.set_interfaces(running, now)
+
+    def _look_for_hung_links(self, now: float) -> None:
+        changes = self._watchdog.look(self._links.values(), now)
+        if changes is None:
+            return
+        for link in changes.hung:
+            log.warning("%s: its driver does not return; requests take other paths", link.interface)
+            link.link.stats.hangs += 1
+        for link in changes.back:
+            log.warning("%s: its driver is back", link.interface)
+            # What it thinks of its paths is as old as what it still has to send.
+            link.post(ResetPaths("driver hung"))
+        self._use_links_that_run(now)
+
     def _links_for(self, interface: InterfaceName | None) -> list[InterfaceThread]:
         if interface is None:
             return list(self._links.values())
@@ -253,8 +270,9 @@ class ThreadedDataPlane:
     def _timer_turn(self) -> None:
         with self._lock:
             now = self._clock()
+            self._look_for_hung_links(now)
             self._engine.handle_timer(now)
             woken = self._queue_outputs()
             if not self._stopping:
-                self._timer.arm(min(self._engine.next_timer(), now + MAX_TIMER_SLEEP_S))
+                self._timer.arm(min(self._engine.next_timer(), now + LOOK_EVERY_S))
         self._wake(woken)

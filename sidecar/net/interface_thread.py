@@ -80,6 +80,8 @@ class InterfaceThread:
         self._more = False
         self._path_log = PathLog()
         self._stopping = False
+        self._abandoned = False
+        self._turn_began: float | None = None
         self._thread = threading.Thread(target=self._run, name=f"plr-{link.identity.interface}", daemon=True)
 
     @property
@@ -97,6 +99,7 @@ class InterfaceThread:
         self.wake()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
+            self._abandoned = True
             log.warning("%s: the thread did not end within %.1f s", self.interface, timeout_s)
 
     def post(self, command: LinkCommand | Callable[[StunClient], None]) -> None:
@@ -110,6 +113,11 @@ class InterfaceThread:
         """Make the thread look at its inbox; nearly free while it is awake."""
         self._waiter.wake()
 
+    def in_turn_for(self, now: float) -> float:
+        """Return for how long (s) the thread has not waited for anything; 0 while it does."""
+        began = self._turn_began
+        return 0.0 if began is None else now - began
+
     # Runs on the thread ------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
@@ -118,12 +126,14 @@ class InterfaceThread:
             while not self._stopping:
                 readable = waiter.wait(self._due(), for_room=bool(self._unsent))
                 self._guarded_turn(readable=readable)
-            self._guarded_turn(readable=False)
+            if not self._abandoned:
+                self._guarded_turn(readable=False)
         finally:
             waiter.close()
             self._socket.close()
 
     def _guarded_turn(self, *, readable: bool) -> None:
+        self._turn_began = self._clock()
         try:
             self._turn(readable=readable)
         except Exception:
@@ -131,6 +141,8 @@ class InterfaceThread:
             log.exception("%s: internal error; the interface goes on", self.interface)
             self.link.stats.dropped["internal_error"] += 1
             time.sleep(ERROR_PAUSE_S)
+        finally:
+            self._turn_began = None
 
     def _due(self) -> float:
         """When a turn is wanted without anybody asking for it."""
@@ -236,7 +248,7 @@ class InterfaceThread:
             if rest is not None:
                 unsent.appendleft(rest)
                 return False
-            if unsent and self._clock() - began > SLOW_SEND_S:
+            if unsent and (self._abandoned or self._clock() - began > SLOW_SEND_S):
                 return False
         return True
 

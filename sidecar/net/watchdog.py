@@ -1,0 +1,50 @@
+"""Notices interface threads that hang in their driver.
+
+A hung thread cannot say that its paths are down: its link does not run. Whoever waits for the engine's timers looks
+instead, and the engine treats the interface as gone until its thread is back.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from sidecar.net.interface_thread import InterfaceThread
+
+HUNG_AFTER_S = 0.25
+"""A turn takes some milliseconds, and a path is silent for 60 ms at least before it is doubted."""
+LOOK_EVERY_S = 0.1
+
+
+class Changes(NamedTuple):
+    """What changed since the last look."""
+
+    hung: list[InterfaceThread]
+    back: list[InterfaceThread]
+
+
+class Watchdog:
+    """Remembers who hangs. Used under the data plane's lock."""
+
+    def __init__(self, now: float) -> None:
+        self._hung: set[InterfaceThread] = set()
+        self._looked_at = now
+
+    def hangs(self, thread: InterfaceThread) -> bool:
+        """Whether it hung at the last look."""
+        return thread in self._hung
+
+    def look(self, threads: Collection[InterfaceThread], now: float) -> Changes | None:
+        """Look at these threads, all that there are; returns what changed, if anything did."""
+        slept, self._looked_at = now - self._looked_at, now
+        if slept > HUNG_AFTER_S:
+            return None  # we did not get to run either: the machine stalled, not a driver
+        before = self._hung
+        self._hung = {thread for thread in threads if thread.in_turn_for(now) > HUNG_AFTER_S}
+        changes = Changes(
+            [thread for thread in threads if thread in self._hung and thread not in before],
+            [thread for thread in threads if thread in before and thread not in self._hung],
+        )
+        return changes if changes.hung or changes.back else None
