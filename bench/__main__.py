@@ -3,7 +3,7 @@
 examples:
   make bench-dataplane                                     the data plane against its targets, with a page of plots
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
-  make bench-churn BENCH_ARGS='--minutes 3'                interfaces, addresses, servers, sidecars come and go under load
+  make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
 """
 
 from __future__ import annotations
