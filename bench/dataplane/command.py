@@ -94,7 +94,7 @@ def _rich(table: Table) -> RichTable:
 def _show_verdicts(console: Console, figures: dict[str, Figure]) -> None:
     table = RichTable(title="targets", title_justify="left")
     for column in ("figure", "value", "wanted", "verdict"):
-        shape: dict[str, Any] = {"justify": "right"} if column == "value" else {"no_wrap": column == "figure"}
+        shape: dict[str, Any] = {"justify": "right"} if column == "value" else {"no_wrap": column != "wanted"}
         table.add_column(column, **shape)
     for target in TARGETS:
         verdict = page.VERDICTS[target.met(figures)]

@@ -60,26 +60,29 @@ def measure(context: Context) -> Findings:
             first_ms.append(_first(calls.between(back)))
             first_seen_ms.append(None if seen is None else _first(calls.between(seen)))
             line = calls.line(back)
+    rows = [Row.of_repeats(before), Row.of_repeats(after)]
     lossfree = [row.p99_ms for row in before]
     return Findings(
         figures={
+            "outage_path_up_after_ms": median(seen_ms),
             "outage_first_ms": median(first_ms),
-            "outage_first_answer_after_ms": median(seen_ms),
-            "outage_first_after_answer_ms": median(first_seen_ms),
+            "outage_first_after_up_ms": median(first_seen_ms),
             "outage_lossfree_p99_ms": median(lossfree),
-            "outage_first_over_lossfree_p99": median(
-                ratio(one, other) for one, other in zip(first_ms, lossfree, strict=True)
-            ),
+            "outage_first_over_lossfree_p99": _over(first_ms, lossfree),
+            "outage_first_after_up_over_lossfree_p99": _over(first_seen_ms, lossfree),
             "outage_lost_after": sum(row.lost for row in after),
         },
-        tables=[Table.of_rows("120 kB at 10 Hz, both paths dark for 10 s", [*_merged(before), *_merged(after)])],
+        tables=[
+            Table.of_rows(
+                "120 kB at 10 Hz, both paths dark for a while", [Row.of_repeats(before), Row.of_repeats(after)]
+            )
+        ],
         plots=[
             Plot("last repeat", "seconds after the links are back", "latency, ms", lines={"ours": line}, log_y=True)
         ],
         notes=[
-            "outage_first_ms: of the first request submitted after the links are back. outage_first_answer_after_ms:"
-            " how long after that any answer came, so when a path was certainly up; outage_first_after_answer_ms: of"
-            " the first request submitted from then on."
+            "outage_path_up_after_ms: from the links' return to the first answer of any request. outage_first_ms: of the"
+            " first request submitted after the links' return; outage_first_after_up_ms: of the first after that answer."
         ],
     )
 
@@ -99,14 +102,14 @@ def _run(ours: Ours, lab: Lab, dark_s: float) -> tuple[Calls, float, float]:
     return ours.finish(), dark, back
 
 
+def _over(values: list[float | None], others: list[float | None]) -> float | None:
+    return median(ratio(value, other) for value, other in zip(values, others, strict=True))
+
+
 def _first(calls: Calls) -> float | None:
     """Latency of the first request, milliseconds; None when it was not answered."""
     latency = calls.latency_s[0] if calls.latency_s else None
     return None if latency is None else latency * MS
-
-
-def _merged(rows: list[Row]) -> list[Row]:
-    return [Row.of_repeats(rows)] if rows else []
 
 
 SECTION = Section("outage", "All paths dark for ten seconds", measure)

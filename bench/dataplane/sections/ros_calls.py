@@ -70,12 +70,11 @@ def measure(context: Context) -> Findings:
     lines = {"proxied": calls.line(cut)}
     return Findings(
         figures=figures,
-        tables=[table],
+        tables=[table, Table("calls a second, 1 kB, 16 in flight", ("", "1/s"), tuple(rates.items()))],
         plots=[
             Plot("median ROS call", "", "ms", bars=_bars(rows)),
             Plot("a path goes silent", "seconds after the cut", "latency, ms", lines=lines),
         ],
-        notes=["requests a second: 16 calls of 1 kB in flight, one client, one server process."],
     )
 
 
