@@ -82,7 +82,8 @@ class EngineProgram:
         self._plane.start()
         self._interfaces.start()
         if parsed.role is Role.CLOUD:
-            self._plane.set_offers((ServiceOffer(SERVICE, TYPE),))
+            rules = parsed.service_rules()
+            self._plane.set_offers(tuple(ServiceOffer(ServiceName(rule.pattern), TYPE) for rule in rules))
             threading.Thread(target=self._answer, daemon=True, name="application").start()
         if not self._have_candidates.wait(READY_TIMEOUT_S):
             raise TimeoutError("no interface came into use")
@@ -94,7 +95,7 @@ class EngineProgram:
         """Take these peers, and (robot) send every request over these (interface, server) pairs."""
         self._version += 1
         version = Version(self._version)
-        error = self._plane.apply_peers(PeerSet(version, self._version, tuple(_peer_of(peer) for peer in peers)))
+        error = self._plane.apply_peers(PeerSet(version, self._version, tuple(peer_of(peer) for peer in peers)))
         if error is None and mapping is not None:
             pairs = tuple(Assignment(InterfaceName(interface), NodeName(server)) for interface, server in mapping)
             services = (ServiceMapping(SERVICE, pairs),)
@@ -191,7 +192,8 @@ class EngineProgram:
         }
 
 
-def _peer_of(fields: dict[str, Any]) -> Peer:
+def peer_of(fields: dict[str, Any]) -> Peer:
+    """Return the peer that `start` described."""
     role = Role(fields["role"])
     candidates = tuple(
         Candidate(c["interface_id"], c["interface"], CandidateKind(c["kind"]), (c["address"][0], c["address"][1]))

@@ -1,0 +1,198 @@
+"""A robot's data plane in this process, each interface a loopback address of its own; the cloud is a process apart.
+
+Its sockets can be made to hang as a bad driver does: the call does not return, but lets the interpreter go on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import random
+import socket
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+from bench.dataplane.programs.engine import TYPE, peer_of
+from bench.dataplane.remote import Remote
+from protos.model import (
+    Assignment,
+    CandidateKind,
+    InterfaceId,
+    InterfaceName,
+    MappingSet,
+    NodeName,
+    PeerSet,
+    Role,
+    ServiceMapping,
+    ServiceName,
+    ServiceOffer,
+    SessionId,
+    Version,
+)
+from sidecar.core.datagrams import LinkIdentity
+from sidecar.core.engine import EngineConfig
+from sidecar.core.events import ApplicationEvent, OfferService, RequestFailed, RequestId, ResponseArrived
+from sidecar.core.link import Link
+from sidecar.core.link_events import SetReady
+from sidecar.core.rules import ServiceRule
+from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from sidecar.net.interface_thread import InterfaceThread
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+PATIENCE_S = 30.0
+SESSION = SessionId(77)
+TOKEN = bytes(15) + b"r"
+
+
+class HangingSocket(socket.socket):
+    """Its sends take `hang_s` each."""
+
+    hang_s = 0.0
+
+    def sendto(self, *arguments: Any) -> int:
+        time.sleep(self.hang_s)
+        return super().sendto(*arguments)
+
+    def sendmsg(self, *arguments: Any) -> int:
+        time.sleep(self.hang_s)
+        return super().sendmsg(*arguments)
+
+
+@dataclass(slots=True)
+class Call:
+    """One request."""
+
+    sent_s: float
+    latency_s: float | None = None
+    interface: str | None = None
+
+
+class Robot:
+    """The robot and its clouds. Use it in a `with` block."""
+
+    def __init__(self, folder: Path, interfaces: tuple[str, ...], mapping: Mapping[str, tuple[str, str]]) -> None:
+        """`mapping`: for each service over which interface it goes to which cloud, alone."""
+        self.calls: dict[str, list[Call]] = {service: [] for service in mapping}
+        self._by_id: dict[RequestId, Call] = {}
+        self._news = threading.Condition()
+        self._offered: set[str] = set()
+        self._stack = contextlib.ExitStack()
+        services = [ServiceName(service) for service in mapping]
+        rules = tuple(ServiceRule(service, 60.0, 60.0) for service in services)
+        hooks = DataPlaneHooks(self, lambda *_: None, lambda: None)
+        self.plane = ThreadedDataPlane(EngineConfig(Role.ROBOT, rules), SESSION, hooks)
+        self.sockets: dict[str, HangingSocket] = {}
+        self.threads: dict[str, InterfaceThread] = {}
+        candidates = []
+        for number, name in enumerate(interfaces):
+            sock = self.sockets[name] = HangingSocket(socket.AF_INET, socket.SOCK_DGRAM)
+            sock.setblocking(False)
+            sock.bind((f"127.0.0.{number + 1}", 0))
+            identity = LinkIdentity(InterfaceName(name), InterfaceId(number), SESSION, TOKEN, 1)
+            link = Link(identity, random.Random(number), time.monotonic())
+            self.threads[name] = InterfaceThread(sock, link, None, self.plane)
+            host = CandidateKind.HOST.value
+            address = sock.getsockname()
+            candidates.append({"interface_id": number, "interface": name, "kind": host, "address": address})
+        me = {
+            "name": "robot",
+            "role": "robot",
+            "session": SESSION,
+            "token": "AAAAAAAAAAAAAAAAAAAAcg==",
+            "candidates": candidates,
+        }
+        clouds = sorted({cloud for _, cloud in mapping.values()})
+        self.clouds = {name: self._stack.enter_context(Remote.start("engine", folder, name=name)) for name in clouds}
+        peers = []
+        for name, cloud in self.clouds.items():
+            config = {
+                "name": name,
+                "role": "cloud",
+                "interfaces": ["lo"],
+                "stun": {"enabled": False},
+                "udp_port": 0,
+                "log_level": "warning",
+                "services": [{"name": service} for service in services],
+            }
+            offers = tuple(ServiceOffer(service, TYPE) for service in services if mapping[service][1] == name)
+            peers.append(dataclasses.replace(peer_of(cloud.ask("start", config=config)), offers=offers))
+            cloud.ask("meet", peers=[me])
+        self.plane.start()
+        for thread in self.threads.values():
+            thread.start()
+            thread.post(SetReady(ready=True))
+        self.plane.set_links({InterfaceName(name): thread for name, thread in self.threads.items()})
+        assert self.plane.apply_peers(PeerSet(Version(1), 1, tuple(peers))) is None
+        pairs = {
+            service: (Assignment(InterfaceName(interface), NodeName(cloud)),)
+            for service, (interface, cloud) in mapping.items()
+        }
+        mappings = tuple(ServiceMapping(ServiceName(service), assigned) for service, assigned in pairs.items())
+        assert self.plane.apply_mapping(MappingSet(Version(1), 1, mappings)) is None
+        with self._news:
+            assert self._news.wait_for(lambda: self._offered == set(services), PATIENCE_S)
+        self.plane.set_carried(frozenset(services))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for sock in self.sockets.values():
+            sock.hang_s = 0.0
+        self.plane.stop()
+        for thread in self.threads.values():
+            thread.stop(PATIENCE_S)
+        self._stack.close()
+
+    def handle(self, event: ApplicationEvent) -> None:
+        """Take what the data plane tells the application."""
+        now = time.monotonic()
+        with self._news:
+            match event:
+                case ResponseArrived():
+                    call = self._by_id[event.request_id]
+                    call.latency_s, call.interface = now - call.sent_s, event.interface
+                case OfferService():
+                    self._offered.add(event.name)
+                case RequestFailed():
+                    raise AssertionError(event)
+                case _:
+                    pass
+            self._news.notify_all()
+
+    def submit(self, service: str, size: int) -> Call:
+        """Send a request."""
+        call = Call(time.monotonic())
+        number = len(self._by_id)
+        request = RequestId(number.to_bytes(16, "big"))
+        self._by_id[request] = call
+        self.calls[service].append(call)
+        # The cloud answers with the beginning of the request.
+        self.plane.submit(request, ServiceName(service), bytes(size))
+        return call
+
+    def wait_for_answers(self, calls: list[Call]) -> None:
+        """Wait until all of these are answered."""
+        with self._news:
+            done = self._news.wait_for(lambda: all(call.latency_s is not None for call in calls), PATIENCE_S)
+        assert done, f"{sum(call.latency_s is None for call in calls)} of {len(calls)} unanswered"
+
+    def beat(self, service: str, seconds: float, rate_hz: float = 50.0, size: int = 1000) -> list[Call]:
+        """Send small requests at a rate and wait for their answers."""
+        calls = []
+        start = time.monotonic()
+        for position in range(int(seconds * rate_hz)):
+            time.sleep(max(0.0, start + position / rate_hz - time.monotonic()))
+            calls.append(self.submit(service, size))
+        self.wait_for_answers(calls)
+        return calls
+
+
+def latencies(calls: list[Call]) -> list[float]:
+    """Seconds, the shortest first."""
+    return sorted(call.latency_s for call in calls if call.latency_s is not None)

@@ -1,0 +1,90 @@
+"""One bad interface, driver or peer delays nothing on another: real threads and sockets over loopback.
+
+No limit here is a time of its own: what is measured is compared with the trouble's length, or with the same calls when
+nothing troubles them.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from tests.integration.isolated_interfaces import PATIENCE_S, Call, Robot, latencies
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HANG_S = 4.0
+"""Each send of the bad driver takes so long."""
+CALM_S = 1.5
+
+
+def worst(calls: list[Call]) -> float:
+    return latencies(calls)[-1]
+
+
+def test_a_driver_that_hangs_delays_nothing_on_another_interface(tmp_path: Path) -> None:
+    mapping = {"/good": ("wlan0", "cloud"), "/bad": ("wwan0", "cloud")}
+    with Robot(tmp_path, ("wlan0", "wwan0"), mapping) as robot:
+        robot.beat("/good", CALM_S)
+        robot.beat("/bad", CALM_S)
+        robot.sockets["wwan0"].hang_s = HANG_S
+        bad: list[Call] = []
+        beating = threading.Thread(target=lambda: bad.extend(robot.beat("/bad", HANG_S / 2, rate_hz=10.0)))
+        beating.start()
+        good = robot.beat("/good", HANG_S / 2)
+        beating.join(PATIENCE_S)
+        assert worst(good) < HANG_S / 4
+        # Those that were mapped to the bad interface alone took the other one, once it was found to hang.
+        assert len(bad) == int(HANG_S / 2 * 10)
+        assert worst(bad) < HANG_S / 2
+        assert {call.interface for call in bad[len(bad) // 2 :]} == {"wlan0"}
+        assert robot.threads["wwan0"].link.stats.hangs == 1
+        robot.sockets["wwan0"].hang_s = 0.0
+        end = time.monotonic() + PATIENCE_S
+        while robot.beat("/bad", 0.2)[-1].interface != "wwan0":
+            assert time.monotonic() < end, "the interface is not used again"
+        assert robot.calls["/bad"][-1] is not bad[-1]
+
+
+def test_a_peer_that_takes_nothing_delays_no_other_peer_on_the_same_interface(tmp_path: Path) -> None:
+    mapping = {"/good": ("wlan0", "cloud_a"), "/stalled": ("wlan0", "cloud_b")}
+    with Robot(tmp_path, ("wlan0",), mapping) as robot:
+        calm = robot.beat("/good", CALM_S)
+        process = robot.clouds["cloud_b"]._process
+        os.kill(process.pid, signal.SIGSTOP)
+        try:
+            backlog = [robot.submit("/stalled", 2_000_000) for _ in range(8)]
+            beside = robot.beat("/good", CALM_S * 2)
+        finally:
+            os.kill(process.pid, signal.SIGCONT)
+        assert all(call.latency_s is None for call in backlog)
+        assert latencies(beside)[len(beside) * 9 // 10] < 20 * latencies(calm)[len(calm) * 9 // 10]
+        assert worst(beside) < CALM_S
+        robot.wait_for_answers(backlog)
+
+
+def test_an_interface_that_computes_flat_out_leaves_the_interpreter_to_the_other(tmp_path: Path) -> None:
+    mapping = {"/good": ("wlan0", "cloud_a"), "/bulk": ("wwan0", "cloud_b")}
+    with Robot(tmp_path, ("wlan0", "wwan0"), mapping) as robot:
+        calm = robot.beat("/good", CALM_S)
+        stop = threading.Event()
+
+        def flood() -> None:
+            while not stop.is_set():
+                robot.wait_for_answers([robot.submit("/bulk", 1_000_000) for _ in range(4)])
+
+        flooding = threading.Thread(target=flood)
+        flooding.start()
+        try:
+            beside = robot.beat("/good", CALM_S * 2)
+        finally:
+            stop.set()
+            flooding.join(PATIENCE_S)
+        assert len(robot.calls["/bulk"]) > 4
+        # Two processors for three busy processes: the tail of each is the scheduler's. The typical call is ours.
+        assert latencies(beside)[len(beside) // 2] < 20 * latencies(calm)[len(calm) // 2]
+        assert worst(beside) < CALM_S
