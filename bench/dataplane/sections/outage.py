@@ -24,6 +24,7 @@ BEFORE_S = 4.0
 DARK_S = 10.0
 QUICK_DARK_S = 4.0
 AFTER_S = 4.0
+GRACE_S = 5.0
 WARM_UP = 20
 LINK = LinkProfile(delay_ms=10, rate_kbps=50_000)
 SERVICE_OF_OUTAGE = {**SERVICE, "deadline_ms": 500.0, "lifetime_ms": 10_000.0}
@@ -72,17 +73,13 @@ def measure(context: Context) -> Findings:
             "outage_first_after_up_over_lossfree_p99": _over(first_seen_ms, lossfree),
             "outage_lost_after": sum(row.lost for row in after),
         },
-        tables=[
-            Table.of_rows(
-                "120 kB at 10 Hz, both paths dark for a while", [Row.of_repeats(before), Row.of_repeats(after)]
-            )
-        ],
+        tables=[Table.of_rows("120 kB at 10 Hz, both paths dark for a while", rows)],
         plots=[
             Plot("last repeat", "seconds after the links are back", "latency, ms", lines={"ours": line}, log_y=True)
         ],
         notes=[
-            "outage_path_up_after_ms: from the links' return to the first answer of any request. outage_first_ms: of the"
-            " first request submitted after the links' return; outage_first_after_up_ms: of the first after that answer."
+            "outage_path_up_after_ms: from the links' return to the first answer of any request. outage_first_ms: of"
+            " the first request submitted after the links' return; outage_first_after_up_ms: after that answer."
         ],
     )
 
@@ -90,7 +87,7 @@ def measure(context: Context) -> Findings:
 def _run(ours: Ours, lab: Lab, dark_s: float) -> tuple[Calls, float, float]:
     """The requests, and the moments at which both links went dark and came back."""
     count = round((BEFORE_S + dark_s + AFTER_S) * RATE_HZ)
-    ours.begin(size=SIZE, count=count, rate_hz=RATE_HZ, grace_s=SERVICE_OF_OUTAGE["lifetime_ms"] / MS / 4)
+    ours.begin(size=SIZE, count=count, rate_hz=RATE_HZ, grace_s=GRACE_S)
     time.sleep(BEFORE_S)
     dark = time.monotonic()
     for carrier in CARRIERS:
