@@ -320,12 +320,14 @@ class RequestTable:
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
 
     def _call_off(self, request: Request, copies: list[Copy], now: float) -> None:
-        """Send no more of these copies, and tell their servers, except where another copy is still awaited."""
+        """Send no more of these copies; tell their servers, except where nothing of them went to them or another copy
+        is still awaited."""
         for copy in copies:
             copy.state = CopyState.DEAD
             self._parts.outbox.drop(copy.message)
             self._parts.stats.called_off[copy.path.interface, copy.path.peer, request.service] += 1
-        servers = {copy.path.peer for copy in copies} - {copy.path.peer for copy in request.pending()}
+        servers = {copy.path.peer for copy in copies if copy.message.begun}
+        servers -= {copy.path.peer for copy in request.pending()}
         for server in servers:
             path = self._parts.routes.best_to(server)
             if path is not None:

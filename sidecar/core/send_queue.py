@@ -2,8 +2,9 @@
 
 Urgent before bulk: a message's priority comes first. Fresh before late: within a priority, those that can still make
 their deadline go first, earliest deadline first; those that can not go after them. So a backlog or an overload makes
-some messages miss, instead of each message make the next one late. No priority starves: while a lower one waits, it
-gets one symbol in SHARE.
+some messages miss, instead of each message make the next one late. What comes with its deadline over goes last: after
+an outage the pace is low at first, and what is asked then may seem hopeless, but must not wait for the backlog. No
+priority starves: while a lower one waits, it gets one symbol in SHARE.
 """
 
 from __future__ import annotations
@@ -89,18 +90,19 @@ class _Entry:
 
 
 class _Class:
-    """Messages of one priority: those that can make their deadline, and the others."""
+    """Messages of one priority: those that can make their deadline, those that can not, those that came too late."""
 
-    __slots__ = ("fresh", "late", "passed_over")
+    __slots__ = ("fresh", "hopeless", "passed_over", "stale")
 
     def __init__(self) -> None:
         self.fresh: list[tuple[float, int, _Entry]] = []
-        self.late: list[tuple[float, int, _Entry]] = []
+        self.hopeless: list[tuple[float, int, _Entry]] = []
+        self.stale: list[tuple[float, int, _Entry]] = []
         self.passed_over = 0
         """Symbols of higher priorities that left while something waited here."""
 
-    def heaps(self) -> tuple[list[tuple[float, int, _Entry]], list[tuple[float, int, _Entry]]]:
-        return self.fresh, self.late
+    def heaps(self) -> tuple[list[tuple[float, int, _Entry]], ...]:
+        return self.fresh, self.hopeless, self.stale
 
 
 class SendQueue:
@@ -139,7 +141,7 @@ class SendQueue:
             self._purge()
         self._entries[message.number] = entry
         mine = self._classes[message.priority]
-        if not mine.fresh and not mine.late:
+        if not any(mine.heaps()):
             mine.passed_over = 0
         heapq.heappush(mine.fresh, (message.deadline, next(self._order), entry))
 
@@ -207,7 +209,8 @@ class SendQueue:
                     self.expired += 1
                     self._drop(heap)
                 elif heap is each.fresh and entry.is_hopeless(now, pace, round_trip_s):
-                    heapq.heappush(each.late, heapq.heappop(heap))
+                    late = each.hopeless if message.deadline > now else each.stale
+                    heapq.heappush(late, heapq.heappop(heap))
                 else:
                     return heap
         return None
@@ -219,8 +222,8 @@ class SendQueue:
         """Empty the queue and return each message with its symbols that did not leave."""
         left = [(entry.message, entry.remaining()) for entry in self._entries.values()]
         for each in self._classes:
-            each.fresh.clear()
-            each.late.clear()
+            for heap in each.heaps():
+                heap.clear()
         self._entries.clear()
         self._purge_at = PURGE_AT
         return [(message, indices) for message, indices in left if indices]

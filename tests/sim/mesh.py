@@ -72,6 +72,8 @@ class Node:
         self.token = mesh.rng.randbytes(16)
         self.offers: tuple[ServiceOffer, ...] = ()
         self.server_delay: Callable[[], float | None] = lambda: 0.001
+        self.server: Callable[[ApplicationEvent], None] | None = None
+        """Runs this cloud's requests in place of `server_delay`."""
         self.events: list[ApplicationEvent] = []
         self.alive = True
         self.start()
@@ -235,7 +237,9 @@ class Mesh:
 
     def _application(self, node: Node, event: ApplicationEvent) -> None:
         node.events.append(event)
-        if isinstance(event, ExecuteRequest):
+        if node.server is not None:
+            node.server(event)
+        elif isinstance(event, ExecuteRequest):
             session, execution = node.session, event.execution
             node.executed.append(RequestId(event.payload))
             delay = node.server_delay()

@@ -59,8 +59,11 @@ class Table:
         for known in SERVERS.values():
             self.routes.set_state(known, PathState.UP)
 
-    def submit(self, number: int = 1, payload: bytes = b"question", now: float = 0.0) -> None:
+    def submit(self, number: int = 1, payload: bytes = b"question", now: float = 0.0, *, begun: bool = True) -> None:
         self.table.submit(request_id(number), ECHO, TYPE, self.rule, payload, now)
+        for command in self.commands if begun else ():
+            if isinstance(command, Send):
+                command.message.begun = True
 
     def sent(self) -> list[PathId]:
         """Paths that got copies since the last look."""
@@ -226,6 +229,15 @@ def test_a_cancel_takes_the_best_path_to_its_server_and_none_when_there_is_none(
         table.routes.set_state(down, PathState.DOWN)
     table.respond(B, copy=1, number=2)
     assert table.cancelled() == []
+
+
+def test_a_server_that_got_nothing_is_told_nothing() -> None:
+    table = Table()
+    table.submit(begun=False)
+    table.respond(B, copy=1)
+    assert table.cancelled() == []
+    assert table.stats.called_off == {(WLAN, A, ECHO): 1}
+    table.assert_empty()
 
 
 def test_all_copies_at_one_server_are_called_off_with_one_cancel() -> None:

@@ -133,6 +133,17 @@ def test_what_can_not_make_it_at_this_pace_is_late_already() -> None:
     assert take(queue, pace=PACE)[0] == 2
 
 
+def test_what_came_too_late_waits_also_for_what_is_hopeless_at_this_pace() -> None:
+    """After an outage: the backlog, then a large message that a low first pace makes look hopeless."""
+    queue = SendQueue()
+    for number in (1, 2):
+        queue.add(message(number, 10_000, deadline=1.0))
+    assert take(queue, now=5.0, pace=PACE)[0] == 1
+    queue.add(message(3, 150_000, deadline=5.1))
+    for now in (5.0, 5.2):
+        assert take(queue, now=now, pace=PACE)[0] == 3, "also when its deadline is over by now"
+
+
 def test_what_is_begun_is_finished_when_it_just_makes_it() -> None:
     def second_taken(*, begin: bool) -> int:
         queue = SendQueue()

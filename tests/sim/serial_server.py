@@ -1,0 +1,77 @@
+"""A local server that takes its requests one by one, behind the same window as a real one's (`sidecar/ros`)."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import count
+from typing import TYPE_CHECKING
+
+from sidecar.core.events import (
+    AbandonExecution,
+    ApplicationEvent,
+    CancelExecution,
+    ExecuteRequest,
+    ExecutionId,
+    RejectReason,
+    RequestId,
+)
+from sidecar.ros.request_window import RequestWindow
+
+if TYPE_CHECKING:
+    from tests.sim.mesh import Mesh, Node
+
+QUEUE_DEPTH = 10
+"""rmw's default."""
+
+
+class SerialServer:
+    """Runs a cloud's requests, each for `busy_s`."""
+
+    def __init__(self, mesh: Mesh, node: Node, busy_s: float) -> None:
+        self.mesh = mesh
+        self.node = node
+        self.busy_s = busy_s
+        self.answer = b""
+        """Sent after the request's own first bytes."""
+        self.window: RequestWindow[ExecutionId] = RequestWindow()
+        self.requests: dict[ExecutionId, ExecuteRequest] = {}
+        self.ran = 0
+        self._numbers = count(1)
+        self._queue: deque[tuple[int, ExecutionId]] = deque()
+        self._idle = True
+        node.server = self.handle
+
+    def handle(self, event: ApplicationEvent) -> None:
+        now = self.mesh.now
+        match event:
+            case ExecuteRequest():
+                self.requests[event.execution] = event
+                self.window.add(event.execution, event.priority, now + event.deadline_s, now)
+            case CancelExecution(execution) | AbandonExecution(execution):
+                if self.window.holds(execution):
+                    self.window.remove(execution)
+                    del self.requests[execution]
+                    if isinstance(event, CancelExecution):
+                        self.node.engine.refuse(execution, RejectReason.CANCELLED, "called off", now)
+        self._release()
+
+    def _release(self) -> None:
+        for execution in self.window.release(self.mesh.now):
+            number = next(self._numbers)
+            self.window.sent(number, self.mesh.now)
+            self._queue.append((number, execution))
+            assert len(self._queue) <= QUEUE_DEPTH
+        if self._idle and self._queue:
+            self._idle = False
+            number, execution = self._queue.popleft()
+            self.mesh.at(self.busy_s, lambda: self._done(number, execution))
+
+    def _done(self, number: int, execution: ExecutionId) -> None:
+        self._idle = True
+        self.ran += 1
+        payload = self.requests.pop(execution).payload
+        self.node.executed.append(RequestId(payload))
+        self.window.answered(number, self.mesh.now)
+        self.node.engine.complete(execution, b"echo:" + payload[:100] + self.answer, self.busy_s, self.mesh.now)
+        self._release()
+        self.mesh.pump(self.node)
