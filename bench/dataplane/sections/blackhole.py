@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 SIZE = 1_000
 RATE_HZ = 50.0
-BEFORE = 100
+BEFORE = 75
 """Requests before the cut."""
-AFTER = 420
+AFTER = 410
 """Requests after it, at least."""
 GRACE_S = 3.0
 """How long the last answers are waited for."""

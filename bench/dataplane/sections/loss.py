@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SIZE = 150_000
 RATE_HZ = 10.0
 WARM_UP = 20
-COUNT = 150
+COUNT = 130
 """At the losses that have targets, and without loss; elsewhere a third of it."""
 LOSSES = (0.0, 0.02, 0.01, 0.05)
 JUDGED = (0.0, 0.02)

@@ -24,6 +24,8 @@ BEFORE_S = 4.0
 DARK_S = 10.0
 QUICK_DARK_S = 4.0
 AFTER_S = 4.0
+MARGIN_S = 0.5
+"""Who was sent less than this before the links went dark may have been caught by it."""
 GRACE_S = 5.0
 WARM_UP = 20
 LINK = LinkProfile(delay_ms=10, rate_kbps=50_000)
@@ -54,7 +56,7 @@ def measure(context: Context) -> Findings:
         for repeat in range(context.repeats):
             context.say(f"outage: {repeat + 1} of {context.repeats}")
             calls, dark, back = _run(ours, lab, QUICK_DARK_S if context.quick else DARK_S)
-            before.append(calls.between(0, dark).row("before"))
+            before.append(calls.between(0, dark - MARGIN_S).row("before"))
             after.append(calls.between(back).row("sent after the links are back"))
             seen = min((at for at in calls.arrivals() if at >= back), default=None)
             seen_ms.append(None if seen is None else (seen - back) * MS)

@@ -23,7 +23,7 @@ DIRECT_DOMAIN = 9
 DOMAINS = {"direct": DIRECT_DOMAIN, "proxied": 0}
 SIZES = {"1k": (1_000, 50.0), "150k": (150_000, 10.0)}
 """Bytes of the request, requests a second."""
-SECONDS = 5.0
+SECONDS = 4.0
 QUICK_SECONDS = 2.0
 RATE_SECONDS = 3.0
 BLACKHOLE_BEFORE_S = 2.0

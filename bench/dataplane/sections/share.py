@@ -25,7 +25,7 @@ LINK = LinkProfile(delay_ms=ONE_WAY_MS, rate_kbps=RATE_KBPS, queue_bytes=round(R
 SIZE = 100_000
 AT_ONCE = 6
 """600 kB in flight are three times what link and queue hold."""
-FLOW_S = 12
+FLOW_S = 10
 QUICK_FLOW_S = 4
 LEAD_S = 2.0
 """Ours alone, before the TCP flow."""
