@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SOCKET_BUFFER_BYTES = 4 << 20
+RECEIVE_BUFFER_BYTES = 4 << 20
 """A quarter of the largest message: what arrives while the interpreter is held has to wait here."""
+SEND_BUFFER_BYTES = 512 << 10
+"""Some milliseconds of a fast link: more would only go stale there, where nobody can call it back."""
 
 ADDRESS_CACHE_ENTRIES = 4096
 """More than the addresses of all peers of one sidecar; a flood of forged sources only empties the cache."""
@@ -116,8 +118,8 @@ def _open(bind: Callable[[socket.socket], None], family: int | None = None) -> s
 
 def _set_options(sock: socket.socket) -> None:
     sock.setblocking(False)
-    _raise_buffer(sock, _SO_RCVBUFFORCE, socket.SO_RCVBUF)
-    _raise_buffer(sock, _SO_SNDBUFFORCE, socket.SO_SNDBUF)
+    _set_buffer(sock, _SO_RCVBUFFORCE, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+    _set_buffer(sock, _SO_SNDBUFFORCE, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
     # Never fragmented (one lost fragment loses the datagram), and no belief in ICMP, which anybody may forge.
     sock.setsockopt(socket.IPPROTO_IP, _IP_MTU_DISCOVER, _PMTUDISC_PROBE)
     if sock.family == socket.AF_INET6:
@@ -125,15 +127,15 @@ def _set_options(sock: socket.socket) -> None:
         sock.setsockopt(socket.IPPROTO_IPV6, _IPV6_MTU_DISCOVER, _PMTUDISC_PROBE)
 
 
-def _raise_buffer(sock: socket.socket, forced: int, polite: int) -> None:
+def _set_buffer(sock: socket.socket, forced: int, polite: int, size: int) -> None:
     try:
-        sock.setsockopt(socket.SOL_SOCKET, forced, SOCKET_BUFFER_BYTES)
+        sock.setsockopt(socket.SOL_SOCKET, forced, size)
     except PermissionError:
-        sock.setsockopt(socket.SOL_SOCKET, polite, SOCKET_BUFFER_BYTES)
+        sock.setsockopt(socket.SOL_SOCKET, polite, size)
         # The kernel doubles what it grants, for its own bookkeeping.
         granted = sock.getsockopt(socket.SOL_SOCKET, polite) // 2
-        if granted < SOCKET_BUFFER_BYTES:
-            log.info("socket buffer of %d bytes instead of %d: raise net.core", granted, SOCKET_BUFFER_BYTES)
+        if granted < size:
+            log.info("socket buffer of %d bytes instead of %d: raise net.core", granted, size)
 
 
 def _bind_to_device(sock: socket.socket, interface: Interface, port: int) -> None:

@@ -1,12 +1,14 @@
 """A robot's data plane in this process, each interface a loopback address of its own; the cloud is a process apart.
 
-Its sockets can be made to hang as a bad driver does: the call does not return, but lets the interpreter go on.
+Its sockets can be made to hang as a bad driver does (the call does not return, but lets the interpreter go on), or to
+be full.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import random
 import socket
 import threading
@@ -45,22 +47,37 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 PATIENCE_S = 30.0
+LIFETIME_S = 60.0
+URGENT_S = 1.0
 SESSION = SessionId(77)
 TOKEN = bytes(15) + b"r"
 
 
-class HangingSocket(socket.socket):
-    """Its sends take `hang_s` each."""
+class BadSocket(socket.socket):
+    """Its sends take `hang_s` each; while it is `full` it takes nothing."""
 
     hang_s = 0.0
+    full = False
 
     def sendto(self, *arguments: Any) -> int:
-        time.sleep(self.hang_s)
+        self._suffer()
+        self.sent.append(len(arguments[0]))
         return super().sendto(*arguments)
 
     def sendmsg(self, *arguments: Any) -> int:
-        time.sleep(self.hang_s)
+        self._suffer()
+        self.sent.append(len(arguments[0][0]))
         return super().sendmsg(*arguments)
+
+    @functools.cached_property
+    def sent(self) -> list[int]:
+        """Bytes of each send that succeeded."""
+        return []
+
+    def _suffer(self) -> None:
+        time.sleep(self.hang_s)
+        if self.full:
+            raise BlockingIOError
 
 
 @dataclass(slots=True)
@@ -76,21 +93,22 @@ class Robot:
     """The robot and its clouds. Use it in a `with` block."""
 
     def __init__(self, folder: Path, interfaces: tuple[str, ...], mapping: Mapping[str, tuple[str, str]]) -> None:
-        """`mapping`: for each service over which interface it goes to which cloud, alone."""
+        """`mapping`: for each service over which interface it goes to which cloud, alone; the first is urgent."""
         self.calls: dict[str, list[Call]] = {service: [] for service in mapping}
         self._by_id: dict[RequestId, Call] = {}
         self._news = threading.Condition()
         self._offered: set[str] = set()
         self._stack = contextlib.ExitStack()
         services = [ServiceName(service) for service in mapping]
-        rules = tuple(ServiceRule(service, 60.0, 60.0) for service in services)
+        deadline_s = dict.fromkeys(services, LIFETIME_S) | {services[0]: URGENT_S}
+        rules = tuple(ServiceRule(service, deadline_s[service], LIFETIME_S) for service in services)
         hooks = DataPlaneHooks(self, lambda *_: None, lambda: None)
         self.plane = ThreadedDataPlane(EngineConfig(Role.ROBOT, rules), SESSION, hooks)
-        self.sockets: dict[str, HangingSocket] = {}
+        self.sockets: dict[str, BadSocket] = {}
         self.threads: dict[str, InterfaceThread] = {}
         candidates = []
         for number, name in enumerate(interfaces):
-            sock = self.sockets[name] = HangingSocket(socket.AF_INET, socket.SOCK_DGRAM)
+            sock = self.sockets[name] = BadSocket(socket.AF_INET, socket.SOCK_DGRAM)
             sock.setblocking(False)
             sock.bind((f"127.0.0.{number + 1}", 0))
             identity = LinkIdentity(InterfaceName(name), InterfaceId(number), SESSION, TOKEN, 1)
@@ -143,7 +161,7 @@ class Robot:
 
     def __exit__(self, *_: object) -> None:
         for sock in self.sockets.values():
-            sock.hang_s = 0.0
+            sock.hang_s, sock.full = 0.0, False
         self.plane.stop()
         for thread in self.threads.values():
             thread.stop(PATIENCE_S)

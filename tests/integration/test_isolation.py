@@ -44,10 +44,45 @@ def test_a_driver_that_hangs_delays_nothing_on_another_interface(tmp_path: Path)
         assert {call.interface for call in bad[len(bad) // 2 :]} == {"wlan0"}
         assert robot.threads["wwan0"].link.stats.hangs == 1
         robot.sockets["wwan0"].hang_s = 0.0
-        end = time.monotonic() + PATIENCE_S
-        while robot.beat("/bad", 0.2)[-1].interface != "wwan0":
-            assert time.monotonic() < end, "the interface is not used again"
+        assert until_over(robot, "wwan0")
         assert robot.calls["/bad"][-1] is not bad[-1]
+
+
+def test_a_full_socket_buffer_holds_one_burst_and_nothing_stale_leaves_it(tmp_path: Path) -> None:
+    mapping = {"/good": ("wlan0", "cloud"), "/bad": ("wwan0", "cloud")}
+    with Robot(tmp_path, ("wlan0", "wwan0"), mapping) as robot:
+        calm = robot.beat("/good", CALM_S)
+        robot.beat("/bad", 0.5)
+        sock, thread = robot.sockets["wwan0"], robot.threads["wwan0"]
+        sock.full = True
+        backlog = [robot.submit("/bad", 500_000) for _ in range(6)]
+        waiting = 0
+        good: list[Call] = []
+        beating = threading.Thread(target=lambda: good.extend(robot.beat("/good", CALM_S)))
+        beating.start()
+        while beating.is_alive():
+            waiting = max(waiting, sum(len(batch.data) for batch in list(thread._unsent)))
+            time.sleep(0.005)
+        assert latencies(good)[len(good) * 9 // 10] < 20 * latencies(calm)[len(calm) * 9 // 10]
+        robot.wait_for_answers(backlog)
+        assert 0 < waiting < 4 * 65_000
+        dropped = thread.link.stats.dropped
+        assert dropped["send_buffer_full_waits"] > 0
+        assert dropped["unsent_of_path_down"] > 0
+        sock.sent.clear()
+        sock.full = False
+        assert until_over(robot, "wwan0")
+        # Probes to find that it is back, then the new requests: nothing of the backlog.
+        assert sum(sock.sent) < 100_000
+
+
+def until_over(robot: Robot, interface: str) -> bool:
+    """Call until the answers come over this interface again."""
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        if robot.beat("/bad", 0.2)[-1].interface == interface:
+            return True
+    return False
 
 
 def test_a_peer_that_takes_nothing_delays_no_other_peer_on_the_same_interface(tmp_path: Path) -> None:
