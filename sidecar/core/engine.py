@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, Report, Role, ServiceUse
-from sidecar.core.dedup import ExecutionTable, Reply, Waiter
 from sidecar.core.events import (
     ApplicationEvent,
-    ExecuteRequest,
     ExecutionId,
     RejectReason,
     RequestFailed,
@@ -44,7 +42,6 @@ from sidecar.core.messages import (
     RequestMessage,
     ResponseMessage,
     decode_message,
-    encode_message,
 )
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
@@ -52,7 +49,8 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.peers import Peers
 from sidecar.core.requests import RequestParts, RequestTable
 from sidecar.core.routes import Routes
-from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
+from sidecar.core.rules import ServiceRule, find_rule
+from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
 
 if TYPE_CHECKING:
@@ -81,9 +79,7 @@ class Engine:
         self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
         self._events: list[ApplicationEvent] = []
         self._interfaces: set[InterfaceName] = set()
-        self._local_offers: dict[ServiceName, ServiceOffer] = {}
         self._carried: frozenset[ServiceName] = frozenset()
-        self._draining = False
         self._sweep_at = now + SWEEP_EVERY_S
         self._reassemblers: dict[NodeName, Reassembler] = {}
         self.peers = Peers()
@@ -92,7 +88,7 @@ class Engine:
         self._offers = Offers(config.rules)
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
         self._measurements = Measurements()
-        self._executions = ExecutionTable(self.stats)
+        self._serving = Serving(ServingParts(config.rules, self.routes, self._outbox, self.stats, self._events.append))
         self._requests = RequestTable(
             RequestParts(
                 self._offers,
@@ -138,17 +134,17 @@ class Engine:
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:
         """Cloud: the local server answered."""
-        self._reply(self._executions.complete(execution, payload, processing_s, now))
-        self.stats.in_flight = self._executions.running
+        self._serving.complete(execution, payload, processing_s, now)
+        self.stats.in_flight = self._serving.running
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str, now: float) -> None:
         """Cloud: the request was not or will not be answered."""
-        self._reply(self._executions.refuse(execution, reason, detail, now))
-        self.stats.in_flight = self._executions.running
+        self._serving.refuse(execution, reason, detail, now)
+        self.stats.in_flight = self._serving.running
 
     def set_offers(self, offers: Iterable[ServiceOffer]) -> None:
         """Cloud: the services that local servers offer right now."""
-        self._local_offers = {offer.name: offer for offer in offers}
+        self._serving.set_offers(offers)
 
     def set_carried(self, services: frozenset[ServiceName]) -> None:
         """Robot: the proxied services that exist right now."""
@@ -156,18 +152,18 @@ class Engine:
 
     def drain(self) -> None:
         """Cloud: take no new requests; those in flight go on."""
-        self._draining = True
+        self._serving.drain()
 
     @property
     def busy(self) -> int:
         """Requests in flight here, in either role."""
-        return self._executions.running + self._requests.unanswered + len(self._outbox)
+        return self._serving.running + self._requests.unanswered + len(self._outbox)
 
     # -- the control plane ----------------------------------------------------------------------------------------
 
     def offers(self) -> tuple[ServiceOffer, ...]:
         """What this sidecar can run."""
-        return tuple(self._local_offers.values())
+        return self._serving.offers
 
     def uses(self) -> tuple[ServiceUse, ...]:
         """What this sidecar carries."""
@@ -257,7 +253,7 @@ class Engine:
                     self._commands.append((None, SetPeers(self.peers.for_links())))
             case PeerClosed(peer):
                 self._on_peer_closed(peer, now)
-        self.stats.in_flight = self._requests.unanswered + self._executions.running
+        self.stats.in_flight = self._requests.unanswered + self._serving.running
 
     def _on_fragments(self, event: FragmentsReceived, now: float) -> None:
         path = event.path
@@ -287,59 +283,18 @@ class Engine:
             if robot:
                 self.stats.dropped["request_to_a_robot"] += 1
             else:
-                self._on_request(path, message, now)
+                self._serving.on_request(path, message, now)
         elif isinstance(message, CancelMessage):
             if robot:
                 self.stats.dropped["cancel_to_a_robot"] += 1
             else:
-                self._on_cancel(path.peer, message, now)
+                self._serving.on_cancel(path.peer, message, now)
         elif not robot:
             self.stats.dropped["response_to_a_cloud"] += 1
         elif isinstance(message, ResponseMessage):
             self._requests.on_response(path.peer, message, now)
         else:
             self._requests.on_rejection(path.peer, message, now)
-
-    def _on_request(self, path: PathId, message: RequestMessage, now: float) -> None:
-        waiter = Waiter(path, message.copy)
-        offer = self._local_offers.get(message.service)
-        refusal = None
-        if offer is None:
-            refusal = RejectReason.NOT_OFFERED, f"no server for {message.service}"
-        elif self._draining:
-            refusal = RejectReason.DRAINING, "the sidecar is going away"
-        elif offer.type != message.type:
-            refusal = RejectReason.WRONG_TYPE, f"{message.service} has type {offer.type}, not {message.type}"
-        if refusal and not self._executions.knows(message.request_id):
-            self._reply([self._executions.refuse_unseen(waiter, message, *refusal, now)])
-            return
-        rule = find_rule(self._config.rules, message.service)
-        patience_s = rule.lifetime_s if rule else MAX_LIFETIME_S
-        outcome = self._executions.on_request(path, message, now, patience_s=patience_s)
-        if isinstance(outcome, ExecuteRequest):
-            self._events.append(outcome)
-        elif isinstance(outcome, Reply):
-            self._reply([outcome])
-
-    def _on_cancel(self, robot: NodeName, message: CancelMessage, now: float) -> None:
-        event = self._executions.cancel(robot, message.request_id, now)
-        if event is not None:
-            self._events.append(event)
-        self._outbox.drop_answers(robot, message.request_id)
-
-    def _reply(self, replies: list[Reply]) -> None:
-        for reply in replies:
-            path = reply.waiter.path
-            if self.routes.state(path) is PathState.DOWN:
-                path = self.routes.best_to(path.peer) or path
-            self._outbox.send(
-                path,
-                encode_message(reply.message),
-                priority=reply.priority,
-                deadline=reply.deadline,
-                expires=reply.expires,
-                answers=reply.message.request_id,
-            )
 
     def _on_path_changed(self, event: PathChanged, now: float) -> None:
         path, state = event.path, event.state
@@ -387,15 +342,13 @@ class Engine:
 
     def next_timer(self) -> float:
         """When `handle_timer` is wanted next."""
-        timers = (self._requests.next_timer(), self._executions.next_timer(), self._offers.next_timer())
+        timers = (self._requests.next_timer(), self._serving.next_timer(), self._offers.next_timer())
         return min((self._sweep_at, *(timer for timer in timers if timer is not None)))
 
     def handle_timer(self, now: float) -> None:
         """Do what is due by now."""
         self._requests.handle_timer(now)
-        abandoned, replies = self._executions.handle_timer(now)
-        self._events.extend(abandoned)
-        self._reply(replies)
+        self._serving.handle_timer(now)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
             self._outbox.expire(now)

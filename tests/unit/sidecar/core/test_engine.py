@@ -315,7 +315,7 @@ def test_timers_always_move_on() -> None:
             sidecar.engine.handle_timer(now)
             turns += 1
         assert turns <= 30.0 / SWEEP_EVERY_S + 5
-        assert sidecar.engine._requests.unanswered == sidecar.engine._executions.running == 0
+        assert sidecar.engine._requests.unanswered == sidecar.engine._serving.executions.running == 0
 
 
 def test_an_execution_that_never_answers_is_abandoned() -> None:
