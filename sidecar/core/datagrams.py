@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core import frame
-from sidecar.core.frame import BASE_FRAMES_BYTES, Header
+from sidecar.core.frame import BASE_FRAMES_BYTES, FRAGMENT_DATAGRAM_BYTES, FRAGMENT_TYPE, Header
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
     import random
 
     from protos.model import Address, InterfaceId, InterfaceName, SessionId
+    from sidecar.core.outbound import OutboundMessage
     from sidecar.core.paths import Path
     from sidecar.core.send_queue import Run
     from sidecar.core.stats import LinkStats
@@ -22,6 +23,11 @@ BURST_DATAGRAMS = 64
 
 MTU_PROBE_TIMEOUTS = 3
 """A probe of the path's MTU is given up after this many of its probe timeouts, if that is longer than its own limit."""
+
+MAX_BATCH_DATAGRAMS = 64
+"""As many segments as every kernel's offload takes (UDP_MAX_SEGMENTS of Linux before 6.10)."""
+MAX_BATCH_BYTES = 65_000
+"""The largest UDP payload, less a margin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +42,7 @@ class LinkIdentity:
 
 
 class Batch(NamedTuple):
-    """Datagrams to one address, back to back: at most 64 of them and 65,000 bytes."""
+    """Datagrams to one address, back to back: at most MAX_BATCH_DATAGRAMS and MAX_BATCH_BYTES."""
 
     address: Address
     data: bytes | bytearray | memoryview
@@ -54,6 +60,38 @@ class Batch(NamedTuple):
         return [view[start : start + self.segment] for start in range(0, len(view), self.segment)]
 
 
+class Burst:
+    """Batches that leave together."""
+
+    __slots__ = ("batches", "datagrams")
+
+    def __init__(self) -> None:
+        self.batches: list[Batch] = []
+        self.datagrams = 0
+
+    @property
+    def full(self) -> bool:
+        """Whether the driver shall look at the socket again before more is built."""
+        return self.datagrams >= BURST_DATAGRAMS
+
+    def add(self, address: Address, data: bytes | bytearray, segment: int, count: int = 1) -> None:
+        """Add `count` datagrams as in a Batch; they join the batch before when they fit."""
+        self.datagrams += count
+        if self.batches:
+            before = self.batches[-1]
+            joined, size = before.data, before.segment
+            if (
+                segment == size
+                and before.address == address
+                and isinstance(joined, bytearray)
+                and len(joined) + len(data) <= min(MAX_BATCH_BYTES, MAX_BATCH_DATAGRAMS * size)
+                and len(joined) % size == 0
+            ):
+                joined += data
+                return
+        self.batches.append(Batch(address, data, segment))
+
+
 class DatagramBuilder:
     """Turns the state of a link's paths into datagrams, and notes in it what left."""
 
@@ -64,63 +102,80 @@ class DatagramBuilder:
         self._stats = stats
         self._rng = rng
 
-    def build(self, path: Path, out: list[Batch], now: float, *, probing: bool) -> bool:
-        """Append what the path may send now; False when BURST_DATAGRAMS cut it short. `probing` allows probes."""
-        before = len(out)
+    def build(self, path: Path, burst: Burst, now: float, *, probing: bool) -> bool:
+        """Add what the path may send now; False when the burst got full first. `probing` allows probes."""
         if probing and path.probe_at is not None and path.probe_at <= now:
-            self._add_probe(path, out, now)
+            self._add_probe(path, burst, now)
         if probing and path.mtu.timer is not None and path.mtu.timer <= now:
-            self._add_mtu_probe(path, out, now)
-        self._add_control(path, out, now)
-        complete = self._add_fragments(path, out, now)
-        sent = sum(len(batch.data) for batch in out[before:])
-        path.bytes_sent += sent
-        self._stats.bytes["sent"] += sent
-        return complete
+            self._add_mtu_probe(path, burst, now)
+        if path.pending or path.received.ack_at is not None:
+            self._add_control(path, burst, now)
+        return self._add_fragments(path, burst, now)
 
-    def _add_fragments(self, path: Path, out: list[Batch], now: float) -> bool:
-        if path.state is PathState.DOWN or path.remote is None:
+    def _add_fragments(self, path: Path, burst: Burst, now: float) -> bool:
+        queue = path.queue
+        if not len(queue) or path.state is PathState.DOWN or path.remote is None:
             return True
-        recovery, control, queue = path.recovery, path.control, path.queue
+        recovery, control = path.recovery, path.control
         expired_before = queue.expired
         complete = True
         budget = control.budget(now, recovery.in_flight)
         while budget > 0:
-            if len(out) >= BURST_DATAGRAMS:
+            if burst.full:
                 complete = False
                 break
             run = queue.take(now, budget, control.pacing_rate or 0.0, recovery.rtt.smoothed)
             if run is None:
                 control.ran_dry()
                 break
-            sent = self._add_run(path, path.remote, run, out, now)
+            sent = self._add_run(path, path.remote, run, burst, now)
             control.on_sent(now, sent, recovery.in_flight)
             budget -= sent
         if queue.expired != expired_before:
             self._stats.dropped["expired"] += queue.expired - expired_before
         return complete
 
-    def _add_run(self, path: Path, remote: Address, run: Run, out: list[Batch], now: float) -> int:
-        """Append a run's datagrams and return their bytes."""
-        message = run.message
-        total = 0
-        for index in range(run.first, run.first + run.symbols):
-            number = path.recovery.take_number()
-            datagram = b"".join(
-                (
-                    self._header(path, number),
-                    frame.encode_fragment_head(message.number, message.total, message.symbol, index),
-                    message.symbol_data(index),
-                )
-            )
-            path.recovery.on_sent(number, now, len(datagram), fragment=(message, index))
-            out.append(Batch(remote, datagram, len(datagram)))
-            total += len(datagram)
+    def _add_run(self, path: Path, remote: Address, run: Run, burst: Burst, now: float) -> int:
+        """Add a run's datagrams and return their bytes."""
+        end, sources = run.first + run.symbols, run.message.count
         path.waits_for_answer(now)
         self._stats.datagrams["sent", "data"] += run.symbols
-        return total
+        if run.first < sources < end:  # the last source symbol may be shorter than what follows
+            head = self._add_symbols(path, remote, run.message, range(run.first, sources), burst, now)
+            return head + self._add_symbols(path, remote, run.message, range(sources, end), burst, now)
+        return self._add_symbols(path, remote, run.message, range(run.first, end), burst, now)
 
-    def _add_control(self, path: Path, out: list[Batch], now: float) -> None:
+    def _add_symbols(
+        self, path: Path, remote: Address, message: OutboundMessage, indices: range, burst: Burst, now: float
+    ) -> int:
+        """Build a datagram for each symbol, all but the last equally long, straight into one buffer."""
+        count = len(indices)
+        symbol, message_number, total = message.symbol, message.number, message.total
+        segment = FRAGMENT_DATAGRAM_BYTES + symbol
+        first_number = path.recovery.take_numbers(count)
+        head = frame.clear_head(self._identity.interface_id, path.remote_id)
+        session = self._identity.session
+        pack, symbol_data = frame.FRAGMENT_DATAGRAM.pack_into, message.symbol_data
+        buffer = bytearray(segment * count)
+        end = 0
+        for number, index in enumerate(indices, first_number):
+            pack(buffer, end, head, session, number, FRAGMENT_TYPE, message_number, total, symbol, index)
+            data = symbol_data(index)
+            start = end + FRAGMENT_DATAGRAM_BYTES
+            end = start + len(data)
+            buffer[start:end] = data
+        del buffer[end:]
+        last = end - segment * (count - 1)
+        path.recovery.on_run_sent(first_number, count, now, segment, last, message, indices.start)
+        burst.add(remote, buffer, segment if count > 1 else last, count)
+        self._sent(path, end)
+        return end
+
+    def _sent(self, path: Path, size: int) -> None:
+        path.bytes_sent += size
+        self._stats.bytes["sent"] += size
+
+    def _add_control(self, path: Path, burst: Burst, now: float) -> None:
         pending = path.pending
         if path.received.ack_at is not None and (pending or path.received.ack_at <= now or len(path.queue)):
             ranges, delay = path.received.take_ack(now)
@@ -130,53 +185,52 @@ class DatagramBuilder:
             return
         while pending:
             taken, finished = _fill(pending)
-            number = path.recovery.take_number()
+            number = path.recovery.take_numbers()
             datagram = b"".join((self._header(path, number), *taken))
-            if finished is not None:
-                path.recovery.on_sent(number, now, len(datagram), finished=finished)
+            if finished:
+                path.recovery.on_finished_sent(number, now, len(datagram), finished)
                 path.waits_for_answer(now)
-            out.append(Batch(path.remote, datagram, len(datagram)))
-            self._stats.datagrams["sent", "control"] += 1
+            self._add_alone(path, path.remote, datagram, burst)
 
-    def _add_probe(self, path: Path, out: list[Batch], now: float) -> None:
+    def _add_probe(self, path: Path, burst: Burst, now: float) -> None:
         probe = frame.encode_probe(frame.Probe(path.next_probe(now, self._rng)))
         if path.state is PathState.DOWN:
             me = self._identity
             probe = frame.encode_hello(frame.Hello(me.token, me.incarnation)) + probe
         for address in path.destinations():
-            datagram = self._header(path, path.recovery.take_number()) + probe
-            out.append(Batch(address, datagram, len(datagram)))
-            self._stats.datagrams["sent", "control"] += 1
+            self._add_alone(path, address, self._header(path, path.recovery.take_numbers()) + probe, burst)
 
-    def _add_mtu_probe(self, path: Path, out: list[Batch], now: float) -> None:
+    def _add_mtu_probe(self, path: Path, burst: Burst, now: float) -> None:
         """Add a padded probe. Nobody waits for its acknowledgement, and its loss says nothing of the rest."""
         probe_id = path.take_probe_id()
         size = path.mtu.next_probe(probe_id, now, MTU_PROBE_TIMEOUTS * path.recovery.rtt.probe_timeout(0.0))
         if size is None or path.remote is None:
             return
-        head = self._header(path, path.recovery.take_number()) + frame.encode_probe(frame.Probe(probe_id))
-        out.append(Batch(path.remote, head + frame.encode_padding(size - len(head)), size))
+        head = self._header(path, path.recovery.take_numbers()) + frame.encode_probe(frame.Probe(probe_id))
+        self._add_alone(path, path.remote, head + frame.encode_padding(size - len(head)), burst)
+
+    def _add_alone(self, path: Path, address: Address, datagram: bytes, burst: Burst) -> None:
+        burst.add(address, datagram, len(datagram))
         self._stats.datagrams["sent", "control"] += 1
+        self._sent(path, len(datagram))
 
     def _header(self, path: Path, number: int) -> bytes:
         me = self._identity
         return frame.encode_header(Header(me.interface_id, path.remote_id, me.session, number))
 
 
-def _fill(pending: list[bytes]) -> tuple[list[bytes], int | None]:
-    """Take the frames of one datagram from `pending`, at most one FINISHED (its message number is returned)."""
+def _fill(pending: list[bytes]) -> tuple[list[bytes], tuple[int, ...]]:
+    """Take the frames of one datagram from `pending`; returns them and the messages that they report FINISHED."""
     size = 0
-    finished: int | None = None
+    finished: list[int] = []
     count = 0
     for encoded in pending:
         if size + len(encoded) > BASE_FRAMES_BYTES or count == frame.MAX_FRAMES:
             break
         if encoded[0] == frame.FINISHED_TYPE:
-            if finished is not None:
-                break
-            finished = frame.finished_number(encoded)
+            finished.append(frame.finished_number(encoded))
         size += len(encoded)
         count += 1
     taken = pending[:count]
     del pending[:count]
-    return taken, finished
+    return taken, tuple(finished)

@@ -69,7 +69,7 @@ MAX_ACK_RANGES = 32
 MAX_FRAMES = 64
 """Frames in one datagram; an honest one holds a handful."""
 
-_PADDING, _PROBE, _PROBE_REPLY, _ACK, _FRAGMENT, FINISHED_TYPE, _CLOSE, _HELLO = 0, 1, 2, 3, 4, 6, 8, 9
+_PADDING, _PROBE, _PROBE_REPLY, _ACK, FRAGMENT_TYPE, FINISHED_TYPE, _CLOSE, _HELLO = 0, 1, 2, 3, 4, 6, 8, 9
 
 _U32 = struct.Struct(">I")
 _U64 = struct.Struct(">Q")
@@ -84,6 +84,10 @@ FRAGMENT_OVERHEAD_BYTES = HEADER_BYTES + _TYPED_FRAGMENT_HEAD.size + TAG_BYTES
 BASE_SYMBOL_BYTES = pmtu.BASE_BYTES - FRAGMENT_OVERHEAD_BYTES
 """Symbol that every path carries."""
 MAX_SYMBOL_BYTES = MAX_DATAGRAM_BYTES - FRAGMENT_OVERHEAD_BYTES
+FRAGMENT_DATAGRAM = struct.Struct(">IQQBQIHH")
+"""What goes before the symbol in a datagram that holds nothing but a FRAGMENT or REPAIR: the header, its first four
+bytes as one number, and the frame's head."""
+FRAGMENT_DATAGRAM_BYTES = FRAGMENT_DATAGRAM.size
 MIN_SYMBOL_BYTES = 256
 """Smaller symbols would let a peer make us count millions of fragments for one message."""
 
@@ -155,6 +159,11 @@ def symbol_count(total: int, symbol: int) -> int:
     return max(1, -(-total // symbol))
 
 
+def clear_head(sender: InterfaceId, receiver: InterfaceId) -> int:
+    """Return the first four bytes of a header as one number."""
+    return FIRST_BYTE << 24 | sender << 8 | receiver
+
+
 def encode_header(header: Header) -> bytes:
     """Return the 20 clear bytes."""
     return HEADER.pack(FIRST_BYTE, 0, *header)
@@ -211,7 +220,7 @@ def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
 
 def encode_fragment_head(message: int, total: int, symbol: int, index: int) -> bytes:
     """Return the bytes that go before the symbol itself."""
-    return _TYPED_FRAGMENT_HEAD.pack(_FRAGMENT, message, total, symbol, index)
+    return _TYPED_FRAGMENT_HEAD.pack(FRAGMENT_TYPE, message, total, symbol, index)
 
 
 def encode_finished(frame: Finished) -> bytes:
@@ -255,7 +264,7 @@ def decode_frames(view: memoryview) -> list[Frame]:
             position += 1
             if kind == _PADDING:
                 position = _skip_padding(view, position)
-            elif kind == _FRAGMENT:
+            elif kind == FRAGMENT_TYPE:
                 fragment, position = _decode_fragment(view, position)
                 frames.append(fragment)
             elif kind == _ACK:

@@ -9,9 +9,20 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
+from protos.model import InterfaceId, SessionId
 from sidecar.core import frame
-from sidecar.core.datagrams import BURST_DATAGRAMS, Batch, DatagramBuilder
-from sidecar.core.frame import HEADER_BYTES, Header
+from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
+from sidecar.core.frame import (
+    FRAGMENT_DATAGRAM,
+    FRAGMENT_DATAGRAM_BYTES,
+    FRAGMENT_TYPE,
+    HEADER_BYTES,
+    MAX_MESSAGE_BYTES,
+    MAX_SYMBOL_BYTES,
+    MIN_SYMBOL_BYTES,
+    Fragment,
+    Header,
+)
 from sidecar.core.link_events import (
     FragmentsLost,
     FragmentsReceived,
@@ -44,11 +55,11 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Iterable
 
-    from protos.model import Address, InterfaceId, NodeName, SessionId
+    from protos.model import Address, NodeName
     from sidecar.core.datagrams import LinkIdentity
     from sidecar.core.link_events import LinkPeer
     from sidecar.core.outbound import OutboundMessage
-    from sidecar.core.recovery import Sent
+    from sidecar.core.sent import Sent
 
 MEASURE_EVERY_S = 0.25
 """How often a path's round-trip times go to the engine."""
@@ -71,8 +82,6 @@ class Link:
         self._carrier = True
         self._closing = False
         self._events: deque[LinkEvent] = deque()
-        self._fragments: FragmentsReceived | None = None
-        """Those of the batch that is being received."""
         self._mtu = LinkMtu(self._events)
         self._dirty: dict[PathId, Path] = {}
         self._timers: Timers[PathId] = Timers()
@@ -86,13 +95,93 @@ class Link:
 
         Fragments in the events view `data`: it must keep until the engine has had all events.
         """
-        self._fragments = None
-        for start in range(0, len(data) or 1, segment):  # an empty datagram is one, too
-            self._receive_datagram(data[start : start + segment], source, now)
+        self.stats.bytes["received"] += len(data)
+        end = len(data)
+        position = self._receive_fragments(data, 0, segment, source, now)
+        while position < end or not end:
+            self._receive_datagram(data[position : position + segment], source, now)
+            position += segment
+            if position >= end:
+                break
+            position = self._receive_fragments(data, position, segment, source, now)
+
+    def _receive_fragments(self, data: memoryview, position: int, segment: int, source: Address, now: float) -> int:
+        """Take the datagrams from `position` on that hold one FRAGMENT and nothing else, as long as they are of one
+        path and come in order; returns the position of the first that is not. Nearly all datagrams of a long message
+        are such. What looks odd is left to `_receive_datagram`.
+        """
+        end = len(data)
+        if end - position < FRAGMENT_DATAGRAM_BYTES:
+            return position
+        unpack, new = FRAGMENT_DATAGRAM.unpack_from, tuple.__new__
+        head, session, first, *_ = unpack(data, position)
+        path = self._path_of_head(head, session)
+        if path is None or first <= path.received.largest:
+            return position
+        received = path.received
+        largest = received.largest
+        low = first
+        high = first - 1
+        fragments: list[Fragment] = []
+        while end - position >= FRAGMENT_DATAGRAM_BYTES:
+            its_head, its_session, number, kind, message, total, symbol, index = unpack(data, position)
+            stop = min(position + segment, end)
+            length = min(symbol, total - index * symbol)
+            if (
+                number <= high
+                or kind != FRAGMENT_TYPE
+                or its_head != head
+                or its_session != session
+                or position + FRAGMENT_DATAGRAM_BYTES + length != stop
+                or not MIN_SYMBOL_BYTES <= symbol <= MAX_SYMBOL_BYTES
+                or total > MAX_MESSAGE_BYTES
+                or (length <= 0 and (index or total))
+            ):
+                break
+            if number != high + 1 and fragments:
+                received.add_run(low, high, now)
+                low = number
+            high = number
+            symbol_data = data[position + FRAGMENT_DATAGRAM_BYTES : stop]
+            fragments.append(new(Fragment, (message, total, symbol, index, symbol_data)))
+            position = stop
+        if fragments:
+            received.add_run(low, high, now)
+            assert received.largest > largest
+            self._heard(path, source, now, newest=True)
+            self.stats.datagrams["received", "data"] += len(fragments)
+            self._hand_up(path, fragments)
+            received.owe_ack(now, len(fragments))
+        return position
+
+    def _path_of_head(self, head: int, session: int) -> Path | None:
+        """Return the path that a datagram of this clear head (its first four bytes) and session came over."""
+        peer = self._by_session.get(SessionId(session))
+        if peer is None:
+            return None
+        sender = InterfaceId(head >> 8 & 0xFF)
+        if head != frame.clear_head(sender, self.identity.interface_id):
+            return None
+        return self._paths.get((peer.name, sender))
+
+    def _heard(self, path: Path, source: Address, now: float, *, newest: bool) -> None:
+        """A datagram that is neither forged nor a duplicate came; `newest`: sent after all that came before."""
+        if newest and source != path.remote:
+            self._mtu.moved(path, source, now)
+        if path.state is PathState.DOWN:
+            path.hasten_probe(now)
+        self._dirty[path.id] = path
+
+    def _hand_up(self, path: Path, fragments: list[Fragment]) -> None:
+        """Append to the event before, if it is of the same path and session."""
+        before = self._events[-1] if self._events else None
+        if isinstance(before, FragmentsReceived) and before.path is path.id and before.session == path.session:
+            before.fragments.extend(fragments)
+        else:
+            self._events.append(FragmentsReceived(path.id, path.session, fragments))
 
     def _receive_datagram(self, data: memoryview, source: Address, now: float) -> None:
         stats = self.stats
-        stats.bytes["received"] += len(data)
         try:
             header = frame.decode_header(data)
             peer = self._by_session.get(header.session)
@@ -113,16 +202,11 @@ class Link:
         except DecodeError:
             stats.dropped["malformed"] += 1
             return
+        newest = header.packet_number > path.received.largest
         if not path.received.add(header.packet_number, now):
             stats.dropped["duplicate"] += 1
             return
-        if header.packet_number > path.largest_received:
-            path.largest_received = header.packet_number
-            if source != path.remote:
-                self._mtu.moved(path, source, now)
-        if path.state is PathState.DOWN:
-            path.hasten_probe(now)
-        self._dirty[path.id] = path
+        self._heard(path, source, now, newest=newest)
         self._receive_frames(path, frames, now)
 
     def execute(self, command: LinkCommand, now: float) -> None:
@@ -199,15 +283,15 @@ class Link:
 
     def batches_to_send(self, now: float) -> list[Batch]:
         """Build what may leave now, at most about BURST_DATAGRAMS; call again until nothing comes."""
-        out: list[Batch] = []
+        burst = Burst()
         probing = self._may_probe
         for path in list(self._dirty.values()):
-            if self._builder.build(path, out, now, probing=probing):
+            if self._builder.build(path, burst, now, probing=probing):
                 del self._dirty[path.id]
                 self._arm(path)
-            if len(out) >= BURST_DATAGRAMS:
+            if burst.full:
                 break
-        return out
+        return burst.batches
 
     # -- receiving ------------------------------------------------------------------------------------------------
 
@@ -231,7 +315,7 @@ class Link:
                 case frame.Fragment():
                     eliciting = True
                     kind = "data"
-                    self._add_fragment(path, item)
+                    self._hand_up(path, [item])
                 case frame.AckFrame():
                     self._receive_ack(path, item, now)
                 case frame.Probe(probe_id) if self._closing:
@@ -261,26 +345,17 @@ class Link:
         if eliciting:
             path.received.owe_ack(now)
 
-    def _add_fragment(self, path: Path, fragment: frame.Fragment) -> None:
-        event = self._fragments
-        if event is None or event.path is not path.id or event.session != path.session:
-            event = self._fragments = FragmentsReceived(path.id, path.session, [])
-            self._events.append(event)
-        event.fragments.append(fragment)
-
     def _receive_ack(self, path: Path, ack: frame.AckFrame, now: float) -> None:
         recovery = path.recovery
         newly = recovery.on_ack(ack, now)
         if newly is None:
             self.stats.dropped["acks_the_unsent"] += 1
             return
+        _mark_acked(recovery.late(ack, now))
         if not newly:
             return
-        for datagram in newly:
-            if datagram.fragment is not None:
-                message, index = datagram.fragment
-                message.acked[index] = 1
-        path.mtu.on_delivered(max(datagram.size for datagram in newly))
+        _mark_acked(newly)
+        path.mtu.on_delivered(max(run.longest for run in newly))
         if recovery.sample is not None:
             path.control.on_acked(recovery.sample, recovery.rtt, now)
         path.note_rtt()
@@ -350,7 +425,7 @@ class Link:
         recovery = path.recovery
         lost = recovery.detect_lost(now)
         if lost:
-            size = sum(datagram.size for datagram in lost)
+            size = sum(run.size for run in lost)
             path.control.on_lost(size, lost[-1].at, recovery.in_flight, now)
             self._lost(path, lost, now)
 
@@ -384,15 +459,16 @@ class Link:
 
     def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
         by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}
-        for datagram in lost:
-            if datagram.fragment is not None:
-                message, index = datagram.fragment
-                if message.needs(index):
-                    by_message.setdefault(message.number, (message, []))[1].append(index)
-            elif datagram.finished is not None and path.state is not PathState.DOWN:
-                self._owe(path, frame.encode_finished(frame.Finished(datagram.finished)))
+        for run in lost:
+            if run.message is not None:
+                missing = filter(run.message.needs, run.indices)
+                by_message.setdefault(run.message.number, (run.message, []))[1].extend(missing)
+            elif path.state is not PathState.DOWN:
+                for number in run.finished:
+                    self._owe(path, frame.encode_finished(frame.Finished(number)))
         for message, indices in by_message.values():
-            self._events.append(FragmentsLost(path.id, message, tuple(indices), timed_out))
+            if indices:
+                self._events.append(FragmentsLost(path.id, message, tuple(indices), timed_out))
 
     def _measure(self) -> None:
         for path in self._paths.values():
@@ -483,3 +559,9 @@ class Link:
             path.control.next_release(recovery.in_flight) if len(path.queue) else None,
         )
         self._timers.arm(path.id, min((timer for timer in timers if timer is not None), default=None))
+
+
+def _mark_acked(runs: list[Sent]) -> None:
+    for run in runs:
+        if run.message is not None:
+            run.message.acked[run.symbol : run.symbol + run.datagrams] = b"\1" * run.datagrams

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from protos.model import Address
     from sidecar.core.link_events import LinkEvent
     from sidecar.core.paths import Path
-    from sidecar.core.recovery import Sent
+    from sidecar.core.sent import Sent
 
 DEFAULT_MTU = 1500
 """Ethernet's, in bytes; until the interface's own is known."""
@@ -66,7 +66,7 @@ class LinkMtu:
     def lost(self, path: Path, lost: list[Sent], now: float) -> None:
         """These datagrams were found lost at once; call it before they are sent again."""
         # Those that are longer than what is sent now left before it fell, and say nothing of what is sent now.
-        large = sum(BASE_BYTES < datagram.size <= path.mtu.size for datagram in lost)
+        large = sum(run.within(BASE_BYTES + 1, path.mtu.size) for run in lost)
         if large and path.mtu.on_lost(large, now):
             self._fell(path)
 

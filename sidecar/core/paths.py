@@ -49,7 +49,6 @@ class Path:
         "candidates",
         "control",
         "id",
-        "largest_received",
         "mtu",
         "pending",
         "probe_at",
@@ -82,7 +81,6 @@ class Path:
         self.queue = SendQueue()
         self.pending: list[bytes] = []
         """Encoded control frames that wait for the next datagram."""
-        self.largest_received = -1
         self.probe_at: float | None = now
         self.rtts: list[float] = []
         self.bytes_sent = 0

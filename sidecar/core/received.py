@@ -26,18 +26,27 @@ class ReceivedPackets:
         self._unacked = 0
         self._gap = False
 
+    @property
+    def largest(self) -> int:
+        """The largest packet number that came; -1 before the first."""
+        return self._ranges[0][1] if self._ranges else -1
+
+    def add_run(self, low: int, high: int, now: float) -> None:
+        """Note consecutive packet numbers, all of them larger than any before."""
+        ranges = self._ranges
+        if ranges and low == ranges[0][1] + 1:
+            ranges[0][1] = high
+        else:
+            self._gap = self._gap or bool(ranges)
+            ranges.insert(0, [low, high])
+            while len(ranges) > MAX_ACK_RANGES or ranges[-1][1] < high - STALE_PACKETS:
+                self._floor = ranges.pop()[1]
+        self._largest_at = now
+
     def add(self, number: int, now: float) -> bool:
         """Note a packet number; False when it came before or is older than what is remembered."""
-        ranges = self._ranges
-        if not ranges or number > ranges[0][1]:
-            if ranges and number == ranges[0][1] + 1:
-                ranges[0][1] = number
-            else:
-                self._gap = bool(ranges)
-                ranges.insert(0, [number, number])
-                while len(ranges) > MAX_ACK_RANGES or ranges[-1][1] < number - STALE_PACKETS:
-                    self._floor = ranges.pop()[1]
-            self._largest_at = now
+        if number > self.largest:
+            self.add_run(number, number, now)
             return True
         if number <= self._floor or not self._fill(number):
             return False
@@ -72,9 +81,9 @@ class ReceivedPackets:
             return False
         return True
 
-    def owe_ack(self, now: float) -> None:
-        """An ack-eliciting datagram came: acknowledge it soon, or now when it shows a gap or is the second one."""
-        self._unacked += 1
+    def owe_ack(self, now: float, count: int = 1) -> None:
+        """Ack-eliciting datagrams came: acknowledge soon, or now when they show a gap or one is the second."""
+        self._unacked += count
         if self._unacked >= ACK_EVERY or self._gap:
             self._ack_at = now
         elif self._ack_at is None:

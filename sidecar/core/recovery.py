@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from bisect import bisect_right
+from operator import attrgetter
+from typing import TYPE_CHECKING
 
 from sidecar.core.congestion import RateSample
 from sidecar.core.received import MAX_ACK_DELAY_S
+from sidecar.core.reordering import Reordering
 from sidecar.core.rtt import RttEstimator
+from sidecar.core.sent import Sent
 
 if TYPE_CHECKING:
     from sidecar.core.frame import AckFrame
     from sidecar.core.outbound import OutboundMessage
 
-PACKET_THRESHOLD = 3
-"""A datagram is lost when one sent this many later is acknowledged (RFC 9002 section 6.1.1)."""
 PTO_DATAGRAMS = 2
 """How many of the oldest datagrams a probe timeout gives up (RFC 9002 section 6.2.4 allows two probes)."""
 MAX_PTO_BACKOFF = 6
 """Probe timeouts stop doubling here; the path is long down by then."""
 
-
-class Sent(NamedTuple):
-    """An ack-eliciting datagram in flight."""
-
-    at: float
-    size: int
-    delivered: int
-    """Bytes acknowledged on the path when it left (for the delivery rate)."""
-    fragment: tuple[OutboundMessage, int] | None
-    """The message and index of the symbol it carries."""
-    finished: int | None
-    """The message it reports FINISHED."""
+_first = attrgetter("first")
 
 
 class Recovery:
@@ -40,10 +31,10 @@ class Recovery:
         "_lost_at",
         "_next_number",
         "_pto_count",
-        "acked_bytes",
         "in_flight",
         "largest_acked",
         "last_eliciting_at",
+        "reordering",
         "rtt",
         "sample",
         "sent",
@@ -53,11 +44,12 @@ class Recovery:
 
     def __init__(self, first_number: int) -> None:
         self.rtt = RttEstimator()
-        self.sent: dict[int, Sent] = {}
+        self.reordering = Reordering()
+        self.sent: list[Sent] = []
+        """In the order of their packet numbers."""
         self.sample: RateSample | None = None
         """What the last acknowledgement says of the path's rate; None when it acknowledged no fragment."""
         self.in_flight = 0
-        self.acked_bytes = 0
         self.largest_acked = first_number - 1
         self.last_eliciting_at = 0.0
         self.total_sent = 0
@@ -71,89 +63,132 @@ class Recovery:
         """The packet number that comes next."""
         return self._next_number
 
-    def take_number(self) -> int:
-        """Return the packet number of the next datagram."""
+    def take_numbers(self, count: int = 1) -> int:
+        """Return the first of the packet numbers of the next `count` datagrams."""
         number = self._next_number
-        self._next_number += 1
-        self.total_sent += 1
+        self._next_number += count
+        self.total_sent += count
         return number
 
-    def on_sent(
-        self,
-        number: int,
-        now: float,
-        size: int,
-        fragment: tuple[OutboundMessage, int] | None = None,
-        finished: int | None = None,
+    def on_run_sent(
+        self, first: int, count: int, now: float, segment: int, last: int, message: OutboundMessage, index: int
     ) -> None:
-        """An ack-eliciting datagram left."""
-        self.sent[number] = Sent(now, size, self.acked_bytes, fragment, finished)
-        self.in_flight += size
-        self.last_eliciting_at = now
+        """Datagrams left that carry the symbols of `message` from `index` on, one each; sizes as in `Sent`."""
+        self._note(Sent(first, count, now, segment, last, message, index))
+
+    def on_finished_sent(self, number: int, now: float, size: int, finished: tuple[int, ...]) -> None:
+        """A datagram left that reports these messages FINISHED."""
+        self._note(Sent(number, 1, now, size, size, finished=finished))
+
+    def _note(self, sent: Sent) -> None:
+        self.sent.append(sent)
+        self.in_flight += sent.size
+        self.last_eliciting_at = sent.at
 
     def on_ack(self, ack: AckFrame, now: float) -> list[Sent] | None:
         """Take an acknowledgement and return what it newly acknowledges; None when it acknowledges the unsent."""
         largest = ack.ranges[0][1]
         if largest >= self._next_number:
             return None
-        sent = self.sent
         newly: list[Sent] = []
-        newest: Sent | None = sent.get(largest)
-        oldest = next(iter(sent), self._next_number)
         for low, high in ack.ranges:
-            if high < oldest:
-                break
             # From the oldest in flight on: what a peer repeats or makes up below it costs nothing.
-            for number in range(max(low, oldest), high + 1):
-                datagram = sent.pop(number, None)
-                if datagram is not None:
-                    self.in_flight -= datagram.size
-                    self.acked_bytes += datagram.size
-                    newly.append(datagram)
+            if not self.sent or high < self.sent[0].first:
+                break
+            self._acknowledge(low, high, newly)
         self.sample = None
-        carried = [datagram for datagram in newly if datagram.fragment is not None]
-        if carried:
-            sent_at = max(datagram.at for datagram in carried)
-            size = sum(datagram.size for datagram in carried)
-            self.sample = RateSample(size, sent_at, now - sent_at if newest is not None else 0.0, self.in_flight)
-        if newest is not None:
-            self.rtt.sample(now - newest.at, now, ack.delay_s)
         if newly:
+            self._measure(newly, largest, ack.delay_s, now)
             self._pto_count = 0
             self.largest_acked = max(self.largest_acked, largest)
         return newly
 
+    def _acknowledge(self, low: int, high: int, newly: list[Sent]) -> None:
+        """Move what the inclusive range covers from `sent` to `newly`; the rest of the runs it cuts stays."""
+        runs = self.sent
+        start = bisect_right(runs, low, key=_first)
+        if start and runs[start - 1].end > low:
+            start -= 1
+        end = start
+        rest: list[Sent] = []
+        while end < len(runs) and runs[end].first <= high:
+            run = runs[end]
+            end += 1
+            if run.first < low:
+                rest.append(run.cut(run.first, low))
+            if run.end > high + 1:
+                rest.append(run.cut(high + 1, run.end))
+            part = run.cut(max(low, run.first), min(high + 1, run.end))
+            self.in_flight -= part.size
+            newly.append(part)
+        runs[start:end] = rest
+
+    def _measure(self, newly: list[Sent], largest: int, peer_delay_s: float, now: float) -> None:
+        newest_at = next((run.at for run in newly if run.end == largest + 1), None)
+        carried = [run for run in newly if run.message is not None]
+        if carried:
+            sent_at = max(run.at for run in carried)
+            size = sum(run.size for run in carried)
+            self.sample = RateSample(size, sent_at, now - sent_at if newest_at is not None else 0.0, self.in_flight)
+        if newest_at is not None:
+            self.rtt.sample(now - newest_at, now, peer_delay_s)
+
+    def late(self, ack: AckFrame, now: float) -> list[Sent]:
+        """Return what an acknowledgement says to have arrived although it was declared lost."""
+        return self.reordering.late(ack.ranges, self.rtt, now)
+
     def detect_lost(self, now: float) -> list[Sent]:
         """Return what packet and time threshold call lost by now, and arm the time threshold for the rest."""
         self._lost_at = None
-        delay = self.rtt.loss_delay()
-        lost: list[int] = []
-        for number, datagram in self.sent.items():
-            if number > self.largest_acked:
+        delay = self.reordering.loss_delay(self.rtt)
+        threshold = self.reordering.packet_threshold
+        overtaken = self.largest_acked - threshold if threshold is not None else -1
+        lost: list[Sent] = []
+        whole = 0
+        for run in self.sent:
+            if run.first > self.largest_acked:
                 break
-            if self.largest_acked - number >= PACKET_THRESHOLD or datagram.at + delay <= now:
-                lost.append(number)
-            else:
-                self._lost_at = datagram.at + delay
+            if run.at + delay > now and run.end - 1 > overtaken:
+                if run.first <= overtaken:
+                    lost.append(run.cut(run.first, overtaken + 1))
+                    self.sent[whole] = run.cut(overtaken + 1, run.end)
+                self._lost_at = run.at + delay
                 break
-        return [self._forget(number) for number in lost]
+            lost.append(run)
+            whole += 1
+        del self.sent[:whole]
+        return self._lose(lost, by_threshold=True)
 
     def on_probe_timeout(self, now: float) -> list[Sent]:
         """The probe timeout passed: give up the oldest datagrams so that their content travels again."""
         self._pto_count = min(self._pto_count + 1, MAX_PTO_BACKOFF)
         self.last_eliciting_at = now
-        oldest = list(self.sent)[:PTO_DATAGRAMS]
-        return [self._forget(number) for number in oldest]
+        lost: list[Sent] = []
+        left = PTO_DATAGRAMS
+        while self.sent and left:
+            run = self.sent[0]
+            part = run.cut(run.first, run.first + min(left, run.datagrams))
+            self.sent[:1] = [run.cut(part.end, run.end)] if part.end < run.end else []
+            left -= part.datagrams
+            lost.append(part)
+        return self._lose(lost, by_threshold=False)
 
     def give_up_all(self) -> list[Sent]:
         """The path is dead: everything in flight counts as lost."""
-        return [self._forget(number) for number in list(self.sent)]
+        lost, self.sent = self.sent, []
+        self._lost_at = None
+        return self._forget(lost)
 
-    def _forget(self, number: int) -> Sent:
-        datagram = self.sent.pop(number)
-        self.in_flight -= datagram.size
-        self.total_lost += 1
-        return datagram
+    def _lose(self, lost: list[Sent], *, by_threshold: bool) -> list[Sent]:
+        if lost:
+            self.reordering.note_lost(lost, by_threshold=by_threshold)
+        return self._forget(lost)
+
+    def _forget(self, lost: list[Sent]) -> list[Sent]:
+        for run in lost:
+            self.in_flight -= run.size
+            self.total_lost += run.datagrams
+        return lost
 
     @property
     def loss_timer(self) -> float | None:

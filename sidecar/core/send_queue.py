@@ -14,6 +14,7 @@ from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
+from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
@@ -188,7 +189,7 @@ class SendQueue:
         while (heap := self._head(chosen, now, pace, round_trip_s)) is not None:
             entry = heap[0][2]
             message = entry.message
-            size = message.symbol
+            size = message.symbol + FRAGMENT_OVERHEAD_BYTES
             run = entry.take(max(1, min(most, budget // size, MAX_RUN_BYTES // size)))
             if run is not None:
                 return Run(message, *run)

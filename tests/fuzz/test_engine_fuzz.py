@@ -92,7 +92,7 @@ class Rogue:
         for interface, link in self.node.links.items():
             for path in link._paths.values():
                 if path.peer == self.victim.name:
-                    number = path.recovery.take_number()
+                    number = path.recovery.take_numbers()
                     yield (
                         interface,
                         Header(link.identity.interface_id, path.remote_id, self.node.session, number),

@@ -69,7 +69,7 @@ def assert_bounded(bench: Bench) -> None:
     for path in link._paths.values():
         assert len(path.pending) <= MAX_PENDING_FRAMES
         assert len(path.received._ranges) <= MAX_ACK_RANGES
-        assert 0 <= path.recovery.in_flight == sum(sent.size for sent in path.recovery.sent.values())
+        assert 0 <= path.recovery.in_flight == sum(sent.size for sent in path.recovery.sent)
         assert path.control.window > 0
     assert len(link.stats.dropped) < 20
 

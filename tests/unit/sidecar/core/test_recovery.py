@@ -1,14 +1,19 @@
 from __future__ import annotations
 
 import random
+from typing import TYPE_CHECKING
 
 import pytest
 
 from sidecar.core import frame
 from sidecar.core.frame import AckFrame
 from sidecar.core.received import MAX_ACK_DELAY_S, ReceivedPackets
-from sidecar.core.recovery import MAX_PTO_BACKOFF, PACKET_THRESHOLD, PTO_DATAGRAMS, Recovery, Sent
+from sidecar.core.recovery import MAX_PTO_BACKOFF, PTO_DATAGRAMS, Recovery
+from sidecar.core.reordering import PACKET_THRESHOLD
 from tests.unit.sidecar.core.builders import message
+
+if TYPE_CHECKING:
+    from sidecar.core.sent import Sent
 
 
 def ack(*ranges: tuple[int, int], delay_s: float = 0.0) -> AckFrame:
@@ -18,21 +23,21 @@ def ack(*ranges: tuple[int, int], delay_s: float = 0.0) -> AckFrame:
 def with_sent(count: int, *, at: float = 1.0, every_s: float = 0.0, first: int = 0) -> Recovery:
     recovery = Recovery(first)
     for index in range(count):
-        recovery.on_sent(recovery.take_number(), at + index * every_s, 100, finished=index)
+        recovery.on_finished_sent(recovery.take_numbers(), at + index * every_s, 100, (index,))
     return recovery
 
 
-def numbers(lost: list[Sent]) -> list[int | None]:
-    return [datagram.finished for datagram in lost]
+def numbers(gone: list[Sent] | None) -> list[int]:
+    assert gone is not None
+    return [number for run in gone for number in range(run.first, run.end)]
 
 
 def test_acknowledged_datagrams_leave_the_flight() -> None:
     recovery = with_sent(5)
     assert recovery.in_flight == 500
     newly = recovery.on_ack(ack((3, 4), (0, 0)), 1.1)
-    assert newly is not None
-    assert sorted(datagram.finished or 0 for datagram in newly) == [0, 3, 4]
-    assert (recovery.in_flight, recovery.acked_bytes, recovery.largest_acked) == (200, 300, 4)
+    assert sorted(numbers(newly)) == [0, 3, 4]
+    assert (recovery.in_flight, recovery.largest_acked) == (200, 4)
     assert recovery.rtt.latest == pytest.approx(0.1)
 
 
@@ -53,8 +58,7 @@ def test_acknowledging_the_unsent_is_refused_whole() -> None:
 def test_numbers_from_before_the_path_and_giant_ranges_are_cheap() -> None:
     recovery = with_sent(2, first=2**40)
     newly = recovery.on_ack(ack((2**40, 2**40 + 1), (0, 2**40 - 2)), 1.1)  # would never end if walked through
-    assert newly is not None
-    assert len(newly) == 2
+    assert len(numbers(newly)) == 2
 
 
 def test_lost_by_packet_threshold() -> None:
@@ -126,24 +130,34 @@ def test_sender_and_receiver_agree_whatever_the_network_does(seed: int) -> None:
     arrived: set[int] = set()
     fate: dict[int, str] = {}
     carried = message(size=0)
+    size_of: dict[int, int] = {}
 
     def settle(what: str, gone: list[Sent]) -> None:
-        for datagram in gone:
-            assert datagram.finished is not None
-            assert datagram.finished not in fate, "acknowledged or lost twice"
-            fate[datagram.finished] = what
+        for run in gone:
+            assert run.message is carried
+            for number, index in zip(range(run.first, run.end), run.indices, strict=True):
+                assert number not in fate, "acknowledged or lost twice"
+                assert index == symbol_of[number]
+                fate[number] = what
 
+    symbol_of: dict[int, int] = {}
     sent: list[int] = []
-    while len(sent) < 400 or recovery.sent:
+    while len(sent) < 600 or recovery.sent:
         now += rng.choice([0.0001, 0.001, 0.02])
-        if len(sent) < 400 and rng.random() < 0.7:
-            number = recovery.take_number()
+        if len(sent) < 600 and rng.random() < 0.7:
+            count = rng.choice([1, 1, 2, 5, 40])
+            first, index = recovery.take_numbers(count), rng.randrange(1000)
+            run = range(first, first + count)
             if rng.random() < 0.8:
-                sent.append(number)
-                recovery.on_sent(number, now, 100, (carried, 0), finished=number)
-            for _ in range(2 if rng.random() < doubling else 1):
-                arrives_at = now + rng.choice([0.01, 0.011, 0.05])
-                to_receiver += [(arrives_at, number)] if rng.random() >= loss else []
+                sent += run
+                symbol_of.update(zip(run, range(index, index + count), strict=True))
+                size_of.update((number, 100) for number in run)
+                size_of[run[-1]] = rng.choice([100, 60])
+                recovery.on_run_sent(first, count, now, 100, size_of[run[-1]], carried, index)
+            for number in run:
+                for _ in range(2 if rng.random() < doubling else 1):
+                    arrives_at = now + rng.choice([0.01, 0.011, 0.05])
+                    to_receiver += [(arrives_at, number)] if rng.random() >= loss else []
         for due in [due for due in to_receiver if due[0] <= now]:
             to_receiver.remove(due)
             new = packets.add(due[1], now)
@@ -160,7 +174,10 @@ def test_sender_and_receiver_agree_whatever_the_network_does(seed: int) -> None:
             assert isinstance(decoded, AckFrame)
             newly = recovery.on_ack(decoded, now)
             assert newly is not None, "an honest receiver acknowledges nothing unsent"
-            assert {datagram.finished for datagram in newly} <= arrived, "acknowledged without having come"
+            assert set(numbers(newly)) <= arrived, "acknowledged without having come"
+            late = numbers(recovery.late(decoded, now))
+            assert {fate[number] for number in late} <= {"lost"}, "late is what was lost before"
+            assert set(late) <= arrived
             settle("acked", newly)
             settle("lost", recovery.detect_lost(now))
         if recovery.loss_timer is not None:
@@ -168,7 +185,8 @@ def test_sender_and_receiver_agree_whatever_the_network_does(seed: int) -> None:
                 settle("lost", recovery.detect_lost(now))
         elif recovery.pto_timer is not None and recovery.pto_timer <= now:
             settle("lost", recovery.on_probe_timeout(now))
-        assert recovery.in_flight == 100 * len(recovery.sent)
+        assert recovery.in_flight == sum(size_of[number] for number in numbers(recovery.sent))
+        assert numbers(recovery.sent) == sorted(numbers(recovery.sent))
     assert recovery.in_flight == 0
     assert sorted(fate) == sent, "some datagram is neither acknowledged nor lost"
     assert recovery.total_lost == sum(what == "lost" for what in fate.values())

@@ -3,6 +3,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.priority import Priority
+from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SHARE, SendQueue
 from tests.unit.sidecar.core.builders import message
 
@@ -48,9 +49,10 @@ def test_a_run_is_what_the_budget_and_one_offload_take() -> None:
     queue = SendQueue()
     large = message(1, 500_000)
     queue.add(large)
-    assert take(queue, budget=3 * large.symbol + 5) == (1, 0, 3)
+    datagram = large.symbol + FRAGMENT_OVERHEAD_BYTES
+    assert take(queue, budget=3 * datagram + 5) == (1, 0, 3)
     assert take(queue, budget=0) == (1, 3, 1)
-    symbols = min(MAX_RUN, MAX_RUN_BYTES // large.symbol)
+    symbols = min(MAX_RUN, MAX_RUN_BYTES // datagram)
     assert take(queue, budget=MUCH) == (1, 4, symbols)
 
 
