@@ -107,6 +107,11 @@ def others(trouble: Trouble) -> tuple[str, ...]:
     return tuple(target for target in _PLANS[trouble.lane].targets if target != trouble.target)
 
 
+def ends_a_judged_process(trouble: Trouble) -> bool:
+    """Whether it ends a process whose memory is judged over the second half, and thus must not come then."""
+    return trouble.lane is Lane.CONTROL or (trouble.kind in _ENDS_A_SIDECAR and trouble.target == SERVERS[0])
+
+
 def _draw_lane(lane: Lane, rng: random.Random, length_s: float) -> list[Trouble]:
     plan = _PLANS[lane]
     troubles: list[Trouble] = []
@@ -120,13 +125,9 @@ def _draw_lane(lane: Lane, rng: random.Random, length_s: float) -> list[Trouble]
         lasts_s = 0.0 if kind in _MOMENTARY else rng.uniform(*plan.lasts_s)
         if at + lasts_s > length_s - CALM_END_S:
             return troubles
-        if not _lives_on(kind, target) or at < length_s / 2:
-            troubles.append(Trouble(lane, kind, target, at, lasts_s))
+        trouble = Trouble(lane, kind, target, at, lasts_s)
+        if at < length_s / 2 or not ends_a_judged_process(trouble):
+            troubles.append(trouble)
             at += lasts_s + rng.uniform(*plan.rest_s)
         elif lane is Lane.CONTROL:
             return troubles
-
-
-def _lives_on(kind: Kind, target: str) -> bool:
-    """Whether this trouble would end a process whose memory is judged over the second half."""
-    return kind is Kind.KILL_CONTROL or (kind in _ENDS_A_SIDECAR and target == SERVERS[0])

@@ -65,6 +65,8 @@ MEASURE_EVERY_S = 0.25
 """How often a path's round-trip times go to the engine."""
 MAX_PENDING_FRAMES = 256
 """Control frames waiting on one path; a peer that makes us owe more is not honest."""
+MAX_PATHS_OF_A_PEER = 32
+"""Of those that a peer introduces itself by; further ones wait for the control plane's word."""
 
 
 class Link:
@@ -192,10 +194,12 @@ class Link:
                 stats.dropped["wrong_interface"] += 1
                 return
             path = self._paths.get((peer.name, header.sender_interface))
-            if path is None:
-                stats.dropped["unknown_path"] += 1
-                return
             frames = frame.decode_frames(data[HEADER_BYTES:])
+            if path is None:
+                path = self._introduced(peer, header, frames[0], now)
+                if path is None:
+                    stats.dropped["unknown_path"] += 1
+                    return
         except frame.VersionError:
             stats.dropped["version"] += 1
             return
@@ -305,6 +309,20 @@ class Link:
                 self._events.append(PeerRestarted(peer.name, header.session, hello.incarnation))
                 return
         self.stats.dropped["unknown_session"] += 1
+
+    def _introduced(self, peer: LinkPeer, header: Header, first: frame.Frame, now: float) -> Path | None:
+        """A known peer speaks from an interface that the control plane has not told of (yet): believed with its token.
+
+        So a robot's new interface works before, and without, the control plane.
+        """
+        if not isinstance(first, frame.Hello) or first.token != peer.token:
+            return None
+        if sum(name == peer.name for name, _ in self._paths) >= MAX_PATHS_OF_A_PEER:
+            self.stats.dropped["paths_full"] += 1
+            return None
+        path_id = PathId(self.identity.interface, peer.name, header.sender_interface)
+        path = self._paths[peer.name, header.sender_interface] = Path(path_id, peer.session, (), self.next_number, now)
+        return path
 
     def _receive_frames(self, path: Path, frames: list[frame.Frame], now: float) -> None:
         eliciting = False
@@ -535,6 +553,11 @@ class Link:
                     path = Path(path_id, peer.session, addresses, first_number, now)
                 self._paths[peer.name, remote] = path
                 self._dirty[path.id] = path
+        for key, path in list(before.items()):
+            known = self._by_session.get(path.session)
+            if path.state is not PathState.DOWN and known is not None and key not in self._paths:
+                # It proves itself, whatever the control plane's view says: older or newer than what happened here.
+                self._paths[key] = before.pop(key)
         for path in before.values():
             if path.state is not PathState.DOWN:
                 self._take_down(path, "peer left or restarted")

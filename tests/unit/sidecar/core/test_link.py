@@ -4,7 +4,8 @@ import pytest
 
 from protos.model import InterfaceId, InterfaceName, NodeName, SessionId
 from sidecar.core import frame, pmtu
-from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Hello, Probe, ProbeReply
+from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Hello, Probe, ProbeReply, encode_header
+from sidecar.core.link import MAX_PATHS_OF_A_PEER
 from sidecar.core.link_events import (
     FragmentsLost,
     FragmentsReceived,
@@ -201,6 +202,62 @@ def test_a_rebinding_makes_a_path_unstable_until_it_answers_and_resends_what_was
     assert state_changes(bench) == [PathState.UP]
     bench.link.handle_timer(bench.now + 1)
     assert bench.link.stats.paths[A].srtt_s == pytest.approx(0.03), "the round-trip time is the new way's alone"
+
+
+NEW_INTERFACE = InterfaceId(8)
+NEW_PATH = PathId(WLAN, A, NEW_INTERFACE)
+
+
+def introduction(bench: Bench, number: int, token: bytes = PEER_TOKEN, sender: int = NEW_INTERFACE) -> None:
+    """The peer's HELLO and probe from an interface that no view has named."""
+    header = Header(InterfaceId(sender), InterfaceId(3), PEER_SESSION, number)
+    hello = frame.encode_hello(Hello(token, 1)) + frame.encode_probe(Probe(77))
+    bench.link.receive_batch(memoryview(encode_header(header) + hello), 1500, PEER_ADDRESS, bench.now)
+
+
+def test_a_peers_new_interface_is_known_by_its_hello_before_any_view_names_it() -> None:
+    bench = up()
+    introduction(bench, 0)
+    answers = frames(bench.sent())
+    assert ProbeReply(77) in answers
+    (probe,) = [item for item in answers if isinstance(item, Probe)]
+    header = Header(NEW_INTERFACE, InterfaceId(3), PEER_SESSION, 1)
+    reply = encode_header(header) + frame.encode_probe_reply(ProbeReply(probe.id))
+    bench.link.receive_batch(memoryview(reply), 1500, PEER_ADDRESS, bench.now + 0.01)
+    assert PathChanged(NEW_PATH, PathState.UP, "answers") in bench.events()
+    bench.know()  # a view that still does not name it
+    assert state_changes(bench) == []
+    assert bench.link.in_use(PEER_ADDRESS)
+
+
+def test_a_wrong_token_introduces_nobody_and_introductions_are_capped() -> None:
+    bench = up()
+    introduction(bench, 0, token=bytes(16))
+    assert bench.sent() == []
+    for interface in range(10, 10 + MAX_PATHS_OF_A_PEER):
+        introduction(bench, 0, sender=interface)
+    assert bench.link.stats.dropped == {"unknown_path": 2, "paths_full": 1}
+
+
+def test_an_introduced_path_that_is_down_is_forgotten_with_the_next_view() -> None:
+    bench = up()
+    introduction(bench, 0)
+    bench.know()
+    bench.sent()
+    introduction(bench, 1)
+    assert bench.link.stats.dropped == {}
+    assert numbers(bench.sent())[0] > 0, "packet numbers go on"
+
+
+def test_a_path_that_lives_outlives_a_view_that_forgot_it() -> None:
+    """The control plane may have heard of the interface's end and not yet of its return."""
+    bench = up()
+    bench.link.execute(SetPeers((LinkPeer(A, PEER_SESSION, PEER_TOKEN, 1, ()),)), bench.now)
+    assert state_changes(bench) == []
+    bench.wait(30.0)
+    assert state_changes(bench)[-1] is PathState.DOWN
+    bench.link.execute(SetPeers((LinkPeer(A, PEER_SESSION, PEER_TOKEN, 1, ()),)), bench.now)
+    assert bench.wait(10.0) == [], "nothing is left of it"
 
 
 def test_a_link_opened_anew_goes_on_with_the_packet_numbers_of_the_one_before() -> None:
