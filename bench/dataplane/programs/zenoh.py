@@ -40,9 +40,12 @@ class ZenohProgram:
         """Open a session for each list of endpoints; returns when each has all its links."""
         self._sessions = [_open(max_links, lease_ms, connect=endpoints) for endpoints in sessions]
         end = time.monotonic() + LINKS_TIMEOUT_S
-        while any(len(session.info.peers_zid()) == 0 for session in self._sessions):
+        while any(
+            len(session.info.links()) < len(endpoints)
+            for session, endpoints in zip(self._sessions, sessions, strict=True)
+        ):
             if time.monotonic() > end:
-                raise TimeoutError("no link came up")
+                raise TimeoutError("not all links came up")
             time.sleep(0.05)
 
     def call(self, **plan: Any) -> dict[str, Any]:
