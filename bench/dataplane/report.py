@@ -37,6 +37,7 @@ class Report:
     def as_json(self) -> dict[str, Any]:
         """The figures by their names at the top; what stands behind them below."""
         return {
+            **{target.key: None for target in TARGETS},
             **self.figures,
             "verdicts": {target.key: target.met(self.figures) for target in TARGETS},
             "machine": self.machine,
