@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core import frame
-from sidecar.core.frame import BASE_FRAMES_BYTES, FRAGMENT_DATAGRAM_BYTES, FRAGMENT_TYPE, Header
+from sidecar.core.frame import BASE_FRAMES_BYTES, FRAGMENT_DATAGRAM_BYTES, FRAGMENT_TYPE, REPAIR_TYPE, Header
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
@@ -155,11 +155,12 @@ class DatagramBuilder:
         first_number = path.recovery.take_numbers(count)
         head = frame.clear_head(self._identity.interface_id, path.remote_id)
         session = self._identity.session
+        kind = FRAGMENT_TYPE if indices.start < message.count else REPAIR_TYPE
         pack, symbol_data = frame.FRAGMENT_DATAGRAM.pack_into, message.symbol_data
         buffer = bytearray(segment * count)
         end = 0
         for number, index in enumerate(indices, first_number):
-            pack(buffer, end, head, session, number, FRAGMENT_TYPE, message_number, total, symbol, index)
+            pack(buffer, end, head, session, number, kind, message_number, total, symbol, index)
             data = symbol_data(index)
             start = end + FRAGMENT_DATAGRAM_BYTES
             end = start + len(data)

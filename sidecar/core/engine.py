@@ -18,21 +18,22 @@ from sidecar.core.events import (
     RequestFailed,
     RequestId,
 )
-from sidecar.core.fragments import Progress, Reassembler
+from sidecar.core.inbound import Decoding, Inbound
 from sidecar.core.link_events import (
     FragmentsLost,
     FragmentsReceived,
     LinkCommand,
     LinkEvent,
+    MessageAbandoned,
+    MessageDecoded,
     MessageFinished,
+    MessageForgotten,
     PathChanged,
+    PathCommand,
     PathMeasured,
     PathMtuChanged,
     PeerClosed,
     PeerRestarted,
-    Resend,
-    Send,
-    SendFinished,
     SetPeers,
 )
 from sidecar.core.mapping import MappingTable
@@ -56,7 +57,7 @@ from sidecar.core.stats import EngineStats
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceOffer
+    from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceOffer, SessionId
 
 SWEEP_EVERY_S = 1.0
 """How often old messages and half messages are looked for."""
@@ -81,7 +82,7 @@ class Engine:
         self._interfaces: set[InterfaceName] = set()
         self._carried: frozenset[ServiceName] = frozenset()
         self._sweep_at = now + SWEEP_EVERY_S
-        self._reassemblers: dict[NodeName, Reassembler] = {}
+        self._inbound = Inbound(self._to_link, self.stats)
         self.peers = Peers()
         self.routes = Routes()
         self.mapping = MappingTable(self.routes)
@@ -114,7 +115,11 @@ class Engine:
         self._events.clear()
         return events
 
-    def _to_link(self, command: Send | Resend) -> None:
+    def take_decodings(self) -> list[Decoding]:
+        """Return messages to compute outside any lock; what their `run` returns comes back as an event."""
+        return self._inbound.take_decodings()
+
+    def _to_link(self, command: PathCommand) -> None:
         self._commands.append((command.path.interface, command))
 
     # -- the application's calls ----------------------------------------------------------------------------------
@@ -230,8 +235,18 @@ class Engine:
     def on_link_event(self, event: LinkEvent, now: float) -> None:
         """Take what a link saw."""
         match event:
-            case FragmentsReceived():
-                self._on_fragments(event, now)
+            case FragmentsReceived(path, session, fragments):
+                if self._is_current(path, session):
+                    for content in self._inbound.add(path, session, fragments, now):
+                        self._on_message(path, content, now)
+            case MessageDecoded(path, session, content):
+                if self._is_current(path, session):
+                    self._on_message(path, content, now)
+            case MessageAbandoned(peer, session, number):
+                if self.peers.session(peer) == session:
+                    self._inbound.abandon(peer, number)
+            case MessageForgotten(peer, number):
+                self._outbox.on_forgotten(peer, number)
             case MessageFinished(peer, number):
                 self._outbox.on_finished(peer, number)
             case FragmentsLost():
@@ -255,26 +270,15 @@ class Engine:
                 self._on_peer_closed(peer, now)
         self.stats.in_flight = self._requests.unanswered + self._serving.running
 
-    def _on_fragments(self, event: FragmentsReceived, now: float) -> None:
-        path = event.path
-        if self.peers.session(path.peer) != event.session:
-            self.stats.dropped["fragment_of_old_session"] += len(event.fragments)
-            return
-        reassembler = self._reassemblers.get(path.peer)
-        if reassembler is None:
-            reassembler = self._reassemblers[path.peer] = Reassembler(path.peer, self.stats.dropped)
-        for fragment in event.fragments:
-            whole = reassembler.add(fragment, now)
-            if isinstance(whole, Progress):
-                if whole is Progress.ALREADY_FINISHED:
-                    self._commands.append((path.interface, SendFinished(path, fragment.message)))
-            else:
-                self._commands.append((path.interface, SendFinished(path, fragment.message)))
-                self._on_message(path, whole, now)
+    def _is_current(self, path: PathId, session: SessionId) -> bool:
+        if self.peers.session(path.peer) == session:
+            return True
+        self.stats.dropped["fragment_of_old_session"] += 1
+        return False
 
-    def _on_message(self, path: PathId, whole: memoryview, now: float) -> None:
+    def _on_message(self, path: PathId, content: memoryview, now: float) -> None:
         try:
-            message = decode_message(whole)
+            message = decode_message(content)
         except DecodeError:
             self.stats.dropped["malformed_message"] += 1
             return
@@ -328,7 +332,7 @@ class Engine:
         self._drop_if_unlisted(name, now)
 
     def _end_session(self, name: NodeName, now: float) -> None:
-        self._reassemblers.pop(name, None)
+        self._inbound.forget_peer(name)
         self._outbox.drop_peer(name)
         self.routes.forget_peer(name)
         self._update_offers(now)
@@ -352,8 +356,7 @@ class Engine:
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
             self._outbox.expire(now)
-            for reassembler in self._reassemblers.values():
-                reassembler.expire(now)
+            self._inbound.expire(now)
         dark_until = self._offers.next_timer()
         if dark_until is not None and dark_until <= now:
             self._update_offers(now)

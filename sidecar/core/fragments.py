@@ -1,13 +1,16 @@
-"""Reassembly of messages from symbols that may come over any path of a peer; capped in bytes, count and age."""
+"""Reassembly of messages from symbols that may come over any path of a peer; capped in bytes, count and age.
+
+What is dropped unfinished was acknowledged in part and would never be completed by what still comes. Its number is
+remembered, and a further symbol of it is answered FORGOTTEN: the sender sends the message anew, under another number.
+"""
 
 from __future__ import annotations
 
 import enum
 from collections import OrderedDict
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.frame import symbol_count
+from sidecar.core.partial import Partial
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -16,44 +19,45 @@ if TYPE_CHECKING:
     from sidecar.core.frame import Fragment
 
 MAX_PEER_BYTES = 64 * 1024 * 1024
-"""Announced bytes of one peer's unfinished messages: almost four of the largest. A sender keeps below it (`outbox.py`),
-since what is evicted here was acknowledged and does not come again."""
+"""Announced bytes of one peer's unfinished messages: almost four of the largest. A sender keeps below it (`outbox.py`)
+unless it hears nothing of what it called off (ABANDON is sent once)."""
 MAX_PEER_MESSAGES = 8192
 """Unfinished messages of one peer: as many as requests may be in flight to it."""
 MAX_AGE_S = 30.0
-"""An unfinished message that got nothing new for this long is dropped."""
-FINISHED_REMEMBERED = 8192
-"""Finished message numbers kept per peer, so that late symbols are recognised."""
+"""An unfinished message that got no symbol for this long is dropped."""
+OVER_REMEMBERED = 8192
+"""Message numbers kept per peer that are finished, forgotten or abandoned, so that late symbols are recognised."""
 
 
-class Progress(enum.Enum):
-    """What a symbol did."""
+class Fate(enum.Enum):
+    """What became of a message."""
 
-    STORED = "stored"
-    ALREADY_FINISHED = "already_finished"
-    DROPPED = "dropped"
+    FINISHED = "finished"
+    FORGOTTEN = "forgotten"
+    """Dropped unfinished to make room, or for its age."""
+    ABANDONED = "abandoned"
+    """Its sender does not send the rest."""
 
 
-@dataclass(slots=True)
-class _Partial:
-    total: int
-    symbol: int
-    count: int
-    touched_at: float
-    parts: dict[int, bytes] = field(default_factory=dict)
-    """Symbols by index: memory is spent on what came, not on what was announced."""
+class Reassembled(NamedTuple):
+    """What the sender of a message has to be told, once for all the symbols added together."""
+
+    number: int
+    fate: Fate
+    content: memoryview | Partial | None
+    """The message, when it was finished just now; a Partial still has to be decoded."""
 
 
 class Reassembler:
     """Unfinished messages of one peer's session."""
 
-    __slots__ = ("_bytes", "_dropped", "_finished", "_partials", "peer")
+    __slots__ = ("_bytes", "_dropped", "_over", "_partials", "peer")
 
     def __init__(self, peer: NodeName, dropped: Counter[str]) -> None:
         self.peer = peer
-        self._partials: OrderedDict[int, _Partial] = OrderedDict()
+        self._partials: OrderedDict[int, Partial] = OrderedDict()
         """The one that waits longest for news first."""
-        self._finished: OrderedDict[int, None] = OrderedDict()
+        self._over: OrderedDict[int, Fate] = OrderedDict()
         self._bytes = 0
         self._dropped = dropped
 
@@ -66,54 +70,114 @@ class Reassembler:
         """How many messages are unfinished."""
         return len(self._partials)
 
-    def add(self, fragment: Fragment, now: float) -> memoryview | Progress:
-        """Store a symbol; returns the whole message when it was the last one missing."""
-        number = fragment.message
-        if number in self._finished:
-            return Progress.ALREADY_FINISHED
-        partial = self._partials.get(number)
-        if partial is None:
-            if fragment.total == len(fragment.data):
-                self._remember(number)
-                return fragment.data
-            partial = self._open(fragment, now)
-        elif partial.total != fragment.total or partial.symbol != fragment.symbol:
-            self._dropped["fragment_mismatch"] += 1
-            return Progress.DROPPED
-        parts = partial.parts
-        if fragment.symbol_index in parts:
-            return Progress.STORED
-        # A copy: a view would keep the whole datagram, however little of it the symbol is.
-        parts[fragment.symbol_index] = bytes(fragment.data)
-        if len(parts) < partial.count:
-            partial.touched_at = now
-            self._partials.move_to_end(number)
-            return Progress.STORED
-        del self._partials[number]
-        self._bytes -= partial.total
-        self._remember(number)
-        return memoryview(b"".join(map(parts.__getitem__, range(partial.count))))
+    def add(self, fragments: list[Fragment], now: float) -> list[Reassembled]:
+        """Store symbols; returns what there is to tell.
 
-    def _open(self, fragment: Fragment, now: float) -> _Partial:
+        Each symbol is copied once, to its place in the message. A message of one datagram is a view of it.
+        """
+        out: dict[int, Reassembled] = {}
         partials = self._partials
-        while partials and (len(partials) >= MAX_PEER_MESSAGES or self._bytes + fragment.total > MAX_PEER_BYTES):
-            self._drop_oldest("reassembly_evicted")
-        count = symbol_count(fragment.total, fragment.symbol)
-        partial = partials[fragment.message] = _Partial(fragment.total, fragment.symbol, count, now)
-        self._bytes += fragment.total
+        current: int | None = None
+        partial: Partial | None = None
+        for number, total, symbol, index, data in fragments:
+            if number != current or partial is None:
+                current = number
+                partial = partials.get(number)
+                if partial is None:
+                    partial = self._meet(number, total, symbol, data, now, out)
+                    if partial is None:
+                        continue
+                else:
+                    partial.touched_at = now
+                    partials.move_to_end(number)
+            if total != partial.total or symbol != partial.symbol:
+                self._dropped["fragment_mismatch"] += 1
+                continue
+            if index < partial.count:
+                have = partial.have
+                if have[index]:
+                    continue
+                have[index] = 1
+                start = index * symbol
+                partial.buffer[start : start + len(data)] = data
+                partial.missing -= 1
+                if partial.missing and not partial.repairs:
+                    continue
+            elif not self._add_repair(partial, index - partial.count, data):
+                partial = partials.get(number)
+                continue
+            if not partial.missing:
+                out[number] = self._finish(partial, partial.whole())
+                partial = None
+            elif partial.is_decodable():
+                out[number] = self._finish(partial, partial)
+                partial = None
+        return list(out.values())
+
+    def _meet(
+        self, number: int, total: int, symbol: int, data: memoryview, now: float, out: dict[int, Reassembled]
+    ) -> Partial | None:
+        """A symbol of a message that is not being put together; returns the Partial to store it in, if any."""
+        fate = self._over.get(number)
+        if fate is not None:
+            if fate is not Fate.ABANDONED:
+                out.setdefault(number, Reassembled(number, fate, None))
+            return None
+        if total <= symbol:
+            # Of a lone symbol, the repair symbol is its padded copy.
+            self._remember(number, Fate.FINISHED)
+            out[number] = Reassembled(number, Fate.FINISHED, data[:total])
+            return None
+        self._make_room(total, messages=1)
+        partial = self._partials[number] = Partial(number, total, symbol, now)
+        self._bytes += total
         return partial
 
-    def _drop_oldest(self, reason: str) -> None:
-        _, partial = self._partials.popitem(last=False)
-        self._bytes -= partial.total
+    def _add_repair(self, partial: Partial, repair: int, data: memoryview) -> bool:
+        if not partial.wants_repair(repair):
+            return False
+        self._make_room(partial.symbol, messages=0)
+        if partial.number not in self._partials:
+            return False
+        partial.add_repair(repair, data)
+        self._bytes += partial.symbol
+        return True
+
+    def _finish(self, partial: Partial, content: memoryview | Partial) -> Reassembled:
+        self._remove(partial)
+        self._remember(partial.number, Fate.FINISHED)
+        return Reassembled(partial.number, Fate.FINISHED, content)
+
+    def _make_room(self, size: int, messages: int) -> None:
+        partials = self._partials
+        while partials and (len(partials) + messages > MAX_PEER_MESSAGES or self._bytes + size > MAX_PEER_BYTES):
+            self._forget_oldest("reassembly_evicted")
+
+    def _forget_oldest(self, reason: str) -> None:
+        partial = next(iter(self._partials.values()))
+        self._remove(partial)
+        self._remember(partial.number, Fate.FORGOTTEN)
         self._dropped[reason] += 1
 
-    def _remember(self, number: int) -> None:
-        self._finished[number] = None
-        if len(self._finished) > FINISHED_REMEMBERED:
-            self._finished.popitem(last=False)
+    def _remove(self, partial: Partial) -> None:
+        del self._partials[partial.number]
+        self._bytes -= partial.held_bytes
+
+    def _remember(self, number: int, fate: Fate) -> None:
+        self._over[number] = fate
+        if len(self._over) > OVER_REMEMBERED:
+            self._over.popitem(last=False)
+
+    def abandon(self, number: int) -> None:
+        """The sender does not send the rest of this message."""
+        partial = self._partials.get(number)
+        if partial is not None:
+            self._remove(partial)
+            self._dropped["reassembly_abandoned"] += 1
+        if number not in self._over:
+            self._remember(number, Fate.ABANDONED)
 
     def expire(self, now: float) -> None:
-        """Drop messages that got nothing new for MAX_AGE_S."""
+        """Drop messages that got no symbol for MAX_AGE_S."""
         while self._partials and next(iter(self._partials.values())).touched_at + MAX_AGE_S <= now:
-            self._drop_oldest("reassembly_expired")
+            self._forget_oldest("reassembly_expired")

@@ -28,15 +28,16 @@ Frames, each a type byte and then::
     ACK          3  largest (64) delay in us (32) n (8), n times: length - 1 of a range (16), gap - 1 below it (16)
     FRAGMENT     4  message (64) total size (32) symbol size (16) index (16), then the symbol: its length follows
                     from the other fields
-    REPAIR       5  reserved for FEC: as FRAGMENT, with block (16) and repair index (8) for the index
+    REPAIR       5  as FRAGMENT, of a repair symbol (fec.py): the index counts on after the source symbols
     FINISHED     6  message (64)                             the receiver has all of it
-    ABANDON      7  message (64)                             reserved: the sender will not send the rest
+    ABANDON      7  message (64)                             the sender will not send the rest
     CLOSE        8  the sidecar goes away
     HELLO        9  token (16 bytes) incarnation (64)        who sends under this session; place of the key agreement
+    FORGOTTEN   10  message (64)                             the receiver dropped what it had of it: send it anew
 
 A message of `total size` bytes is cut into symbols of `symbol size` bytes, the last one shorter; `index` counts them.
-Only FRAGMENT and FINISHED are ack-eliciting (RFC 9002 section 2): a PROBE is answered by its reply, the rest is not
-waited for.
+Only FRAGMENT, REPAIR and FINISHED are ack-eliciting (RFC 9002 section 2): a PROBE is answered by its reply, the rest
+is not waited for.
 """
 
 from __future__ import annotations
@@ -69,7 +70,8 @@ MAX_ACK_RANGES = 32
 MAX_FRAMES = 64
 """Frames in one datagram; an honest one holds a handful."""
 
-_PADDING, _PROBE, _PROBE_REPLY, _ACK, FRAGMENT_TYPE, FINISHED_TYPE, _CLOSE, _HELLO = 0, 1, 2, 3, 4, 6, 8, 9
+_PADDING, _PROBE, _PROBE_REPLY, _ACK, FRAGMENT_TYPE, REPAIR_TYPE, FINISHED_TYPE, _ABANDON = range(8)
+_CLOSE, _HELLO, _FORGOTTEN = 8, 9, 10
 
 _U32 = struct.Struct(">I")
 _U64 = struct.Struct(">Q")
@@ -136,6 +138,18 @@ class Finished(NamedTuple):
     message: int
 
 
+class Abandon(NamedTuple):
+    """The sender will not send the rest of the message."""
+
+    message: int
+
+
+class Forgotten(NamedTuple):
+    """The receiver dropped what it had of the message."""
+
+    message: int
+
+
 class Close(NamedTuple):
     """The sender goes away."""
 
@@ -147,7 +161,7 @@ class Hello(NamedTuple):
     incarnation: int
 
 
-Frame = Probe | ProbeReply | AckFrame | Fragment | Finished | Close | Hello
+Frame = Probe | ProbeReply | AckFrame | Fragment | Finished | Abandon | Forgotten | Close | Hello
 
 
 class VersionError(DecodeError):
@@ -220,12 +234,23 @@ def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
 
 def encode_fragment_head(message: int, total: int, symbol: int, index: int) -> bytes:
     """Return the bytes that go before the symbol itself."""
-    return _TYPED_FRAGMENT_HEAD.pack(FRAGMENT_TYPE, message, total, symbol, index)
+    kind = FRAGMENT_TYPE if index * symbol < total or not index else REPAIR_TYPE
+    return _TYPED_FRAGMENT_HEAD.pack(kind, message, total, symbol, index)
 
 
 def encode_finished(frame: Finished) -> bytes:
     """Return the frame's bytes."""
     return b"\x06" + _U64.pack(frame.message)
+
+
+def encode_abandon(frame: Abandon) -> bytes:
+    """Return the frame's bytes."""
+    return b"\x07" + _U64.pack(frame.message)
+
+
+def encode_forgotten(frame: Forgotten) -> bytes:
+    """Return the frame's bytes."""
+    return b"\x0a" + _U64.pack(frame.message)
 
 
 def finished_number(encoded: bytes) -> int:
@@ -264,14 +289,14 @@ def decode_frames(view: memoryview) -> list[Frame]:
             position += 1
             if kind == _PADDING:
                 position = _skip_padding(view, position)
-            elif kind == FRAGMENT_TYPE:
-                fragment, position = _decode_fragment(view, position)
+            elif kind in (FRAGMENT_TYPE, REPAIR_TYPE):
+                fragment, position = _decode_fragment(kind, view, position)
                 frames.append(fragment)
             elif kind == _ACK:
                 ack, position = _decode_ack(view, position)
                 frames.append(ack)
-            elif kind == FINISHED_TYPE:
-                frames.append(Finished(_U64.unpack_from(view, position)[0]))
+            elif kind in _ABOUT_A_MESSAGE:
+                frames.append(_ABOUT_A_MESSAGE[kind](_U64.unpack_from(view, position)[0]))
                 position += 8
             elif kind in (_PROBE, _PROBE_REPLY):
                 (probe_id,) = _U32.unpack_from(view, position)
@@ -299,17 +324,30 @@ def _skip_padding(view: memoryview, position: int) -> int:
     return len(view) - len(bytes(rest).lstrip(b"\0"))
 
 
-def _decode_fragment(view: memoryview, position: int) -> tuple[Fragment, int]:
+_ABOUT_A_MESSAGE: dict[int, type[Finished | Abandon | Forgotten]] = {
+    FINISHED_TYPE: Finished,
+    _ABANDON: Abandon,
+    _FORGOTTEN: Forgotten,
+}
+
+
+def _decode_fragment(kind: int, view: memoryview, position: int) -> tuple[Fragment, int]:
     message, total, symbol, index = _FRAGMENT_HEAD.unpack_from(view, position)
     position += _FRAGMENT_HEAD.size
     if total > MAX_MESSAGE_BYTES:
         raise DecodeError("message over the limit")
     if not MIN_SYMBOL_BYTES <= symbol <= MAX_SYMBOL_BYTES:
         raise DecodeError("symbol too small or too large")
-    start = index * symbol
-    if start >= total and (index or total):
-        raise DecodeError("fragment beyond the end of its message")
-    length = min(symbol, total - start)
+    if kind == FRAGMENT_TYPE:
+        start = index * symbol
+        if start >= total and (index or total):
+            raise DecodeError("fragment beyond the end of its message")
+        length = min(symbol, total - start)
+    else:
+        count = symbol_count(total, symbol)
+        if not count <= index < 2 * count:
+            raise DecodeError("repair symbol that no block has")
+        length = symbol
     data = view[position : position + length]
     if len(data) != length:
         raise DecodeError("truncated fragment")

@@ -28,7 +28,9 @@ from sidecar.core.link_events import (
     FragmentsReceived,
     LinkCommand,
     LinkEvent,
+    MessageAbandoned,
     MessageFinished,
+    MessageForgotten,
     PathChanged,
     PathMeasured,
     PathMtuChanged,
@@ -38,8 +40,10 @@ from sidecar.core.link_events import (
     Resend,
     ResetPaths,
     Send,
+    SendAbandon,
     SendClose,
     SendFinished,
+    SendForgotten,
     SetCarrier,
     SetMtu,
     SetPeers,
@@ -228,6 +232,14 @@ class Link:
                 path = self._paths.get((path_id.peer, path_id.remote))
                 if path is not None:
                     self._owe(path, frame.encode_finished(frame.Finished(number)))
+            case SendAbandon(path_id, number):
+                path = self._paths.get((path_id.peer, path_id.remote))
+                if path is not None and path.state is not PathState.DOWN:
+                    self._owe(path, frame.encode_abandon(frame.Abandon(number)))
+            case SendForgotten(path_id, number):
+                path = self._paths.get((path_id.peer, path_id.remote))
+                if path is not None:
+                    self._owe(path, frame.encode_forgotten(frame.Forgotten(number)))
             case SetPeers(peers):
                 self._set_peers(peers, now)
             case SetReady(ready):
@@ -352,6 +364,10 @@ class Link:
                 case frame.Finished(number):
                     eliciting = True
                     events.append(MessageFinished(path.peer, number))
+                case frame.Abandon(number):
+                    events.append(MessageAbandoned(path.peer, path.session, number))
+                case frame.Forgotten(number):
+                    events.append(MessageForgotten(path.peer, number))
                 case frame.Close() if path.state is not PathState.DOWN:
                     self._take_down(path, "peer closed")
                     events.append(PeerClosed(path.peer))

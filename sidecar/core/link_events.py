@@ -90,11 +90,29 @@ class SendFinished:
 
 
 @dataclass(frozen=True, slots=True)
+class SendAbandon:
+    """Tell the peer that the rest of our message does not come."""
+
+    path: PathId
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class SendForgotten:
+    """Tell the peer that we dropped what we had of its message."""
+
+    path: PathId
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
 class SendClose:
     """Tell all peers that we go away."""
 
 
-LinkCommand = SetPeers | SetReady | SetCarrier | ResetPaths | Rebind | SetMtu | Send | Resend | SendFinished | SendClose
+PathCommand = Send | Resend | SendFinished | SendAbandon | SendForgotten
+"""What is for one path."""
+LinkCommand = SetPeers | SetReady | SetCarrier | ResetPaths | Rebind | SetMtu | PathCommand | SendClose
 
 
 class FragmentsReceived(NamedTuple):
@@ -120,6 +138,32 @@ class FragmentsLost:
 @dataclass(frozen=True, slots=True)
 class MessageFinished:
     """The peer holds the whole message."""
+
+    peer: NodeName
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class MessageDecoded:
+    """A message was computed from its symbols (`inbound.py`): the driver's answer, not a link's."""
+
+    path: PathId
+    session: SessionId
+    content: memoryview
+
+
+@dataclass(frozen=True, slots=True)
+class MessageAbandoned:
+    """The peer does not send the rest of its message."""
+
+    peer: NodeName
+    session: SessionId
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class MessageForgotten:
+    """The peer dropped what it had of our message."""
 
     peer: NodeName
     number: int
@@ -173,6 +217,9 @@ LinkEvent = (
     FragmentsReceived
     | FragmentsLost
     | MessageFinished
+    | MessageAbandoned
+    | MessageForgotten
+    | MessageDecoded
     | PathChanged
     | PathMtuChanged
     | PathMeasured

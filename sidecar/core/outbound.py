@@ -37,6 +37,7 @@ class OutboundMessage:
         "count",
         "deadline",
         "expires",
+        "generation",
         "interfaces",
         "number",
         "over",
@@ -86,6 +87,8 @@ class OutboundMessage:
         """Delivered, called off, expired or cut anew: nothing of it needs to travel any more."""
         self.successor: OutboundMessage | None = None
         """The same bytes, cut anew into smaller symbols."""
+        self.generation = 0
+        """How many messages before this one carried the same bytes."""
         self._lost: set[int] = set()
         self._lost_repairs: set[int] = set()
 
@@ -128,6 +131,7 @@ class OutboundMessage:
             answers=self.answers,
             repairs=-(-self.repairs * symbol_count(self.total, symbol) // self.count),
         )
+        self.successor.generation = self.generation + 1
         return self.successor
 
     def missing(self) -> tuple[int, ...]:

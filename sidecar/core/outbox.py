@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.fragments import MAX_PEER_BYTES as REASSEMBLED_PEER_BYTES
-from sidecar.core.link_events import FragmentsLost, Resend, Send
+from sidecar.core.link_events import FragmentsLost, Resend, Send, SendAbandon
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.shares import Shares
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, NodeName
     from sidecar.core.events import RequestId
+    from sidecar.core.link_events import PathCommand
     from sidecar.core.messages import Encoded
     from sidecar.core.path_id import PathId
     from sidecar.core.priority import Priority
@@ -24,12 +25,14 @@ MAX_MESSAGES = 16_384
 """All undelivered messages: one peer may have half of them, as many as requests may be in flight."""
 MAX_BYTES = 256 * 1024 * 1024
 """All undelivered messages together: sixteen of the largest."""
+MAX_GENERATIONS = 8
+"""How often a message is sent anew under another number; a receiver that forgets it more often is not honest."""
 
 
 class Outbox:
     """Undelivered messages, by number. The numbers are this session's own, never reused."""
 
-    def __init__(self, routes: Routes, command: Callable[[Send | Resend], None], stats: EngineStats) -> None:
+    def __init__(self, routes: Routes, command: Callable[[PathCommand], None], stats: EngineStats) -> None:
         self._routes = routes
         self._command = command
         self._stats = stats
@@ -106,12 +109,34 @@ class Outbox:
         message = self._messages.get(number)
         if message is None or message.peer != peer:
             return None
-        self.drop(message)
+        self._remove(message)
         return message
 
+    def on_answered(self, message: OutboundMessage) -> None:
+        """The peer proved by its answer that it holds all of it, also when its FINISHED got lost."""
+        self._remove(message.newest)
+
+    def on_forgotten(self, peer: NodeName, number: int) -> None:
+        """The peer dropped what it had of the message: the whole of it travels anew."""
+        message = self._messages.get(number)
+        if message is None or message.peer != peer:
+            return
+        self._stats.dropped["message_forgotten"] += 1
+        self._remove(message)
+        if message.generation < MAX_GENERATIONS:
+            self._enter_anew(message, self._routes.best_to(peer) or message.path)
+
     def drop(self, message: OutboundMessage) -> None:
-        """Nothing more of it needs to travel, as whatever it was cut into."""
+        """Nothing more of it needs to travel, as whatever it was cut into. A peer that has some of it is told so."""
         message = message.newest
+        unfinished = message.begun and not message.over and message.count > 1
+        self._remove(message)
+        if unfinished:
+            path = self._routes.best_to(message.peer)
+            if path is not None:
+                self._command(SendAbandon(path, message.number))
+
+    def _remove(self, message: OutboundMessage) -> None:
         message.over = True
         if self._messages.pop(message.number, None) is not None:
             self._shares_of_messages.give_back(message.peer)
@@ -134,7 +159,7 @@ class Outbox:
     def drop_peer(self, peer: NodeName) -> None:
         """The peer's session is over: what was meant for it can not arrive."""
         for message in [message for message in self._messages.values() if message.peer == peer]:
-            self.drop(message)
+            self._remove(message)
         self._parked.pop(peer, None)
 
     def on_lost(self, event: FragmentsLost, now: float) -> None:
@@ -166,6 +191,9 @@ class Outbox:
     def _cut_anew(self, message: OutboundMessage, path: PathId) -> None:
         """No path carries its symbols any more: the whole of it travels again, in smaller ones."""
         self.drop(message)
+        self._enter_anew(message, path)
+
+    def _enter_anew(self, message: OutboundMessage, path: PathId) -> None:
         self._enter(message.cut_anew(self._take_number(), path, self._routes.symbol_to(path.peer)))
 
     def on_path_up(self, path: PathId) -> None:

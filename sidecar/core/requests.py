@@ -171,7 +171,7 @@ class RequestTable:
         measure = request.observed and copy.state is CopyState.PENDING
         copy.state = CopyState.ANSWERED
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
-        self._parts.outbox.drop(copy.message)
+        self._parts.outbox.on_answered(copy.message)
         if measure:
             self._parts.measurements.answered(copy.path, request.service, now - copy.sent_at, response.processing_s)
         if request.done:
@@ -213,7 +213,7 @@ class RequestTable:
             return
         copy.state = CopyState.REJECTED
         copy.certainly_not_run = rejection.reason.certainly_not_run
-        self._parts.outbox.drop(copy.message)
+        self._parts.outbox.on_answered(copy.message)
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
         if not request.done:
             self._rescue(request, now)

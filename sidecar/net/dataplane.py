@@ -199,13 +199,17 @@ class ThreadedDataPlane:
 
     def on_link_events(self, events: list[LinkEvent]) -> None:
         """Take what a link saw."""
-        now = self._clock()
         engine = self._engine
-        with self._lock:
-            for event in events:
-                engine.on_link_event(event, now)
-            woken = self._queue_outputs()
-        self._wake(woken)
+        while events:
+            now = self._clock()
+            with self._lock:
+                for event in events:
+                    engine.on_link_event(event, now)
+                decodings = engine.take_decodings()
+                woken = self._queue_outputs()
+            self._wake(woken)
+            # On this link's thread, with nothing locked.
+            events = [decoding.run() for decoding in decodings]
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
         """Take what STUN found."""

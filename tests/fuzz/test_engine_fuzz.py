@@ -11,7 +11,7 @@ from protos.model import Role, ServiceName
 from sidecar.core import frame
 from sidecar.core.dedup import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
 from sidecar.core.events import RejectReason, RequestId
-from sidecar.core.fragments import FINISHED_REMEMBERED, MAX_PEER_BYTES, MAX_PEER_MESSAGES
+from sidecar.core.fragments import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
 from sidecar.core.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
 from sidecar.core.link import MAX_PENDING_FRAMES
 from sidecar.core.messages import (
@@ -112,11 +112,11 @@ class Rogue:
 
 def assert_bounded(node: Node) -> None:
     engine = node.engine
-    for reassembler in engine._reassemblers.values():
+    for reassembler in engine._inbound._reassemblers.values():
         assert reassembler.held_bytes <= MAX_PEER_BYTES
         assert len(reassembler) <= MAX_PEER_MESSAGES
-        assert len(reassembler._finished) <= FINISHED_REMEMBERED
-    assert len(engine._reassemblers) <= len(engine.peers.names())
+        assert len(reassembler._over) <= OVER_REMEMBERED
+    assert len(engine._inbound._reassemblers) <= len(engine.peers.names())
     assert len(engine._outbox) <= MAX_MESSAGES
     assert engine._outbox.held_bytes <= MAX_BYTES
     executions = engine._serving.executions

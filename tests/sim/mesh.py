@@ -222,6 +222,9 @@ class Mesh:
                 while (event := link.next_event()) is not None:
                     busy = True
                     engine.on_link_event(event, now)
+            for decoding in engine.take_decodings():
+                busy = True
+                engine.on_link_event(decoding.run(), now)
             for application_event in engine.take_events():
                 busy = True
                 self._application(node, application_event)

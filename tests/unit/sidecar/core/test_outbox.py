@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from sidecar.core import outbox as outbox_module
 from sidecar.core.events import RequestId
 from sidecar.core.fragments import MAX_PEER_BYTES
-from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send
+from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
 from sidecar.core.messages import Encoded
-from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES, Outbox
+from sidecar.core.outbox import MAX_BYTES, MAX_GENERATIONS, MAX_MESSAGES, Outbox
 from sidecar.core.path_id import PathState
 from sidecar.core.pmtu import BASE_BYTES
 from sidecar.core.priority import Priority
@@ -250,7 +250,8 @@ def test_a_message_that_no_path_carries_any_more_is_cut_anew() -> None:
     box.lost(message, 2)
     box.outbox.drop(message)
     assert anew.over
-    assert (len(box.outbox), box.outbox.held_bytes, len(box.commands)) == (0, 0, 1)
+    assert (len(box.outbox), box.outbox.held_bytes) == (0, 0)
+    assert box.commands[1:] == [SendAbandon(OVER_WWAN, anew.number)]
 
 
 def test_what_waits_for_a_path_is_cut_to_the_one_that_comes() -> None:
@@ -275,3 +276,42 @@ def test_a_suspect_path_is_left_for_one_that_is_too_small() -> None:
     box.routes.set_state(OVER_WLAN, PathState.UNSTABLE)
     box.lost(message, 0, timed_out=True)
     assert box.commands == [Send(OVER_WWAN, message.newest)]
+
+
+def test_a_peer_that_has_part_of_a_dropped_message_is_told() -> None:
+    box = Box(OVER_WLAN)
+    message = box.send(size=3000)
+    message.symbol_data(0)
+    box.outbox.drop(message)
+    box.outbox.drop(message)
+    assert box.commands == [SendAbandon(OVER_WLAN, message.number)]
+
+
+def test_nothing_is_said_of_messages_that_did_not_leave_or_that_one_datagram_holds_or_that_arrived() -> None:
+    box = Box(OVER_WLAN)
+    unsent, small, finished, answered = (box.send(size=size) for size in (3000, 100, 3000, 3000))
+    for begun in (small, finished, answered):
+        begun.symbol_data(0)
+    box.outbox.drop(unsent)
+    box.outbox.drop(small)
+    box.outbox.on_finished(A, finished.number)
+    box.outbox.on_answered(answered)
+    assert box.commands == []
+    assert len(box.outbox) == 0
+
+
+def test_a_forgotten_message_is_sent_anew_but_not_for_ever() -> None:
+    box = Box(OVER_WLAN)
+    first = message = box.send(size=3000)
+    message.acked[0] = message.acked[1] = 1
+    for _ in range(MAX_GENERATIONS):
+        box.outbox.on_forgotten(B, message.number)  # not his
+        box.outbox.on_forgotten(A, message.number)
+        assert message.over
+        message = first.newest
+        assert box.commands.pop() == Send(OVER_WLAN, message)
+        assert len(message.missing()) == message.count
+        assert (len(box.outbox), box.outbox.held_bytes) == (1, 3000)
+    box.outbox.on_forgotten(A, message.number)
+    assert (len(box.outbox), box.outbox.held_bytes, box.commands) == (0, 0, [])
+    assert box.stats.dropped["message_forgotten"] == MAX_GENERATIONS + 1

@@ -1,0 +1,83 @@
+"""Messages on their way in: one reassembler for each peer, and the decoding that is left to the driver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sidecar.core.fragments import Fate, Reassembler
+from sidecar.core.link_events import MessageDecoded, SendFinished, SendForgotten
+from sidecar.core.partial import Partial
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import NodeName, SessionId
+    from sidecar.core.frame import Fragment
+    from sidecar.core.link_events import PathCommand
+    from sidecar.core.path_id import PathId
+    from sidecar.core.stats import EngineStats
+
+
+@dataclass(frozen=True, slots=True)
+class Decoding:
+    """A message to compute from its symbols: work for whoever drives the engine, while nothing is locked."""
+
+    path: PathId
+    session: SessionId
+    partial: Partial
+
+    def run(self) -> MessageDecoded:
+        """Compute it, in up to some milliseconds; the result is an event for the engine."""
+        return MessageDecoded(self.path, self.session, self.partial.decode())
+
+
+class Inbound:
+    """The unfinished messages of all peers."""
+
+    def __init__(self, command: Callable[[PathCommand], None], stats: EngineStats) -> None:
+        self._command = command
+        self._stats = stats
+        self._reassemblers: dict[NodeName, Reassembler] = {}
+        self._decodings: list[Decoding] = []
+
+    def add(self, path: PathId, session: SessionId, fragments: list[Fragment], now: float) -> list[memoryview]:
+        """Store symbols that came over `path`; returns the messages that they complete.
+
+        A message of one datagram is a view of it; any other is a buffer of its own.
+        """
+        reassembler = self._reassemblers.get(path.peer)
+        if reassembler is None:
+            reassembler = self._reassemblers[path.peer] = Reassembler(path.peer, self._stats.dropped)
+        whole: list[memoryview] = []
+        for number, fate, content in reassembler.add(fragments, now):
+            if fate is Fate.FORGOTTEN:
+                self._command(SendForgotten(path, number))
+                continue
+            # Also when it is still to be decoded: nothing that might come could help.
+            self._command(SendFinished(path, number))
+            if isinstance(content, Partial):
+                self._decodings.append(Decoding(path, session, content))
+            elif content is not None:
+                whole.append(content)
+        return whole
+
+    def take_decodings(self) -> list[Decoding]:
+        """Return the messages to be decoded."""
+        decodings, self._decodings = self._decodings, []
+        return decodings
+
+    def abandon(self, peer: NodeName, number: int) -> None:
+        """The peer does not send the rest of this message."""
+        reassembler = self._reassemblers.get(peer)
+        if reassembler is not None:
+            reassembler.abandon(number)
+
+    def forget_peer(self, peer: NodeName) -> None:
+        """The peer's session is over."""
+        self._reassemblers.pop(peer, None)
+
+    def expire(self, now: float) -> None:
+        """Drop messages that wait for too long."""
+        for reassembler in self._reassemblers.values():
+            reassembler.expire(now)

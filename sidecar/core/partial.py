@@ -1,0 +1,118 @@
+"""A message of which some symbols are still missing: one buffer that symbols are written into as they come."""
+
+from __future__ import annotations
+
+import mmap
+
+from sidecar.core import fec
+from sidecar.core.frame import symbol_count
+
+LAZY_BYTES = 1024 * 1024
+"""From this size on, a buffer's pages are claimed as they are written: announcing 16 MiB must cost nothing."""
+
+
+class Partial:
+    """The symbols of one message that came, in their places.
+
+    `have` and `buffer` are for the reassembler's loop, which writes source symbols itself.
+    """
+
+    __slots__ = (
+        "_blocks",
+        "_decodable_blocks",
+        "_rows",
+        "buffer",
+        "count",
+        "have",
+        "missing",
+        "number",
+        "repairs",
+        "symbol",
+        "total",
+        "touched_at",
+    )
+
+    def __init__(self, number: int, total: int, symbol: int, now: float) -> None:
+        self.number = number
+        self.total = total
+        self.symbol = symbol
+        self.count = symbol_count(total, symbol)
+        self.missing = self.count
+        """Source symbols that did not come."""
+        self.have = bytearray(self.count)
+        """1 for each source symbol that came."""
+        self.buffer = _claim(total)
+        self.repairs = 0
+        """Repair symbols stored."""
+        self.touched_at = now
+        self._blocks = fec.block_count(self.count)
+        self._rows: dict[int, dict[int, bytes]] = {}
+        """Repair symbols by block and row."""
+        self._decodable_blocks = 0
+        """The first so many blocks miss no more than they have repair symbols for, and never will again."""
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes claimed by what was announced and by repair symbols."""
+        return self.total + self.repairs * self.symbol
+
+    def wants_repair(self, repair: int) -> bool:
+        """Whether this repair symbol is new and its block misses more than it has repair symbols for."""
+        row, block = divmod(repair, self._blocks)
+        rows = self._rows.get(block, {})
+        return row not in rows and len(rows) < self._missing_in(block)
+
+    def add_repair(self, repair: int, data: memoryview) -> None:
+        """Keep a repair symbol that is wanted."""
+        row, block = divmod(repair, self._blocks)
+        self._rows.setdefault(block, {})[row] = bytes(data)
+        self.repairs += 1
+
+    def is_decodable(self) -> bool:
+        """Whether what is missing can be computed. Over a message's whole life, every block is looked at once."""
+        if self.missing > self.repairs:
+            return False
+        while self._decodable_blocks < self._blocks:
+            block = self._decodable_blocks
+            if self._missing_in(block) > len(self._rows.get(block, ())):
+                return False
+            self._decodable_blocks += 1
+        return True
+
+    def _missing_in(self, block: int) -> int:
+        return self.have[block :: self._blocks].count(0)
+
+    def whole(self) -> memoryview:
+        """Return the message; nothing is missing."""
+        return memoryview(self.buffer)
+
+    def decode(self) -> memoryview:
+        """Compute what is missing and return the message. Takes up to some milliseconds: not for under a lock.
+
+        Symbols of a dishonest sender give a message of garbage.
+        """
+        buffer, symbol = memoryview(self.buffer), self.symbol
+        for block, rows in self._rows.items():
+            if not self._missing_in(block):
+                continue
+            indices = range(block, self.count, self._blocks)
+            sources = [self._padded(buffer, index) if self.have[index] else None for index in indices]
+            for place, data in fec.decode(sources, rows):
+                start = indices[place] * symbol
+                length = min(symbol, self.total - start)
+                buffer[start : start + length] = data[:length]
+        return buffer
+
+    def _padded(self, buffer: memoryview, index: int) -> bytes | memoryview:
+        start = index * self.symbol
+        data = buffer[start : start + self.symbol]
+        return data if len(data) == self.symbol else bytes(data).ljust(self.symbol, b"\0")
+
+
+def _claim(size: int) -> bytearray | mmap.mmap:
+    if size >= LAZY_BYTES:
+        try:
+            return mmap.mmap(-1, size)
+        except OSError:  # no mappings left
+            pass
+    return bytearray(size)
