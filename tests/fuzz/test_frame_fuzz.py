@@ -32,9 +32,10 @@ def ack_ranges(draw: st.DrawFn) -> list[tuple[int, int]]:
 def fragments(draw: st.DrawFn) -> tuple[bytes, Fragment]:
     symbol = draw(st.integers(frame.MIN_SYMBOL_BYTES, frame.MAX_SYMBOL_BYTES))
     total = draw(st.integers(0, 5 * symbol) | st.integers(0, frame.MAX_MESSAGE_BYTES))
-    index = draw(st.integers(0, min(frame.symbol_count(total, symbol) - 1, 0xFFFF)))
+    count = frame.symbol_count(total, symbol)
+    index = draw(st.integers(0, min(2 * count - 1, 0xFFFF)))
     number = draw(u64)
-    data = bytes(min(symbol, total - index * symbol))
+    data = bytes(min(symbol, total - index * symbol) if index < count else symbol)
     encoded = frame.encode_fragment_head(number, total, symbol, index) + data
     return encoded, Fragment(number, total, symbol, index, memoryview(data))
 
@@ -43,6 +44,8 @@ whole_frames = st.one_of(
     u32.map(lambda n: (frame.encode_probe(Probe(n)), Probe(n))),
     u32.map(lambda n: (frame.encode_probe_reply(ProbeReply(n)), ProbeReply(n))),
     u64.map(lambda n: (frame.encode_finished(Finished(n)), Finished(n))),
+    u64.map(lambda n: (frame.encode_abandon(frame.Abandon(n)), frame.Abandon(n))),
+    u64.map(lambda n: (frame.encode_forgotten(frame.Forgotten(n)), frame.Forgotten(n))),
     st.just((frame.encode_close(), frame.Close())),
     st.builds(Hello, st.binary(min_size=16, max_size=16), u64).map(lambda hello: (frame.encode_hello(hello), hello)),
     fragments(),
@@ -97,8 +100,12 @@ def test_frames_or_the_one_error(data: bytes) -> None:
             assert numbers[-1] >= 0
         elif isinstance(item, Fragment):
             assert item.total <= frame.MAX_MESSAGE_BYTES
-            assert item.symbol_index * item.symbol + len(item.data) <= item.total
-            assert item.symbol_index < frame.symbol_count(item.total, item.symbol)
+            count = frame.symbol_count(item.total, item.symbol)
+            if item.symbol_index < count:
+                assert item.symbol_index * item.symbol + len(item.data) <= item.total
+            else:
+                assert item.symbol_index - count < count
+                assert len(item.data) == item.symbol
 
 
 @given(st.binary(max_size=40) | st.binary(max_size=40).map(lambda rest: b"\xd1\x00" + rest))
