@@ -58,6 +58,11 @@ def wait_for_log(system: System, text: str) -> None:
     system.wait(f"'{text}' in the log", lambda: text in log.read_text(), SOON_S)
 
 
+def peers_version(system: System) -> float:
+    """Of the cloud's view of the robot."""
+    return system.metrics("cloud_a").get("plr_peers_version", 0.0)
+
+
 @contextlib.contextmanager
 def flawless_call(system: System) -> Iterator[None]:
     """20 requests a second around what happens in the block."""
@@ -140,6 +145,27 @@ def test_an_interface_that_is_renamed_and_gets_its_name_back(system: System) -> 
         wait_for_path(system, "usb0", up=True)
     pull_out(system.lab, "robot", "usb0")
     plug_in(system.lab, "robot", "usb0")
+
+
+def test_an_interface_that_comes_back_while_the_control_plane_is_dead(system: System) -> None:
+    """The cloud was told that it is gone; only the robot's own word can bring it back."""
+    before = peers_version(system)
+    system.lab.link("wlan0").unplug()
+    wait_for_path(system, "wlan0", up=False)
+    system.wait("the cloud to hear of it", lambda: peers_version(system) > before, SOON_S)
+    system.parts["controlplane"].kill()
+    system.lab.link("wlan0").restore()
+    wait_for_path(system, "wlan0", up=True)
+    with flawless_call(system):
+        system.lab.link("wwan0").blackhole()
+        system.lab.host("robot").ip_batch(["link set usb0 down"])
+    system.lab.link("wwan0").restore()
+    pull_out(system.lab, "robot", "usb0")
+    plug_in(system.lab, "robot", "usb0")
+    system.start_control_plane()
+    registered = "registered with the control plane"
+    log = system.parts["robot.sidecar"].log
+    system.wait("the robot to register again", lambda: log.read_text().count(registered) > 1)
 
 
 def test_one_path_of_ipv6_only_and_one_of_ipv4_only(system: System) -> None:
