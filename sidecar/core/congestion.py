@@ -1,9 +1,8 @@
 """How much may be under way on one path, and when the next burst may leave.
 
 A model of the path, after BBR (draft-ietf-ccwg-bbr): the rate at which it delivers and the round trip of its empty
-queue say how fast to send and how much to have in flight. Single losses change nothing: radio links lose datagrams
-without being full. Losses while a queue stands do: then a ceiling on the bytes in flight is cut, and grows again as
-CUBIC's window does (RFC 9438), so that TCP keeps its share.
+queue say how fast to send and how much to have in flight. Losses that mean congestion put a ceiling on that. Why so:
+docs/adr/0011-congestion-by-model-and-ceiling.md.
 """
 
 from __future__ import annotations
@@ -12,12 +11,12 @@ from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core.delivery_rate import DeliveryRate
+from sidecar.core.loss_ceiling import LossCeiling
+from sidecar.core.units import DATAGRAM_BYTES
 
 if TYPE_CHECKING:
     from sidecar.core.rtt import RttEstimator
 
-DATAGRAM_BYTES = 1200
-"""What windows and growth are counted in; larger datagrams make neither wrong, only coarser."""
 INITIAL_WINDOW_BYTES = 32 * 1024
 """May leave at once on a path of which nothing is known: within what browsers do (RFC 6928 says 14 kB for TCP), and
 so that small requests never wait for an estimate."""
@@ -44,6 +43,8 @@ DRAIN_ROUNDS = 3
 """Draining ends after so many rounds: what still stands then is not ours."""
 CYCLE = (1.25, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
 """Pacing gains round by round: ask for more, drain what that queued, cruise (BBR's ProbeBW)."""
+PROBE_GROWTH = 1.1
+"""Asking for more found that much: ask again at once."""
 FULL_GROWTH = 1.25
 FULL_ROUNDS = 3
 """The path is full when the rate did not grow by FULL_GROWTH within FULL_ROUNDS."""
@@ -51,20 +52,8 @@ QUEUE_FACTOR = 0.25
 """A round trip this much above the minimum shows a queue."""
 PROBE_AGAIN_S = 1.0
 """A queue that stands although we keep to our window makes us look for the minimum no more often than this."""
-FLOOR_MEMORY_S = 60.0
-"""How long the least round trip of all counts when a loss is judged."""
 MINIMUM_STALE_S = 5.0
 """A minimum round trip not seen for this long is looked for, with half the window, before it is forgotten."""
-CUT = 0.7
-"""What a loss with a standing queue leaves of the ceiling (CUBIC's beta, RFC 9438 section 4.6)."""
-CUBIC_C = 0.4
-"""Growth of the ceiling, datagrams per cubed second (RFC 9438 section 5)."""
-SIGNIFICANT = 2.0
-"""A queue's losses are congestion when they are this many times as frequent as those without a queue."""
-LOSS_MEMORY_BYTES = 500 * DATAGRAM_BYTES
-"""Over how much the frequency of losses without a queue is measured."""
-HEAVY_LOSS = 0.2
-"""Losing this much of a round's bytes is congestion even without a queue: a policer, or a tiny buffer."""
 OUTAGE_FRACTION = 0.5
 """What a path that was down is believed to carry of what it carried before."""
 PERSISTENT_FACTOR = 3
@@ -98,34 +87,23 @@ class CongestionController:
 
     __slots__ = (
         "_believed_before",
-        "_ceiling",
-        "_cut_at",
         "_cycle",
         "_drained_at",
-        "_epoch_at",
-        "_epoch_ceiling",
         "_first_window",
-        "_floor_at",
-        "_floor_rtt",
         "_full_rate",
         "_full_rounds",
-        "_idle_bytes",
-        "_idle_lost",
         "_phase_rounds",
         "_probe_credit",
         "_probe_min_rtt",
         "_probed_rtt_at",
-        "_queue_stood",
+        "_rate_before",
         "_release_at",
-        "_round_acked",
-        "_round_in_flight",
-        "_round_lost",
         "_round_min_rtt",
-        "_round_queued",
         "_rtt",
         "_silent_since",
         "_standing_rounds",
         "_was_down",
+        "ceiling",
         "phase",
         "rate",
     )
@@ -133,6 +111,7 @@ class CongestionController:
     def __init__(self) -> None:
         self.phase = Phase.STARTUP
         self.rate = DeliveryRate()
+        self.ceiling = LossCeiling()
         self._rtt: RttEstimator | None = None
         self._first_window = float(INITIAL_WINDOW_BYTES)
         self._release_at = 0.0
@@ -148,20 +127,8 @@ class CongestionController:
         self._probed_rtt_at: float | None = None
         self._probe_min_rtt = float("inf")
         self._drained_at: float | None = None
-        self._idle_bytes = 0.0
-        self._idle_lost = 0.0
-        self._ceiling: float | None = None
-        self._epoch_at = 0.0
-        self._epoch_ceiling = 0.0
-        self._cut_at = float("-inf")
-        self._round_acked = 0
-        self._round_lost = 0
-        self._round_in_flight = 0
         self._round_min_rtt = float("inf")
-        self._round_queued = False
-        self._queue_stood = False
-        self._floor_rtt = float("inf")
-        self._floor_at = 0.0
+        self._rate_before = 0.0
 
     # -- asking ---------------------------------------------------------------------------------------------------
 
@@ -188,8 +155,8 @@ class CongestionController:
     def window(self) -> float:
         """Bytes that may be in flight."""
         model = self._model_window()
-        if self._ceiling is not None:
-            model = min(model, self._ceiling)
+        if self.ceiling.bytes is not None:
+            model = min(model, self.ceiling.bytes)
         least = MIN_WINDOW_BYTES if self.phase is not Phase.PROBE_RTT else MIN_WINDOW_BYTES / 2
         return min(max(model, least), MAX_WINDOW_BYTES)
 
@@ -225,7 +192,7 @@ class CongestionController:
         self._probe_credit = 0
         if in_flight <= size:
             self._silent_since = now
-        self._round_in_flight = max(self._round_in_flight, in_flight)
+        self.ceiling.on_sent(in_flight)
         pace = self.pacing_rate
         if pace is not None:
             self._release_at = max(self._release_at, now - LATE_S) + size / pace
@@ -238,10 +205,7 @@ class CongestionController:
         """Learn from an acknowledgement."""
         self._rtt = rtt
         self._silent_since = now
-        self._round_acked += sample.acked_bytes
         if sample.rtt_s:
-            self._note_floor(sample.rtt_s, rtt, now)
-            self._round_queued |= self._queue_stands(rtt)
             self._round_min_rtt = min(self._round_min_rtt, sample.rtt_s)
             if self._probed_rtt_at is None or sample.rtt_s <= 1.05 * rtt.minimum + 1e-4:
                 self._probed_rtt_at = now
@@ -250,8 +214,7 @@ class CongestionController:
         limit = STARTUP_GAIN * (self.rate.settled or self._first_window / max(rtt.minimum, 1e-4))
         probing_rtt = self.phase is Phase.PROBE_RTT
         round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit, held_back=probing_rtt)
-        if self._ceiling is not None:
-            self._grow_ceiling(now)
+        self.ceiling.on_acked(sample.acked_bytes, sample.rtt_s, rtt, self._model_window(), now)
         if self.phase is Phase.DRAIN and sample.in_flight <= self.rate.best * rtt.minimum:
             self._cruise()
         if round_over:
@@ -259,22 +222,11 @@ class CongestionController:
 
     def on_lost(self, lost_bytes: int, sent_at: float, in_flight: int, now: float) -> None:
         """These bytes were lost, the newest of them sent at `sent_at`; `in_flight` is what is left."""
-        self._round_lost += lost_bytes
         rtt = self._rtt
-        if rtt is None:
+        if rtt is None or not self.ceiling.on_lost(lost_bytes, sent_at, in_flight, rtt, now):
             return
-        if sent_at <= self._cut_at:
-            return  # left before the last cut could help (RFC 9002 section 7.3.2)
-        carried = self._round_lost + self._round_acked
-        heavy = self._round_lost > max(HEAVY_LOSS * carried, 8 * DATAGRAM_BYTES)
-        if heavy or (self._queue_stands(rtt) and self._round_lost > SIGNIFICANT * self._usual_loss(carried)):
-            self._cut(in_flight + lost_bytes, now)
-
-    def _usual_loss(self, size: int) -> float:
-        """How many of so many bytes are lost without a queue; a little more where there are such losses at all."""
-        if self._idle_lost <= 0.005 * self._idle_bytes:
-            return 0.0
-        return self._idle_lost / self._idle_bytes * size + DATAGRAM_BYTES
+        if self.phase is Phase.STARTUP:
+            self._enter(Phase.DRAIN)
 
     def on_probe_timeout(self, now: float) -> None:
         """Nothing was heard: two datagrams may leave whatever is in flight (RFC 9002 section 7.5)."""
@@ -287,7 +239,7 @@ class CongestionController:
         """The path is dead."""
         self._was_down = True
         self.rate.scale(OUTAGE_FRACTION)
-        self._forget_ceiling()
+        self.ceiling.forget()
 
     def on_path_up(self, now: float) -> None:
         """The path answers; after an outage, start from a part of what it carried, and look for more."""
@@ -303,38 +255,36 @@ class CongestionController:
     # -- rounds ---------------------------------------------------------------------------------------------------
 
     def _end_round(self, rtt: RttEstimator, now: float) -> None:
-        standing = self._round_min_rtt - rtt.minimum if self._round_min_rtt < float("inf") else 0.0
-        queued = standing > QUEUE_FACTOR * rtt.minimum + END_HOST_S
+        standing_s = self._round_min_rtt - rtt.minimum if self._round_min_rtt < float("inf") else 0.0
+        self._round_min_rtt = float("inf")
+        queued = standing_s > QUEUE_FACTOR * rtt.minimum + END_HOST_S
         self._phase_rounds += 1
-        self._standing_rounds = self._standing_rounds + 1 if standing > rtt.minimum + 2 * END_HOST_S else 0
-        if self._standing_rounds:
+        self.ceiling.end_round()
+        if standing_s > rtt.minimum + 2 * END_HOST_S:
+            self._standing_rounds += 1
             self._believed_before = max(self._believed_before, self.rate.best)
             self.rate.believe_latest()
-        if not self._queue_stood and not self._round_queued:
-            self._note_usual_loss()
-        self._queue_stood = self._round_queued
-        self._round_queued = False
+        else:
+            self._standing_rounds = 0
+            self._believed_before = 0.0
         if self.phase is Phase.STARTUP:
             self._check_full(queued=queued)
         elif self.phase is Phase.DRAIN and self._phase_rounds > DRAIN_ROUNDS:
             self._cruise()
         elif self.phase is Phase.CRUISE:
-            self._cycle = (self._cycle + 1) % len(CYCLE)
-            unseen = now - (self._probed_rtt_at or now)
-            if unseen > MINIMUM_STALE_S or (self._standing_rounds > 1 and unseen > PROBE_AGAIN_S):
+            self._next_in_cycle(queued=queued)
+            unseen_s = now - (self._probed_rtt_at or now)
+            if unseen_s > MINIMUM_STALE_S or (self._standing_rounds > 1 and unseen_s > PROBE_AGAIN_S):
                 self._enter(Phase.PROBE_RTT)
                 self._drained_at = None
                 self._probe_min_rtt = float("inf")
-        self._round_acked = self._round_lost = 0
-        self._round_in_flight = 0
-        self._round_min_rtt = float("inf")
 
-    def _note_usual_loss(self) -> None:
-        if self._idle_bytes > LOSS_MEMORY_BYTES:
-            self._idle_bytes /= 2
-            self._idle_lost /= 2
-        self._idle_bytes += self._round_acked + self._round_lost
-        self._idle_lost += self._round_lost
+    def _next_in_cycle(self, *, queued: bool) -> None:
+        """Go to the next gain. What was sent at the first is acknowledged by the end of the second round."""
+        if self._cycle == 0:
+            self._rate_before = self.rate.settled
+        found_more = self._cycle == 1 and self.rate.settled > PROBE_GROWTH * self._rate_before and not queued
+        self._cycle = 0 if found_more else (self._cycle + 1) % len(CYCLE)
 
     def _probe_rtt(self, sample: RateSample, rtt: RttEstimator, now: float) -> None:
         """With little of ours in flight for a round trip, what remains of the queue is others'."""
@@ -343,7 +293,7 @@ class CongestionController:
             if sample.in_flight <= self.window:
                 self._drained_at = now
         elif sample.sent_at >= self._drained_at:
-            if self._probe_min_rtt > 2 * rtt.minimum:
+            if self._believed_before and self._probe_min_rtt > 2 * rtt.minimum:
                 self.rate.restart(self._believed_before)  # the queue is others': the path is not slower than thought
             self._believed_before = 0.0
             rtt.restart_minimum(self._probe_min_rtt, now)
@@ -369,51 +319,10 @@ class CongestionController:
         self._enter(Phase.CRUISE)
         self._cycle = 2
 
-    # -- loss -----------------------------------------------------------------------------------------------------
-
-    def _note_floor(self, rtt_s: float, rtt: RttEstimator, now: float) -> None:
-        if rtt_s <= self._floor_rtt:
-            self._floor_rtt, self._floor_at = rtt_s, now
-        elif now - self._floor_at > FLOOR_MEMORY_S:
-            self._floor_rtt, self._floor_at = rtt.minimum, now
-
-    def _queue_stands(self, rtt: RttEstimator) -> bool:
-        """Whether there is a queue, whosever: seen from the floor, which others' queues do not raise so soon."""
-        excess = min(rtt.smoothed, rtt.latest) - self._floor_rtt
-        return excess > max(0.2 * self._floor_rtt, 2.5 * rtt.variation, 0.001)
-
-    def _cut(self, in_flight: int, now: float) -> None:
-        at = float(max(in_flight, self._round_in_flight))
-        if self._ceiling is not None:
-            at = min(at, self._ceiling)
-        self._ceiling = max(CUT * at, MIN_WINDOW_BYTES)
-        # Fast convergence (RFC 9438 section 4.7): who has to yield twice leaves room for others.
-        self._epoch_ceiling = at if at >= self._epoch_ceiling else at * (1 + CUT) / 2
-        self._epoch_at = self._cut_at = now
-        if self.phase is Phase.STARTUP:
-            self._enter(Phase.DRAIN)
-
-    def _grow_ceiling(self, now: float) -> None:
-        top = self._epoch_ceiling / DATAGRAM_BYTES
-        k = (top * (1 - CUT) / CUBIC_C) ** (1 / 3)
-        t = now - self._epoch_at
-        cubic = CUBIC_C * (t - k) ** 3 + top
-        # As fast as Reno where that is faster (RFC 9438 section 4.3).
-        rtt = self._rtt.smoothed if self._rtt is not None else 0.1
-        reno = CUT * top + 3 * (1 - CUT) / (1 + CUT) * t / max(rtt, 1e-3)
-        self._ceiling = max(cubic, reno, CUT * top) * DATAGRAM_BYTES
-        if self._ceiling > 2 * self._model_window() and self._ceiling > 2 * self._epoch_ceiling:
-            self._forget_ceiling()
-
-    def _forget_ceiling(self) -> None:
-        self._ceiling = None
-        self._epoch_ceiling = 0.0
-        self._cut_at = float("-inf")
-
     def _collapse(self, rtt: RttEstimator) -> None:
         """Persistent congestion: begin again with the least (RFC 9002 section 7.6.2)."""
         self.rate.restart(MIN_WINDOW_BYTES / max(rtt.smoothed, 1e-3))
-        self._forget_ceiling()
+        self.ceiling.forget()
         self._first_window = float(MIN_WINDOW_BYTES)
         self._enter(Phase.STARTUP)
         self._full_rate = 0.0

@@ -1,10 +1,11 @@
 """Symbols that wait for one path, and which of them leave next.
 
 Urgent before bulk: a message's priority comes first. Fresh before late: within a priority, those that can still make
-their deadline go first, earliest deadline first; those that can not go after them. So a backlog or an overload makes
-some messages miss, instead of each message make the next one late. What comes with its deadline over goes last: after
-an outage the pace is low at first, and what is asked then may seem hopeless, but must not wait for the backlog. No
-priority starves: while a lower one waits, it gets one symbol in SHARE.
+their deadline go first, earliest deadline first; those that can not go after them, what is begun first and then the
+newest. So a backlog or an overload makes some messages miss, instead of each message make the next one late, and what
+comes late comes as little late as can be. What comes with its deadline over goes last: after an outage the pace is low
+at first, and what is asked then may seem hopeless, but must not wait for the backlog. No priority starves: while a
+lower one waits, it gets one symbol in SHARE.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ HASTE = 1.25
 begun should also be finished."""
 PURGE_AT = 64
 """Entries before the first look for messages that are over; then whenever their number has doubled."""
+BEGUN = float("-inf")
+"""Sorts what is begun before the other late ones."""
 MAX_RUN = 64
 """Symbols in a run: the segments of one offload."""
 MAX_RUN_BYTES = 65_000
@@ -46,13 +49,15 @@ class Run(NamedTuple):
 class _Entry:
     """One message's turn on one path."""
 
-    __slots__ = ("again", "message", "next")
+    __slots__ = ("again", "begun", "message", "next")
 
     def __init__(self, message: OutboundMessage) -> None:
         self.message = message
         self.next = 0
         self.again: deque[int] = deque()
         """Symbols to be sent once more."""
+        self.begun = False
+        """Some of what is to be sent has left."""
 
     def take(self, most: int) -> tuple[int, int] | None:
         """Remove and return the next consecutive symbols as (first, count), `most` of them; None when none is left."""
@@ -85,9 +90,8 @@ class _Entry:
         message = self.message
         if not pace:
             return message.deadline <= now
-        begun = self.next > 0
         sending_s = (len(self.again) + message.symbols - self.next) * message.symbol / pace
-        return message.deadline <= now + sending_s * (1.0 if begun else HASTE) + round_trip_s
+        return message.deadline <= now + sending_s * (1.0 if self.begun else HASTE) + round_trip_s
 
 
 class _Class:
@@ -192,6 +196,9 @@ class SendQueue:
             size = message.symbol + FRAGMENT_OVERHEAD_BYTES
             run = entry.take(max(1, min(most, budget // size, MAX_RUN_BYTES // size)))
             if run is not None:
+                entry.begun = True
+                if heap is not chosen.fresh:
+                    heapq.heapreplace(heap, (BEGUN, heap[0][1], entry))
                 return Run(message, *run)
             self._drop(heap)
         return None
@@ -211,7 +218,8 @@ class SendQueue:
                     self._drop(heap)
                 elif heap is each.fresh and entry.is_hopeless(now, pace, round_trip_s):
                     late = each.hopeless if message.deadline > now else each.stale
-                    heapq.heappush(late, heapq.heappop(heap))
+                    deadline, order, _ = heapq.heappop(heap)
+                    heapq.heappush(late, (BEGUN if entry.begun else -deadline, order, entry))
                 else:
                     return heap
         return None

@@ -52,10 +52,16 @@ class Wire:
     cut: bool = False
     bytes_per_s: float = 0.0
     """0 means no limit."""
+    buffer_bytes: float = 0.0
+    """What the queue before it holds; 0 means a second of its rate."""
     mtu: int = 65_535
     """Longer packets vanish without a word; datagrams count with IPv4's headers."""
     busy_until: float = 0.0
     carried: int = 0
+    overflowed: int = 0
+    """Datagrams that found the queue full."""
+    longest_wait_s: float = 0.0
+    """The longest that a datagram stood in the queue; the test may reset it."""
 
 
 class Node:
@@ -267,8 +273,11 @@ class Mesh:
                 continue
             start = max(self.now, wire.busy_until)
             if wire.bytes_per_s:
-                if start - self.now > 1.0:
-                    continue  # the queue is full
+                wait = start - self.now
+                if wait * wire.bytes_per_s > (wire.buffer_bytes or wire.bytes_per_s):
+                    wire.overflowed += 1
+                    continue
+                wire.longest_wait_s = max(wire.longest_wait_s, wait)
                 wire.busy_until = start = start + len(data) / wire.bytes_per_s
             arrival = start - self.now + wire.delay_s + self.rng.uniform(0, wire.jitter_s)
             self.at(arrival, lambda: self._arrive(source, destination, data))

@@ -124,7 +124,16 @@ def test_the_late_wait_for_all_that_can_still_make_it() -> None:
     queue = SendQueue()
     for number, deadline in ((1, 1.0), (2, 2.0), (3, 6.0), (4, 7.0)):
         queue.add(message(number, 10, deadline=deadline))
-    assert drain(queue, now=5.0) == [(3, 0), (4, 0), (1, 0), (2, 0)]
+    assert drain(queue, now=5.0) == [(3, 0), (4, 0), (2, 0), (1, 0)]
+
+
+def test_what_is_begun_is_finished_before_newer_late_ones() -> None:
+    queue = SendQueue()
+    queue.add(message(1, deadline=1.0))
+    assert take(queue, now=5.0) == (1, 0, 1)
+    queue.add(message(2, 10, deadline=2.0))
+    queue.add(message(3, 10, deadline=9.0))
+    assert drain(queue, now=5.0) == [(3, 0), (1, 1), (1, 2), (2, 0)]
 
 
 def test_what_can_not_make_it_at_this_pace_is_late_already() -> None:

@@ -1,0 +1,148 @@
+"""A ceiling on the bytes in flight of one path, cut by losses that mean congestion.
+
+Radio links lose datagrams without being full, so a loss alone says nothing. Congestion is a loss while a queue stands,
+when such losses are clearly more frequent than those without a queue; and heavy loss in any case. The ceiling then
+falls and grows again as CUBIC's window does (RFC 9438), so that TCP at the same bottleneck keeps its share.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.units import DATAGRAM_BYTES
+
+if TYPE_CHECKING:
+    from sidecar.core.rtt import RttEstimator
+
+CUT = 0.7
+"""What a cut leaves (CUBIC's beta, RFC 9438 section 4.6)."""
+CUBIC_C = 0.4
+"""Growth, datagrams per cubed second (RFC 9438 section 5)."""
+LEAST_BYTES = 4 * DATAGRAM_BYTES
+SIGNIFICANT = 2.0
+"""A queue's losses are congestion when they are this many times as frequent as those without a queue."""
+UNUSUAL = 0.005
+"""Less than this share lost without a queue is as good as nothing."""
+MEMORY_BYTES = 500 * DATAGRAM_BYTES
+"""Over how much the frequency of losses without a queue is measured."""
+HEAVY_LOSS = 0.2
+HEAVY_BYTES = 8 * DATAGRAM_BYTES
+"""Losing this share of a round and this much of it is congestion even without a queue: a policer, a tiny buffer."""
+QUEUE_FACTOR = 0.2
+"""A round trip that is longer than the floor by this share, and by more than it varies, shows a queue."""
+VARIATIONS = 2.5
+QUEUE_S = 0.001
+FLOOR_MEMORY_S = 60.0
+"""How long the least round trip counts as the floor. Longer than the minimum that sets the window: the queue of a TCP
+flow that never drains raises that one, and its losses must still be seen as a queue's."""
+
+
+class LossCeiling:
+    """Bytes that may be in flight; None while nothing was lost to congestion."""
+
+    __slots__ = (
+        "_acked",
+        "_at",
+        "_floor_at",
+        "_floor_s",
+        "_lost",
+        "_most_in_flight",
+        "_queue_before",
+        "_queued",
+        "_start",
+        "_top",
+        "_usual_bytes",
+        "_usual_lost",
+        "bytes",
+    )
+
+    def __init__(self) -> None:
+        self.bytes: float | None = None
+        self._at = float("-inf")
+        """When the last cut was."""
+        self._start = 0.0
+        self._top = 0.0
+        self._acked = self._lost = 0
+        """Bytes of this round."""
+        self._most_in_flight = 0
+        self._queued = False
+        self._queue_before = False
+        self._usual_bytes = 0.0
+        self._usual_lost = 0.0
+        self._floor_s = float("inf")
+        self._floor_at = 0.0
+
+    def on_sent(self, in_flight: int) -> None:
+        """So many bytes are in flight."""
+        self._most_in_flight = max(self._most_in_flight, in_flight)
+
+    def on_acked(self, size: int, rtt_s: float, rtt: RttEstimator, wanted: float, now: float) -> None:
+        """Grow. `wanted` is the window without a ceiling; one that is far above it is forgotten."""
+        self._acked += size
+        if rtt_s:
+            if rtt_s <= self._floor_s:
+                self._floor_s, self._floor_at = rtt_s, now
+            elif now - self._floor_at > FLOOR_MEMORY_S:
+                self._floor_s, self._floor_at = rtt.minimum, now
+            self._queued |= self._queue_stands(rtt)
+        if self.bytes is not None:
+            self.bytes = self._grown(now - self._at, rtt.smoothed)
+            if self.bytes > 2 * max(wanted, self._top):
+                self.forget()
+
+    def on_lost(self, size: int, sent_at: float, in_flight: int, rtt: RttEstimator, now: float) -> bool:
+        """Take a loss, the newest datagram of it sent at `sent_at`; True when it cut the ceiling."""
+        self._lost += size
+        if sent_at <= self._at:
+            return False  # it left before the last cut could help (RFC 9002 section 7.3.2)
+        if not self._is_heavy() and not (self._queue_stands(rtt) and self._is_unusual()):
+            return False
+        before = float(max(in_flight + size, self._most_in_flight))
+        if self.bytes is not None:
+            before = min(before, self.bytes)
+        # Fast convergence (RFC 9438 section 4.7): who has to yield twice leaves room for others.
+        self._top = before if before >= self._top else before * (1 + CUT) / 2
+        self._start = self.bytes = max(CUT * before, LEAST_BYTES)
+        self._at = now
+        return True
+
+    def end_round(self) -> None:
+        """A round trip is over. What it lost without any queue, and none in the one before, is usual."""
+        if not self._queued and not self._queue_before:
+            if self._usual_bytes > MEMORY_BYTES:
+                self._usual_bytes /= 2
+                self._usual_lost /= 2
+            self._usual_bytes += self._acked + self._lost
+            self._usual_lost += self._lost
+        self._queue_before = self._queued
+        self._queued = False
+        self._acked = self._lost = 0
+        self._most_in_flight = 0
+
+    def forget(self) -> None:
+        """No ceiling."""
+        self.bytes = None
+        self._top = 0.0
+        self._at = float("-inf")
+
+    def _grown(self, elapsed_s: float, rtt_s: float) -> float:
+        top, start = self._top / DATAGRAM_BYTES, self._start / DATAGRAM_BYTES
+        plateau_s: float = (max(0.0, top - start) / CUBIC_C) ** (1 / 3)
+        cubic = CUBIC_C * (elapsed_s - plateau_s) ** 3 + top
+        # Not slower than Reno (RFC 9438 section 4.3).
+        reno = start + 3 * (1 - CUT) / (1 + CUT) * elapsed_s / max(rtt_s, 0.001)
+        return float(max(cubic, reno, start)) * DATAGRAM_BYTES
+
+    def _queue_stands(self, rtt: RttEstimator) -> bool:
+        """Whether there is a queue, whosever."""
+        excess_s = min(rtt.smoothed, rtt.latest) - self._floor_s
+        return excess_s > max(QUEUE_FACTOR * self._floor_s, VARIATIONS * rtt.variation, QUEUE_S)
+
+    def _is_heavy(self) -> bool:
+        return self._lost > max(HEAVY_LOSS * (self._lost + self._acked), HEAVY_BYTES)
+
+    def _is_unusual(self) -> bool:
+        if self._usual_lost <= UNUSUAL * self._usual_bytes:
+            return True
+        usual = self._usual_lost / self._usual_bytes * (self._acked + self._lost)
+        return self._lost > SIGNIFICANT * (usual + DATAGRAM_BYTES)
