@@ -81,10 +81,12 @@ class LossCeiling:
         self._acked += size
         if rtt_s:
             if rtt_s <= self._floor_s:
+                if rtt_s < self._floor_s - self._short_s:
+                    self._usual_bytes = self._usual_lost = 0.0  # learnt with others' queue taken for none
                 self._floor_s, self._floor_at = rtt_s, now
             elif now - self._floor_at > FLOOR_MEMORY_S:
                 self._floor_s, self._floor_at = rtt.minimum, now
-            self._queued |= self._queue_stands(rtt)
+            self._queued |= rtt_s - self._floor_s > self._short_s
         if self.bytes is not None:
             self.bytes = self._grown(now - self._at, rtt.smoothed)
             if self.bytes > 2 * max(wanted, self._top):
@@ -107,8 +109,8 @@ class LossCeiling:
         return True
 
     def end_round(self) -> None:
-        """A round trip is over. What it lost without any queue, and none in the one before, is usual."""
-        if not self._queued and not self._queue_before:
+        """A round trip is over. What it lost while no datagram met a queue, nor in the one before, is usual."""
+        if not self._queued and not self._queue_before and not self._is_heavy():
             if self._usual_bytes > MEMORY_BYTES:
                 self._usual_bytes /= 2
                 self._usual_lost /= 2
@@ -134,9 +136,14 @@ class LossCeiling:
         return float(max(cubic, reno, start)) * DATAGRAM_BYTES
 
     def _queue_stands(self, rtt: RttEstimator) -> bool:
-        """Whether there is a queue, whosever."""
+        """Whether there is a queue, whosever, and not only for a moment."""
         excess_s = min(rtt.smoothed, rtt.latest) - self._floor_s
-        return excess_s > max(QUEUE_FACTOR * self._floor_s, VARIATIONS * rtt.variation, QUEUE_S)
+        return excess_s > max(self._short_s, VARIATIONS * rtt.variation)
+
+    @property
+    def _short_s(self) -> float:
+        """What a queue shorter than this is taken for none."""
+        return max(QUEUE_FACTOR * self._floor_s, QUEUE_S)
 
     def _is_heavy(self) -> bool:
         return self._lost > max(HEAVY_LOSS * (self._lost + self._acked), HEAVY_BYTES)
