@@ -28,8 +28,8 @@ log = logging.getLogger(__name__)
 
 ROOM_BYTES = 1 << 16
 """Longer than the longest UDP payload and the longest run that the kernel joins: nothing is ever truncated."""
-ARENA_BYTES = 4 * ROOM_BYTES
-"""Received in one turn at most: some hundred datagrams, one or two milliseconds of work; small enough for the cache."""
+ARENA_BYTES = 256 * 1024
+"""Received in one turn at most, four of the longest runs: one or two milliseconds of work, and it fits the cache."""
 RECEIVE_CALLS = 64
 """System calls of one turn at most, for the many small datagrams that the kernel does not join."""
 
