@@ -40,6 +40,8 @@ from sidecar.core.rules import ServiceRule
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from sidecar.core.datagrams import Batch
+
 SERVICE = ServiceName("/bench")
 TYPE = "bench/srv/Bytes"
 ONE_WAY_S = 0.0005
@@ -68,10 +70,10 @@ class Side:
         candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, self.address)
         return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers)
 
-    def turn(self, now: float) -> list[bytes]:
-        """Let engine and link talk until both are done; returns the datagrams that leave."""
+    def turn(self, now: float) -> list[Batch]:
+        """Let engine and link talk until both are done; returns what leaves."""
         engine, link = self.engine, self.link
-        out: list[bytes] = []
+        out: list[Batch] = []
         while True:
             while (event := link.next_event()) is not None:
                 engine.on_link_event(event, now)
@@ -86,9 +88,9 @@ class Side:
                 link.execute(command, now)
             batches = link.batches_to_send(now)
             if not batches:
-                self.datagrams += len(out)
+                self.datagrams += sum(batch.datagrams for batch in out)
                 return out
-            out += [bytes(datagram) for batch in batches for datagram in batch.cut()]
+            out += batches
 
 
 class Pair:
@@ -100,7 +102,7 @@ class Pair:
         self.robot = Side("robot", Role.ROBOT, 1, self.now)
         self.cloud = Side("cloud", Role.CLOUD, 2, self.now)
         self.sent = 0
-        self.early: defaultdict[NodeName, list[bytes]] = defaultdict(list)
+        self.early: defaultdict[NodeName, list[Batch]] = defaultdict(list)
         """What left in the turns between two batches, and is still to be carried."""
         for side, other in ((self.robot, self.cloud), (self.cloud, self.robot)):
             side.engine.apply_peers(PeerSet(Version(1), 1, (other.as_peer(),)), self.now)
@@ -123,9 +125,9 @@ class Pair:
             self.now = max(self.now, min(min(s.link.next_timer(), s.engine.next_timer()) for s in sides))
         for receiver, flight in flights:
             source = self.cloud.address if receiver is self.robot else self.robot.address
-            for start in range(0, len(flight), self.batch):
-                for data, segment in joined(flight[start : start + self.batch]):
-                    receiver.link.receive_batch(memoryview(data), segment, source, self.now)
+            for turn in turns(flight, self.batch):
+                for data, segment in turn:
+                    receiver.link.receive_batch(data, segment, source, self.now)
                 self.early[receiver.name] += receiver.turn(self.now)
         for side in (self.robot, self.cloud):
             side.engine.handle_timer(self.now)
@@ -141,16 +143,21 @@ class Pair:
             self.step()
 
 
-def joined(datagrams: list[bytes]) -> Iterator[tuple[bytes, int]]:
-    """Lay datagrams of one length side by side, as the kernel does; each with that length."""
-    run: list[bytes] = []
-    for datagram in datagrams:
-        if run and (len(datagram) > len(run[0]) or len(run[-1]) < len(run[0])):
-            yield b"".join(run), len(run[0])
-            run = []
-        run.append(datagram)
-    if run:
-        yield b"".join(run), len(run[0])
+def turns(flight: list[Batch], most: int) -> Iterator[list[tuple[memoryview, int]]]:
+    """Cut a flight into what is received in one turn: about `most` datagrams at once, as the kernel joins them."""
+    turn: list[tuple[memoryview, int]] = []
+    room = most
+    for _, data, segment in flight:
+        view = memoryview(data)
+        while view:
+            run, view = view[: room * segment], view[room * segment :]
+            turn.append((run, segment))
+            room -= -(-len(run) // segment)
+            if room <= 0:
+                yield turn
+                turn, room = [], most
+    if turn:
+        yield turn
 
 
 @dataclass(frozen=True)
@@ -197,7 +204,7 @@ def main() -> None:
     parser.add_argument("--profile", action="store_true", help="show the functions that cost most")
     parser.add_argument("--only", default="", help="run only the kinds of traffic whose name contains this")
     parser.add_argument(
-        "--batch", type=int, default=4, help="datagrams received between two turns of a side (default 4)"
+        "--batch", type=int, default=16, help="datagrams received between two turns of a side (default 16)"
     )
     arguments = parser.parse_args()
     chosen = [traffic for traffic in TRAFFIC if arguments.only in traffic.name]
