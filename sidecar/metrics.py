@@ -164,6 +164,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     rtt: dict[tuple[str, ...], float] = {}
     sent: dict[tuple[str, ...], float] = {}
     lost: dict[tuple[str, ...], float] = {}
+    late: dict[tuple[str, ...], float] = {}
     path_bytes: dict[tuple[str, ...], float] = {}
     path_mtu: dict[tuple[str, ...], float] = {}
     offload: dict[tuple[str, ...], float] = {}
@@ -179,6 +180,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
                 rtt[labels] = path.srtt_s
             sent[labels] = path.datagrams_sent
             lost[labels] = path.datagrams_lost
+            late[labels] = path.spurious_losses
             path_bytes[labels] = path.bytes_sent
             path_mtu[labels] = path.max_datagram
     of_path = ("interface", "peer")
@@ -198,6 +200,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     yield gauge("plr_path_rtt_seconds", "Smoothed round-trip time of the best path to the peer.", of_path, rtt)
     yield counter("plr_path_datagrams_sent", "Numbered datagrams sent over the best path.", of_path, sent)
     yield counter("plr_path_datagrams_lost", "Those of them found lost.", of_path, lost)
+    yield counter("plr_path_spurious_losses", "Those found lost that had arrived.", of_path, late)
     yield counter("plr_path_bytes_sent", "UDP payload bytes sent over the best path.", of_path, path_bytes)
     yield gauge("plr_path_mtu_bytes", "Longest datagram the best path is known to carry.", of_path, path_mtu)
 

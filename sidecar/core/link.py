@@ -274,7 +274,7 @@ class Link:
             self._path_timer(path, now)
         if now >= self._measure_at:
             self._measure_at = now + MEASURE_EVERY_S
-            self._measure()
+            self._measure(now)
 
     def next_timer(self) -> float:
         """When `handle_timer` is wanted next."""
@@ -504,9 +504,10 @@ class Link:
             if indices:
                 self._events.append(FragmentsLost(path.id, message, tuple(indices), timed_out))
 
-    def _measure(self) -> None:
+    def _measure(self, now: float) -> None:
         for path in self._paths.values():
             self._report_measured(path)
+            path.recovery.reordering.forget_old(path.recovery.rtt, now)
         self._publish_path_stats()
 
     def _report_measured(self, path: Path) -> None:
@@ -537,6 +538,7 @@ class Link:
                 srtt_s=path.recovery.rtt.smoothed,
                 datagrams_sent=path.recovery.total_sent,
                 datagrams_lost=path.recovery.total_lost,
+                spurious_losses=path.recovery.reordering.spurious,
                 bytes_sent=path.bytes_sent,
                 max_datagram=path.mtu.size,
             )

@@ -23,6 +23,8 @@ class PathStats:
     srtt_s: float = 0.0
     datagrams_sent: int = 0
     datagrams_lost: int = 0
+    spurious_losses: int = 0
+    """Of the lost: acknowledged after all."""
     bytes_sent: int = 0
     max_datagram: int = 0
     """Bytes of UDP payload."""

@@ -131,6 +131,7 @@ def test_counters_become_samples() -> None:
         "plr_path_up{interface=wlan0,peer=cloud-b}": 0,
         "plr_path_rtt_seconds{interface=wlan0,peer=cloud-a}": 0.025,
         "plr_path_datagrams_lost_total{interface=wlan0,peer=cloud-a}": 1,
+        "plr_path_spurious_losses_total{interface=wlan0,peer=cloud-a}": 0,
         "plr_nacks_total{resource=mapping}": 1,
         "plr_control_plane_connected{}": 1,
         "plr_control_messages_ignored_total{reason=undecodable}": 1,
