@@ -6,8 +6,11 @@ nothing troubles them.
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -100,6 +103,38 @@ def test_a_peer_that_takes_nothing_delays_no_other_peer_on_the_same_interface(tm
         assert latencies(beside)[len(beside) * 9 // 10] < 20 * latencies(calm)[len(calm) * 9 // 10]
         assert worst(beside) < CALM_S
         robot.wait_for_answers(backlog)
+
+
+FLOOD = """
+import socket, sys
+out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+out.connect(("127.0.0.2", int(sys.argv[1])))
+while True:
+    out.send(bytes((0xD1,)) + bytes(50))
+"""
+
+
+def test_a_flood_on_one_interface_starves_neither_its_own_timers_nor_the_other(tmp_path: Path) -> None:
+    mapping = {"/good": ("wlan0", "cloud_a"), "/flooded": ("wwan0", "cloud_a")}
+    with Robot(tmp_path, ("wlan0", "wwan0"), mapping) as robot:
+        calm = robot.beat("/good", CALM_S)
+        thread = robot.threads["wwan0"]
+        looked: list[float] = []
+        handle_timer = thread.link.handle_timer
+
+        def noting(now: float) -> None:
+            looked.append(now)
+            handle_timer(now)
+
+        thread.link.handle_timer = noting  # type: ignore[method-assign]
+        with subprocess.Popen([sys.executable, "-c", FLOOD, str(thread.port)]) as flood:
+            try:
+                beside = robot.beat("/good", CALM_S * 2)
+            finally:
+                flood.kill()
+        assert thread.link.stats.dropped["unknown_session"] + thread.link.stats.dropped["malformed"] > 1000
+        assert latencies(beside)[len(beside) // 2] < 20 * latencies(calm)[len(calm) // 2]
+        assert max(after - before for before, after in itertools.pairwise(looked)) < CALM_S / 2
 
 
 def test_an_interface_that_computes_flat_out_leaves_the_interpreter_to_the_other(tmp_path: Path) -> None:

@@ -24,6 +24,10 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
+from protos.model import InterfaceName
+from sidecar.core.datagrams import Batch
+from sidecar.core.stats import LinkStats
+from sidecar.net.batch_socket import BatchSocket
 from sidecar.net.interfaces import Interface, choose, list_interfaces
 from sidecar.net.sockets import DataSocket, normalise, open_socket, to_sockaddr
 
@@ -184,6 +188,34 @@ def too_long() -> dict[str, Any]:
     return answers
 
 
+def runs() -> dict[str, Any]:
+    """Runs that fit the device, then runs of which only the last, shorter datagram does; over a device with and without
+    checksum offload, which segmentation by the kernel used to need.
+    """
+    answers: dict[str, Any] = {}
+    for offload in ("on", "off"):
+        sh(f"ethtool -K wlan0 tx {offload}")
+        for version, longest in ((4, 1472), (6, 1452)):
+            with open_socket(interface("wlan0"), 0).socket as sock:
+                source_seen_by_echo(sock, version)
+                stats = LinkStats(InterfaceName("wlan0"))
+                told: list[int] = []
+                batches = BatchSocket(sock, stats, lambda _, size, told=told: told.append(size))  # type: ignore[misc]
+                for segment in (longest, longest + 1):
+                    batches.send(Batch(ECHO[version], bytes(9 * segment + 40), segment))
+                answered = 0
+                while select.select([sock], [], [], 0.3)[0]:
+                    for run in batches.receive():
+                        answered += -(-len(run.data) // run.segment)
+                answers[f"{version} {offload}"] = {
+                    "answered": answered,
+                    "dropped": dict(stats.dropped),
+                    "segments": stats.offload["send"],
+                    "told": [size - longest for size in told],
+                }
+    return answers
+
+
 def interfaces() -> dict[str, Any]:
     sh("ip link add br-lab type bridge")
     sh("ip link add eth6 type veth peer name eth7")
@@ -229,6 +261,7 @@ SCENARIOS = {
     "no_ipv6": no_ipv6,
     "taken_port": taken_port,
     "too_long": too_long,
+    "runs": runs,
     "interfaces": interfaces,
 }
 

@@ -4,6 +4,7 @@ import errno
 import functools
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -83,6 +84,21 @@ def test_a_taken_port_is_an_error() -> None:
 def test_datagrams_are_not_fragmented() -> None:
     seen, _ = probe("too_long")
     assert seen == {"4": errno.EMSGSIZE, "6": errno.EMSGSIZE}
+
+
+def test_runs_are_cut_by_the_kernel_and_what_is_too_long_in_them_is_told_of() -> None:
+    if shutil.which("ethtool") is None:
+        pytest.skip("ethtool is not installed")
+    seen, log = probe("runs")
+    assert len(seen) == 4
+    for outcome in seen.values():
+        # Ten that fit, and of the next ten the last one.
+        assert outcome["answered"] == 11
+        assert outcome["dropped"] == {"unsendable_emsgsize": 9}
+        assert outcome["told"] == [1]
+    assert seen["4 on"]["segments"]
+    # Without checksum offload some kernels refuse; then, and only then, datagrams go one by one.
+    assert all(outcome["segments"] for outcome in seen.values()) == ("will not cut" not in log)
 
 
 def test_a_dropped_capability_costs_nothing_on_kernels_that_do_not_ask_for_it() -> None:
