@@ -20,6 +20,7 @@ from sidecar.core.events import (
 )
 from sidecar.core.inbound import Decoding, Inbound
 from sidecar.core.link_events import (
+    FinishedLost,
     FragmentsLost,
     FragmentsReceived,
     LinkCommand,
@@ -249,6 +250,10 @@ class Engine:
                 self._outbox.on_forgotten(peer, number)
             case MessageFinished(peer, number):
                 self._outbox.on_finished(peer, number)
+            case FinishedLost(path, numbers) if path.peer in self.peers:
+                self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
+            case FinishedLost():
+                pass
             case FragmentsLost():
                 self._outbox.on_lost(event, now)
             case PathMeasured() if self._knows(event.path):
@@ -307,6 +312,7 @@ class Engine:
         self.routes.set_state(path, state)
         if state is PathState.UP:
             self._outbox.on_path_up(path)
+            self._inbound.on_path_up(path)
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
             self._drop_if_unlisted(path.peer, now)
         self._update_offers(now)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.fragments import Fate, Reassembler
+from sidecar.core.fragments import OVER_REMEMBERED, Fate, Reassembler
 from sidecar.core.link_events import MessageDecoded, SendFinished, SendForgotten
 from sidecar.core.partial import Partial
 
@@ -40,6 +40,8 @@ class Inbound:
         self._stats = stats
         self._reassemblers: dict[NodeName, Reassembler] = {}
         self._decodings: list[Decoding] = []
+        self._untold: dict[NodeName, dict[int, None]] = {}
+        """Finished messages whose peer could not be told for want of a path, oldest first."""
 
     def add(self, path: PathId, session: SessionId, fragments: list[Fragment], now: float) -> list[memoryview]:
         """Store symbols that came over `path`; returns the messages that they complete.
@@ -62,6 +64,26 @@ class Inbound:
                 whole.append(content)
         return whole
 
+    def on_finished_lost(self, peer: NodeName, numbers: tuple[int, ...], best: PathId | None) -> None:
+        """A path died with FINISHED on it: tell the peer over `best`, or once there is a path.
+
+        Its sender has nothing left to send, and would keep the messages until they expire.
+        """
+        if best is not None:
+            for number in numbers:
+                self._command(SendFinished(best, number))
+            return
+        untold = self._untold.setdefault(peer, {})
+        untold.update(dict.fromkeys(numbers))
+        while len(untold) > OVER_REMEMBERED:
+            del untold[next(iter(untold))]
+            self._stats.dropped["finished_untold"] += 1
+
+    def on_path_up(self, path: PathId) -> None:
+        """Tell this peer what it could not be told."""
+        for number in self._untold.pop(path.peer, ()):
+            self._command(SendFinished(path, number))
+
     def take_decodings(self) -> list[Decoding]:
         """Return the messages to be decoded."""
         decodings, self._decodings = self._decodings, []
@@ -76,6 +98,7 @@ class Inbound:
     def forget_peer(self, peer: NodeName) -> None:
         """The peer's session is over."""
         self._reassemblers.pop(peer, None)
+        self._untold.pop(peer, None)
 
     def expire(self, now: float) -> None:
         """Drop messages that wait for too long."""

@@ -24,6 +24,7 @@ from sidecar.core.frame import (
     Header,
 )
 from sidecar.core.link_events import (
+    FinishedLost,
     FragmentsLost,
     FragmentsReceived,
     LinkCommand,
@@ -230,7 +231,10 @@ class Link:
                     path.queue.resend(message, indices)
             case SendFinished(path_id, number):
                 path = self._paths.get((path_id.peer, path_id.remote))
-                if path is not None:
+                if path is None or path.state is PathState.DOWN:
+                    self._events.append(PathChanged(path_id, PathState.DOWN, "not usable here"))
+                    self._events.append(FinishedLost(path_id, (number,)))
+                else:
                     self._owe(path, frame.encode_finished(frame.Finished(number)))
             case SendAbandon(path_id, number):
                 path = self._paths.get((path_id.peer, path_id.remote))
@@ -474,6 +478,9 @@ class Link:
         path.control.on_path_down()
         self._events.append(PathChanged(path.id, PathState.DOWN, reason))
         self._report_lost(path, path.recovery.give_up_all())
+        unsent = path.take_pending_finished()
+        if unsent:
+            self._events.append(FinishedLost(path.id, unsent))
         for message, indices in path.queue.clear():
             self._events.append(FragmentsLost(path.id, message, indices))
 
@@ -493,13 +500,18 @@ class Link:
 
     def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
         by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}
+        finished: list[int] = []
         for run in lost:
             if run.message is not None:
                 missing = filter(run.message.needs, run.indices)
                 by_message.setdefault(run.message.number, (run.message, []))[1].extend(missing)
-            elif path.state is not PathState.DOWN:
+            elif path.state is PathState.DOWN:
+                finished += run.finished
+            else:
                 for number in run.finished:
                     self._owe(path, frame.encode_finished(frame.Finished(number)))
+        if finished:
+            self._events.append(FinishedLost(path.id, tuple(finished)))
         for message, indices in by_message.values():
             if indices:
                 self._events.append(FragmentsLost(path.id, message, tuple(indices), timed_out))

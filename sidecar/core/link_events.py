@@ -136,6 +136,14 @@ class FragmentsLost:
 
 
 @dataclass(frozen=True, slots=True)
+class FinishedLost:
+    """The path died with these FINISHED unacknowledged: the peer may not know that its messages are complete."""
+
+    path: PathId
+    numbers: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class MessageFinished:
     """The peer holds the whole message."""
 
@@ -216,6 +224,7 @@ class PeerClosed:
 LinkEvent = (
     FragmentsReceived
     | FragmentsLost
+    | FinishedLost
     | MessageFinished
     | MessageAbandoned
     | MessageForgotten

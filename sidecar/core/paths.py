@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.congestion import CongestionController
+from sidecar.core.frame import FINISHED_TYPE, finished_number
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
 from sidecar.core.received import ReceivedPackets
@@ -159,6 +160,13 @@ class Path:
         self.recovery.rtt.sample(now - sent_at, now)
         self.note_rtt()
         return True
+
+    def take_pending_finished(self) -> tuple[int, ...]:
+        """Remove the FINISHED from the frames that wait, and return which messages they are of."""
+        waiting = [encoded for encoded in self.pending if encoded[0] == FINISHED_TYPE]
+        if waiting:
+            self.pending = [encoded for encoded in self.pending if encoded[0] != FINISHED_TYPE]
+        return tuple(map(finished_number, waiting))
 
     def note_rtt(self) -> None:
         """Keep the latest round-trip time for the next report."""

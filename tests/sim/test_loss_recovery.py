@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import InterfaceName
 from tests.sim.mesh import Mesh, Node
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
 
@@ -88,17 +87,3 @@ def test_a_path_that_only_reorders_is_soon_known_to() -> None:
     assert early[1] > 0
     calls = call_at(mesh, robot, 20, 3, size=30_000)
     assert lost(robot) - early[0] < calls * 25 * 0.05, "hardly anything is taken for lost any more"
-
-
-def test_a_finished_whose_path_dies_takes_another() -> None:
-    mesh, robot, cloud = one_cloud(4)
-    call_at(mesh, robot, 20, 1)
-    robot.submit(bytes(1000))
-    before = len(robot.responses())
-    while len(robot.responses()) == before:
-        for wire in mesh.all_wires_of("robot.wlan0"):
-            wire.cut = len(cloud.executed) > 20 and mesh.wire("cloud-a.eth0", "robot.wlan0").carried > 0
-        mesh.run(0.001)
-    mesh.run(3.0)
-    assert len(cloud.engine._outbox) == 0
-    assert robot.engine.routes.best_to(cloud.name).interface == InterfaceName("wwan0")  # type: ignore[union-attr]

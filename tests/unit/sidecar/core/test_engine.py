@@ -27,8 +27,10 @@ from sidecar.core.events import (
     RejectReason,
     RequestFailed,
 )
+from sidecar.core.fragments import OVER_REMEMBERED
 from sidecar.core.frame import BASE_SYMBOL_BYTES, Fragment
 from sidecar.core.link_events import (
+    FinishedLost,
     FragmentsReceived,
     LinkCommand,
     PathChanged,
@@ -337,3 +339,28 @@ def test_an_interface_that_goes_takes_its_routes_along() -> None:
     sidecar.take()
     sidecar.engine.on_link_event(PathChanged(PathId(WWAN, A, path().remote), PathState.UP, ""), 0.3)
     assert sidecar.take()[0], "the request travels over the other interface"
+
+
+def test_a_finished_that_lost_its_path_takes_another_or_waits_for_one() -> None:
+    sidecar = robot()
+    sidecar.take()
+    sidecar.engine.on_link_event(FinishedLost(sidecar.path, (7,)), 0.1)
+    assert sidecar.take()[0] == [SendFinished(sidecar.path, 7)]
+    sidecar.change(PathState.DOWN)
+    sidecar.engine.on_link_event(FinishedLost(sidecar.path, (7, 8)), 0.2)
+    assert [item for item in sidecar.take()[0] if isinstance(item, SendFinished)] == []
+    for expected in ([SendFinished(sidecar.path, 7), SendFinished(sidecar.path, 8)], []):
+        sidecar.change(PathState.UP)
+        assert [item for item in sidecar.take()[0] if isinstance(item, SendFinished)] == expected
+        sidecar.change(PathState.DOWN)
+
+
+def test_what_a_peer_could_not_be_told_is_bounded_and_ends_with_its_session() -> None:
+    sidecar = robot()
+    sidecar.change(PathState.DOWN)
+    sidecar.engine.on_link_event(FinishedLost(sidecar.path, tuple(range(OVER_REMEMBERED + 5))), 0.2)
+    assert sidecar.engine.stats.dropped["finished_untold"] == 5
+    sidecar.engine.on_link_event(FinishedLost(path(WLAN, "stranger"), (1,)), 0.2)
+    assert len(sidecar.engine._inbound._untold) == 1
+    sidecar.view(peer(A, session=2), version=2)
+    assert not sidecar.engine._inbound._untold

@@ -7,6 +7,7 @@ from sidecar.core import frame, pmtu
 from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Hello, Probe, ProbeReply, encode_header
 from sidecar.core.link import MAX_PATHS_OF_A_PEER
 from sidecar.core.link_events import (
+    FinishedLost,
     FragmentsLost,
     FragmentsReceived,
     LinkPeer,
@@ -336,6 +337,29 @@ def test_an_owed_finished_takes_the_acknowledgement_along_and_is_repeated_until_
     assert again == [Finished(1)] * len(again)
     assert again
     bench.receive(frame.encode_ack([(0, numbers([datagram])[0] + 20)], 0.0))
+
+
+def test_many_finished_travel_together_and_are_all_repeated_when_lost() -> None:
+    bench = up()
+    for number in range(100):
+        bench.execute(SendFinished(PATH, number))
+    told = [[item.message for item in frames([one]) if isinstance(item, Finished)] for one in bench.sent()]
+    assert [number for one in told for number in one] == list(range(100))
+    assert len(told) == 2
+    again = {item.message for item in frames(bench.wait(0.4)) if isinstance(item, Finished)}
+    assert again == set(range(100))
+
+
+def test_a_finished_whose_path_dies_is_handed_back() -> None:
+    bench = up()
+    bench.execute(SendFinished(PATH, 1))
+    bench.sent()
+    bench.execute(SendFinished(PATH, 2))
+    bench.execute(SetCarrier(on=False))
+    bench.execute(SendFinished(PATH, 3))
+    lost = [event for event in bench.events() if isinstance(event, FinishedLost)]
+    assert sorted(number for event in lost for number in event.numbers) == [1, 2, 3]
+    assert not [item for item in frames(bench.sent()) if isinstance(item, Finished)]
 
 
 def test_expired_messages_are_not_sent_and_counted() -> None:
