@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.churn.samples import Watch
-from bench.churn.schedule import CALM_END_S, PATHS, SERVERS, Lane, Trouble, ends_a_judged_process, others
+from bench.churn.schedule import CALM_END_S, PATHS, SERVERS, SPARED_FROM, Lane, Trouble, ends_a_judged_process, others
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -106,8 +106,8 @@ class Runner:
             state.shift_s = now - trouble.begins_s
             return
         state.queue.popleft()
-        if now >= self._length_s / 2 and ends_a_judged_process(trouble):
-            return  # postponed into the half that spares it
+        if now >= self._length_s * SPARED_FROM and ends_a_judged_process(trouble):
+            return  # postponed into the time that spares it
         if now + trouble.lasts_s > self._length_s - CALM_END_S:
             state.queue.clear()  # postponed beyond the end
             return

@@ -52,6 +52,7 @@ class Growth:
     rss_mb: float
     """By a straight line through its samples."""
     threads: int
+    """By how much the most at once in the last quarter exceed those in the third."""
     judged: bool
     """It ran through the whole second half, and that was long enough to tell."""
 
@@ -95,7 +96,9 @@ def growth(life: Life, length_s: float, every_s: float) -> Growth:
     span_s = half[-1].at_s - half[0].at_s
     whole = half[0].at_s <= length_s / 2 + 2 * every_s
     slope = slope_of([(sample.at_s, sample.rss_mb) for sample in half])
-    threads = half[-1].threads - half[0].threads
+    # They come and go with connections: what adds up is a higher peak.
+    middle = len(half) // 2
+    threads = max(sample.threads for sample in half[middle:]) - max(sample.threads for sample in half[:middle])
     return Growth(life.name, span_s, slope * span_s, threads, judged=whole and span_s >= MIN_JUDGED_S - 2 * every_s)
 
 

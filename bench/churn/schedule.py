@@ -5,8 +5,8 @@ lane at most one resource is in trouble, and a rest follows each trouble, so tha
 one server are well. Whether the one that was in trouble before is really back is not assumed from the rest's length:
 the runner waits until it is seen, and shifts what is left of the lane by that wait.
 
-In the second half of a run the sidecar of the first server and the control plane live on, so that the growth of their
-memory can be judged; the troubles of everything around them go on.
+In the last two thirds of a run the sidecar of the first server and the control plane live on, so that by the second
+half they have warmed up and the growth of their memory can be judged; the troubles of everything around them go on.
 """
 
 from __future__ import annotations
@@ -70,6 +70,8 @@ _PLANS = {
     ),
     Lane.CONTROL: _LanePlan((Kind.KILL_CONTROL,), (CONTROL,), lasts_s=(1.0, 25.0), rest_s=(15.0, 30.0)),
 }
+SPARED_FROM = 1 / 3
+"""From this share of the run on, the processes that are judged in its second half live on."""
 FIRST_S = 3.0
 """Calm at the start ..."""
 CALM_END_S = 8.0
@@ -108,7 +110,7 @@ def others(trouble: Trouble) -> tuple[str, ...]:
 
 
 def ends_a_judged_process(trouble: Trouble) -> bool:
-    """Whether it ends a process whose memory is judged over the second half, and thus must not come then."""
+    """Whether it ends a process whose memory is judged over the second half; not done from SPARED_FROM on."""
     return trouble.lane is Lane.CONTROL or (trouble.kind in _ENDS_A_SIDECAR and trouble.target == SERVERS[0])
 
 
@@ -126,7 +128,7 @@ def _draw_lane(lane: Lane, rng: random.Random, length_s: float) -> list[Trouble]
         if at + lasts_s > length_s - CALM_END_S:
             return troubles
         trouble = Trouble(lane, kind, target, at, lasts_s)
-        if at < length_s / 2 or not ends_a_judged_process(trouble):
+        if at < length_s * SPARED_FROM or not ends_a_judged_process(trouble):
             troubles.append(trouble)
             at += lasts_s + rng.uniform(*plan.rest_s)
         elif lane is Lane.CONTROL:

@@ -14,9 +14,9 @@ DEBOUNCE_S = 0.05
 """A change is acted on this long after its first message: the others of the same event come within it."""
 MIN_GAP_S = 0.2
 """Containers that start on the same host change interfaces all the time; none of that is ours."""
-BUSY_FACTOR = 20.0
+BUSY_FACTOR = 10.0
 """A look that takes long (a host with thousands of interfaces or routes) happens more rarely."""
-MAX_GAP_S = 5.0
+MAX_GAP_S = 2.0
 """But a change is never left waiting for longer than this."""
 RETRY_S = 1.0
 """After a look that failed."""

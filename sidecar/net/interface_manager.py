@@ -38,6 +38,8 @@ MAX_INTERFACES = 256
 """An interface's number is one byte of the datagram's header."""
 GRACE_CHECK_S = 0.5
 """While an interface waits for STUN, how often it is asked whether STUN answers anybody."""
+ERROR_PAUSE_S = 0.1
+"""After an error, which may repeat itself at every turn."""
 COALESCE_S = 0.005
 """Between two readings of a flood of announcements: each costs a turn of the interpreter, which all threads share."""
 
@@ -82,6 +84,7 @@ class InterfaceManager:
         self._readiness = Readiness(stun_enabled=config.stun.enabled)
         self._skipped: dict[InterfaceName, str] = {}
         self._warned = False
+        self._socket_refused = False
         self._lock = threading.Lock()
         """Guards the addresses, which the interfaces' threads report."""
         self._watch = NetlinkWatch()
@@ -184,7 +187,12 @@ class InterfaceManager:
         except OSError as error:
             log.warning("interfaces could not be listed: %s; trying again", error)
             self._schedule.failed(time.monotonic())
-            time.sleep(GRACE_CHECK_S)
+            time.sleep(ERROR_PAUSE_S)
+        except Exception:
+            # Interfaces that are not followed any more are as bad as a dead sidecar, and harder to see.
+            log.exception("internal error; the interfaces are looked at again")
+            self._schedule.failed(time.monotonic())
+            time.sleep(ERROR_PAUSE_S)
 
     def _suspend_links(self, indices: frozenset[int]) -> None:
         """Before anything is looked at: what these carried takes other paths now, not after the next look."""
@@ -202,6 +210,7 @@ class InterfaceManager:
         choice = choose(list_interfaces(), self._config.interfaces)
         self._log_skipped({skipped.name: skipped.reason for skipped in choice.skipped})
         self._drop_gone(choice)
+        self._socket_refused = False
         changed = added = False
         for interface in choice.usable:
             managed = self._managed.get(interface.name)
@@ -216,6 +225,8 @@ class InterfaceManager:
         self._warn_when_none(choice.skipped)
         self._publish_candidates()
         self._schedule.scanned(started, time.monotonic())
+        if self._socket_refused:
+            self._schedule.failed(time.monotonic())
 
     def _drop_gone(self, choice: InterfaceChoice) -> None:
         """Suspend what cannot carry now; let go of what is not there any more, or as another device."""
@@ -254,6 +265,7 @@ class InterfaceManager:
                     interface, self._config.udp_port, identity, number.first_packet, servers, self._data_plane
                 )
             except OSError as error:
+                self._socket_refused = True
                 self._log_skipped_once(interface.name, f"its socket could not be opened: {error}")
                 return False
             self._managed[interface.name] = managed

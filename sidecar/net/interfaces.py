@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
 
-from pyroute2 import IPRoute
+from pyroute2 import IPRoute, NetlinkError
 
 from protos.model import InterfaceName
 from sidecar.config_fields import is_glob
@@ -98,10 +98,13 @@ class InterfaceChoice:
 
 def list_interfaces() -> tuple[Interface, ...]:
     """Return the interfaces of the caller's network namespace by index; raises OSError when netlink fails."""
-    with IPRoute() as netlink:
-        addresses = _addresses_by_index(netlink.get_addr())
-        gateways = _gateways_by_index(netlink.get_routes())
-        interfaces = [_interface(link, addresses, gateways) for link in netlink.get_links()]
+    try:
+        with IPRoute() as netlink:
+            addresses = _addresses_by_index(netlink.get_addr())
+            gateways = _gateways_by_index(netlink.get_routes())
+            interfaces = [_interface(link, addresses, gateways) for link in netlink.get_links()]
+    except NetlinkError as error:
+        raise OSError(error.code, str(error)) from error
     return tuple(sorted(interfaces, key=lambda interface: interface.index))
 
 

@@ -65,3 +65,9 @@ def test_the_sample_next_to_a_moment() -> None:
 def test_a_slope_of_nothing_is_flat() -> None:
     assert slope_of([(1.0, 5.0)]) == 0.0
     assert slope_of([(1.0, 5.0), (2.0, 7.0)]) == pytest.approx(2.0)
+
+
+def test_threads_of_a_connection_that_ends_and_begins_again_are_not_counted_as_growth() -> None:
+    subject = life()
+    subject.samples = [replace(s, threads=10 + 7 * (s.at_s % 60.0 < 30.0)) for s in subject.samples]
+    assert growth(subject, LENGTH_S, EVERY_S).threads == 0
