@@ -1,0 +1,148 @@
+"""The manager's looks, one by one, at interfaces that the test makes up; the sockets are real ones on lo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from protos.model import InterfaceName, Role, SessionId
+from sidecar.config import ServiceConfig, SidecarConfig, StunConfig
+from sidecar.core.scan_schedule import RETRY_S
+from sidecar.net import interface_manager as module
+from sidecar.net.interface_manager import Identity, InterfaceManager
+from sidecar.net.interfaces import Interface
+from sidecar.net.netlink_watch import Changes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from protos.model import Candidate
+    from sidecar.net.interface_thread import InterfaceThread
+
+LO = Interface(InterfaceName("lo"), 1, "", up=True, carrier=True, mtu=65536, addresses=("127.0.0.1",))
+IDLE = Changes(any=False, gone_links=frozenset())
+
+
+class Host:
+    """What the manager sees, and whom it tells."""
+
+    def __init__(self) -> None:
+        self.interfaces: tuple[Interface, ...] = (LO,)
+        self.error: Exception | None = None
+        self.links: dict[InterfaceName, InterfaceThread] = {}
+        self.candidates: tuple[Candidate, ...] = ()
+        self.changes = IDLE
+        config = SidecarConfig(
+            name="robot",
+            role=Role.ROBOT,
+            control_plane="127.0.0.1:1",
+            services=(ServiceConfig(name="/echo", deadline_ms=100),),
+            interfaces=("lo",),
+            stun=StunConfig(enabled=False),
+        )
+        data_plane: Any = self
+        self.manager = InterfaceManager(config, Identity(SessionId(1), bytes(16), 1), data_plane, self._candidates)
+        watch: Any = self.manager._watch
+        watch.wait = lambda timeout_s: self.changes
+
+    def look_up(self) -> tuple[Interface, ...]:
+        if self.error is not None:
+            raise self.error
+        return self.interfaces
+
+    def look(self, *interfaces: Interface) -> None:
+        self.interfaces = interfaces
+        self.manager._scan()
+
+    def set_links(self, links: dict[InterfaceName, InterfaceThread]) -> None:
+        self.links = links
+
+    def on_link_events(self, events: list[Any]) -> None:
+        pass
+
+    def _candidates(self, candidates: tuple[Candidate, ...]) -> None:
+        self.candidates = candidates
+
+
+@pytest.fixture
+def host(monkeypatch: pytest.MonkeyPatch) -> Iterator[Host]:
+    host = Host()
+    monkeypatch.setattr(module, "list_interfaces", host.look_up)
+    yield host
+    for managed in host.manager._managed.values():
+        managed.stop()
+    host.manager._watch.close()
+
+
+def addresses(host: Host) -> list[str]:
+    return [candidate.address[0] for candidate in host.candidates]
+
+
+def test_an_interface_without_carrier_keeps_its_thread_and_is_offered_to_nobody(host: Host) -> None:
+    host.look(LO)
+    thread = host.links[LO.name]
+    assert addresses(host) == ["127.0.0.1"]
+    host.look(replace(LO, carrier=False))
+    assert host.candidates == ()
+    host.look(LO)
+    assert addresses(host) == ["127.0.0.1"]
+    assert host.links[LO.name] is thread
+
+
+def test_an_announced_end_of_a_link_suspends_it_before_any_look(host: Host) -> None:
+    host.look(LO)
+    host.error = AssertionError("looked")
+    host.changes = Changes(any=True, gone_links=frozenset({1}))
+    host.manager._turn(0.0)
+    assert host.manager._managed[LO.name].suspended
+
+
+def test_another_device_of_the_same_name_gets_a_new_socket_and_goes_on_with_the_packet_numbers(host: Host) -> None:
+    host.look(LO)
+    thread = host.links[LO.name]
+    thread.link._first_number = 1000
+    host.look(replace(LO, index=7))
+    again = host.links[LO.name]
+    assert again is not thread
+    assert again.link.next_number == 1000
+    assert again.link.identity.interface_id == thread.link.identity.interface_id
+
+
+def test_an_interface_that_is_renamed_away_is_let_go(host: Host) -> None:
+    host.look(LO)
+    host.look(replace(LO, name=InterfaceName("lan7")))
+    assert host.links == {}
+    assert host.candidates == ()
+
+
+def test_a_changed_address_is_offered(host: Host) -> None:
+    host.look(LO)
+    host.look(replace(LO, addresses=("127.0.0.2", "127.0.0.1")))
+    assert addresses(host) == ["127.0.0.2", "127.0.0.1"]
+
+
+@pytest.mark.parametrize("error", [OSError("netlink is away"), ValueError("a bug")])
+def test_a_failed_look_is_repeated(host: Host, error: Exception, caplog: pytest.LogCaptureFixture) -> None:
+    host.look(LO)
+    host.error = error
+    host.manager._schedule.changed(0.0)
+    host.manager._schedule._due = 0.0
+    host.manager._turn(0.0)
+    assert str(error) in caplog.text
+    assert host.manager._wait_s() <= RETRY_S
+    assert LO.name in host.links
+
+
+def test_a_refused_socket_is_tried_again_soon(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> Any:
+        raise OSError("taken")
+
+    with monkeypatch.context() as refusing:
+        refusing.setattr(module, "ManagedInterface", refuse)
+        host.look(LO)
+    assert host.links == {}
+    assert host.manager._wait_s() <= RETRY_S
+    host.look(LO)
+    assert list(host.links) == [LO.name]
