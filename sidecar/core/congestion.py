@@ -97,6 +97,7 @@ class CongestionController:
         "_probe_min_rtt",
         "_probed_rtt_at",
         "_rate_before",
+        "_rate_before_silence",
         "_release_at",
         "_round_min_rtt",
         "_rtt",
@@ -118,6 +119,7 @@ class CongestionController:
         self._probe_credit = 0
         self._was_down = False
         self._silent_since = 0.0
+        self._rate_before_silence = 0.0
         self._cycle = 2
         self._full_rate = 0.0
         self._full_rounds = 0
@@ -205,6 +207,7 @@ class CongestionController:
         """Learn from an acknowledgement."""
         self._rtt = rtt
         self._silent_since = now
+        self._rate_before_silence = 0.0
         if sample.rtt_s:
             self._round_min_rtt = min(self._round_min_rtt, sample.rtt_s)
             if self._probed_rtt_at is None or sample.rtt_s <= 1.05 * rtt.minimum + 1e-4:
@@ -238,7 +241,8 @@ class CongestionController:
     def on_path_down(self) -> None:
         """The path is dead."""
         self._was_down = True
-        self.rate.scale(OUTAGE_FRACTION)
+        self.rate.restart(OUTAGE_FRACTION * max(self.rate.best, self._rate_before_silence))
+        self._rate_before_silence = 0.0
         self.ceiling.forget()
 
     def on_path_up(self, now: float) -> None:
@@ -251,6 +255,8 @@ class CongestionController:
         self._full_rate = 0.0
         self._full_rounds = 0
         self._probed_rtt_at = now
+        if self._rtt is not None:
+            self._rtt.restart_minimum(self._rtt.latest, now)
 
     # -- rounds ---------------------------------------------------------------------------------------------------
 
@@ -320,7 +326,8 @@ class CongestionController:
         self._cycle = 2
 
     def _collapse(self, rtt: RttEstimator) -> None:
-        """Persistent congestion: begin again with the least (RFC 9002 section 7.6.2)."""
+        """Persistent congestion: begin again with the least (RFC 9002 section 7.6.2), unless it was an outage."""
+        self._rate_before_silence = max(self._rate_before_silence, self.rate.best)
         self.rate.restart(MIN_WINDOW_BYTES / max(rtt.smoothed, 1e-3))
         self.ceiling.forget()
         self._first_window = float(MIN_WINDOW_BYTES)

@@ -132,10 +132,6 @@ class DeliveryRate:
             self._rounds.popleft()
         self._update()
 
-    def scale(self, factor: float) -> None:
-        """Believe only part of what is known, and nothing of what is under way."""
-        self.restart(self.best * factor)
-
     def restart(self, rate: float) -> None:
         """Begin again with this rate."""
         self._rounds.clear()

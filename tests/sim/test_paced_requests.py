@@ -1,0 +1,142 @@
+"""Requests over a slow link in simulated time: the queue stands in the sender, and what can be in time is in time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from sidecar.core.send_queue import _Entry
+from tests.sim.mesh import Mesh, Node, Wire, rule
+
+if TYPE_CHECKING:
+    from sidecar.core.congestion import CongestionController
+    from sidecar.core.events import ExecutionId, RequestId
+
+MBIT = 1e6 / 8
+HZ = 10
+
+
+class World:
+    """A robot with one interface and one server, whose answers are short."""
+
+    def __init__(self, rate: float, delay_s: float, **rules: object) -> None:
+        self.mesh = Mesh(1)
+        self.robot: Node = self.mesh.robot("wlan0", rules=(rule(**rules),))
+        cloud = self.mesh.cloud("cloud-a")
+        self.mesh.push_views()
+        self.up, down = self.mesh.both_ways("robot.wlan0", "cloud-a.eth0")
+        for wire in (self.up, down):
+            wire.delay_s, wire.bytes_per_s = delay_s, rate
+        complete = cloud.engine.complete
+
+        def answer(execution: ExecutionId, payload: bytes, server_s: float, now: float) -> None:
+            complete(execution, payload[:9], server_s, now)
+
+        cloud.engine.complete = answer  # type: ignore[method-assign,assignment]  # an echo of 100 kB would pace both ways
+        self.mesh.run(1.0)
+
+    @property
+    def control(self) -> CongestionController:
+        (link,) = self.robot.links.values()
+        (path,) = link._paths.values()
+        return path.control
+
+    def request(self, size: int, seconds: float) -> list[RequestId]:
+        """Send requests at HZ for so long; forgets the longest wait in the network before."""
+        self.up.longest_wait_s = 0.0
+        ids = []
+        for _ in range(int(seconds * HZ)):
+            self.mesh.calls += 1
+            ids.append(self.robot.submit(self.mesh.calls.to_bytes(4, "big") + bytes(size)))
+            self.mesh.run(1 / HZ)
+        return ids
+
+    def elapsed(self, ids: list[RequestId]) -> list[float]:
+        answers = {event.request_id: event.elapsed_s for event in self.robot.responses()}
+        return [answers[request_id] for request_id in ids if request_id in answers]
+
+
+@pytest.mark.parametrize(("rate", "delay_s"), [(20 * MBIT, 0.025), (100 * MBIT, 0.025), (500 * MBIT, 0.0005)])
+def test_bursts_with_pauses_measure_the_link_and_keep_the_rate(rate: float, delay_s: float) -> None:
+    world, size = World(rate, delay_s, deadline_s=0.5), 150_000
+    world.request(size, 2.5)
+    later = world.request(size, 2.0)
+    assert world.control.rate.best == pytest.approx(rate, rel=0.15)
+    world.mesh.run(0.5)
+    elapsed = world.elapsed(later)
+    assert len(elapsed) == len(later)
+    assert sorted(elapsed)[len(elapsed) // 2] < 1.15 * (size / rate + 2 * delay_s) + 0.002
+    assert world.up.longest_wait_s < 0.012
+
+
+def test_a_rate_that_drops_is_believed_and_so_is_one_that_rises() -> None:
+    world = World(20 * MBIT, 0.025, deadline_s=0.5)
+    world.request(60_000, 3.0)
+    world.up.bytes_per_s = 2 * MBIT
+    world.request(60_000, 1.0)
+    assert world.control.rate.best < 3 * MBIT
+    world.request(60_000, 1.5)
+    world.request(60_000, 1.0)
+    assert world.up.longest_wait_s < 0.1
+    world.up.bytes_per_s = 20 * MBIT
+    world.request(60_000, 3.0)
+    assert world.control.rate.best > 15 * MBIT
+
+
+def test_overload_stands_in_the_sender_and_not_in_the_network() -> None:
+    world = World(2 * MBIT, 0.025, deadline_s=0.5)
+    world.request(120_000, 3.0)
+    assert world.up.longest_wait_s < 0.16  # the first 32 kB, sent while nothing was known
+    world.request(120_000, 10.0)
+    assert world.up.longest_wait_s < 0.1
+    assert world.up.overflowed == 0
+    assert world.control.rate.best == pytest.approx(2 * MBIT, rel=0.15)
+
+
+def in_time_under_twice_the_load(deadline_s: float) -> float:
+    """The share of what the link can carry at all that is answered in time."""
+    world = World(4.8 * MBIT, 0.010, deadline_s=deadline_s)
+    ids = world.request(120_000, 15.0)
+    world.mesh.run(1.0)
+    return sum(elapsed <= deadline_s for elapsed in world.elapsed(ids)) / (len(ids) / 2)
+
+
+@pytest.mark.parametrize("deadline_s", [0.3, 0.5, 1.0])
+def test_under_twice_the_load_most_that_can_be_in_time_is(deadline_s: float) -> None:
+    assert in_time_under_twice_the_load(deadline_s) > 0.8
+
+
+def test_earliest_deadline_first_alone_would_collapse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Entry, "is_hopeless", lambda *_: False)
+    assert in_time_under_twice_the_load(0.5) < 0.2
+
+
+def test_after_an_outage_the_backlog_does_not_flood_the_link() -> None:
+    world = World(4 * MBIT, 0.025, deadline_s=0.5, lifetime_s=20.0)
+    before = world.request(20_000, 3.0)
+    cut(world, cut=True)
+    during = world.request(20_000, 5.0)
+    cut(world, cut=False)
+    after = world.request(20_000, 5.0)
+    assert world.up.longest_wait_s < 0.1
+    world.mesh.run(3.0)
+    assert len(world.elapsed(before + during + after)) == len(before + during + after)
+    assert sorted(world.elapsed(after))[len(after) // 2] < 0.25
+
+
+def cut(world: World, *, cut: bool) -> None:
+    wires: list[Wire] = world.mesh.all_wires_of("robot.wlan0")
+    for wire in wires:
+        wire.cut = cut
+
+
+def test_losing_all_that_is_in_flight_does_not_stall_the_path() -> None:
+    world = World(20 * MBIT, 0.025, deadline_s=0.5)
+    world.request(150_000, 3.0)
+    cut(world, cut=True)
+    ids = world.request(150_000, 0.1)
+    cut(world, cut=False)
+    world.mesh.run(2.0)
+    assert world.elapsed(ids)
+    assert max(world.elapsed(ids)) < 0.6
