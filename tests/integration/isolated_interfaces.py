@@ -75,7 +75,8 @@ class BadSocket(socket.socket):
         return []
 
     def _suffer(self) -> None:
-        time.sleep(self.hang_s)
+        if self.hang_s:
+            time.sleep(self.hang_s)
         if self.full:
             raise BlockingIOError
 
