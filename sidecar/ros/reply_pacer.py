@@ -6,7 +6,8 @@ gets a few at once and the rest spaced (docs/adr/0008-pacing-for-shallow-queues.
 time is never held back: each of its requests earns an answer.
 
 Of those held back, answers in time go before late ones: what was asked before an outage does not delay the answer to
-what is asked after it.
+what is asked after it. Late ones are spaced wider, since they come in great numbers and nobody is in a hurry for them:
+a client held up by a busy machine loses none.
 
 This makes losses rare, not impossible: how many answers lie unread cannot be asked.
 """
@@ -21,8 +22,12 @@ BURST_ANSWERS = 8
 """Below rmw's default depth of 10, so that a few answers may still lie unread."""
 SPACING_S = 0.002
 """Ten times what an rclpy client spends on an answer (0.15 to 0.3 ms): it may be held up for 20 ms and lose nothing."""
+LATE_COST = 5.0
+"""A late answer counts for so many in time: one in 10 ms, so that a client may be held up for nearly 100 ms."""
 MAX_CLIENTS = 1024
 """Clients remembered; the one quiet for longest is forgotten, and begins again with a full allowance."""
+
+_ROUNDING = 1e-6  # of an allowance: what is due at a time is due at that time
 
 T = TypeVar("T")
 
@@ -42,10 +47,11 @@ class _Client(Generic[T]):
 class ReplyPacer(Generic[T]):
     """A token bucket per client (writer guid). Holds no more answers than there are requests pending."""
 
-    __slots__ = ("_burst", "_clients", "_spacing_s", "_waiting", "queued")
+    __slots__ = ("_burst", "_clients", "_late_cost", "_spacing_s", "_waiting", "queued")
 
     def __init__(self, burst: int = BURST_ANSWERS, spacing_s: float = SPACING_S) -> None:
         self._burst = float(burst)
+        self._late_cost = min(LATE_COST, self._burst)
         self._spacing_s = spacing_s
         self._clients: dict[bytes, _Client[T]] = {}
         self._waiting: dict[bytes, _Client[T]] = {}
@@ -59,13 +65,13 @@ class ReplyPacer(Generic[T]):
     def offer(self, client: bytes, reply: T, now: float, *, late: bool) -> bool:
         """Return True when `reply` may go now; otherwise it is kept for `take_due`."""
         state = self._refreshed(client, now)
-        overtakes = not late and not state.in_time
-        if state.tokens < 1.0 or (state.next_waiting() and not overtakes):
+        cost = self._late_cost if late else 1.0
+        if state.tokens < cost or state.in_time or (late and state.late):
             (state.late if late else state.in_time).append(reply)
             self._waiting[client] = state
             self.queued += 1
             return False
-        state.tokens -= 1.0
+        state.tokens -= cost
         return True
 
     def take_due(self, now: float) -> list[T]:
@@ -73,8 +79,8 @@ class ReplyPacer(Generic[T]):
         due: list[T] = []
         for client in list(self._waiting):
             state = self._refreshed(client, now)
-            while (waiting := state.next_waiting()) and state.tokens >= 1.0:
-                state.tokens -= 1.0
+            while (waiting := state.next_waiting()) and state.tokens >= (cost := self._cost_of_next(state)) - _ROUNDING:
+                state.tokens -= cost
                 due.append(waiting.popleft())
             if not state.next_waiting():
                 del self._waiting[client]
@@ -86,8 +92,12 @@ class ReplyPacer(Generic[T]):
         if not self._waiting:
             return None
         return min(
-            state.updated_at + max(0.0, 1.0 - state.tokens) * self._spacing_s for state in self._waiting.values()
+            state.updated_at + max(0.0, self._cost_of_next(state) - state.tokens) * self._spacing_s
+            for state in self._waiting.values()
         )
+
+    def _cost_of_next(self, state: _Client[T]) -> float:
+        return 1.0 if state.in_time else self._late_cost
 
     def _refreshed(self, client: bytes, now: float) -> _Client[T]:
         state = self._clients.pop(client, None)  # moved to the end: the first is the one quiet for longest

@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sidecar.ros.reply_pacer import BURST_ANSWERS, MAX_CLIENTS, SPACING_S, ReplyPacer
+from sidecar.ros.reply_pacer import BURST_ANSWERS, LATE_COST, MAX_CLIENTS, SPACING_S, ReplyPacer
 
 A, B = b"a" * 16, b"b" * 16
 
@@ -49,6 +49,25 @@ def test_an_answer_in_time_goes_before_late_ones_that_wait() -> None:
     assert pacer.take_due(0.03) == ["late 1"]
     assert pacer.take_due(0.04) == ["late 2"]
     assert pacer.next_due() is None
+
+
+def test_late_answers_are_spaced_wider_and_leave_room_for_one_in_time() -> None:
+    pacer: ReplyPacer[int] = ReplyPacer()
+    now, sent = 10.0, [number for number in range(40) if pacer.offer(A, number, 10.0, late=True)]
+    assert sent == [0]
+    while pacer.queued:
+        due = pacer.next_due()
+        assert due is not None
+        assert due > now
+        now = due
+        sent += pacer.take_due(now)
+        assert sent == list(range(len(sent)))
+    wanted_s = 39 * LATE_COST * SPACING_S - (BURST_ANSWERS - LATE_COST) * SPACING_S
+    assert abs(now - 10.0 - wanted_s) < 1e-6
+    pacer = ReplyPacer()
+    assert pacer.offer(A, 0, 20.0, late=True)
+    assert not pacer.offer(A, 1, 20.0, late=True)
+    assert pacer.offer(A, 2, 20.0, late=False)
 
 
 def test_one_request_after_the_other_is_never_held_back() -> None:
