@@ -12,12 +12,14 @@ from protos.config_fields import IpAddress, ListenAddress, RemoteAddress, refuse
 from protos.config_file import key_path, parse_yaml, read_text, validate
 from protos.errors import ConfigError
 from protos.model import NodeName, Role, ServiceName
-from sidecar.config_fields import InterfacePattern, ServicePattern, SidecarName, is_glob
+from sidecar.config_fields import InterfacePattern, RepairShare, ServicePattern, SidecarName, is_glob
 from sidecar.core.priority import Priority
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from sidecar.core.redundancy import Redundancy
 
 DEFAULT_CLOUD_UDP_PORT = 24700
 """Fixed, since a firewall rule has to name it; below Linux' ephemeral ports (32768 and up)."""
@@ -107,6 +109,9 @@ class ServiceConfig(_Section):
     """Robot: an answer after the deadline is not delivered. Default false."""
     priority: Annotated[PriorityWord | None, _converted] = None
     """Robot: low, normal or high; what is higher never waits for what is lower. Default normal."""
+    fec: RepairShare | None = None
+    """Repair symbols for each symbol of what is sent from here (robot: requests, cloud: answers), 0 to 1, or off, or
+    auto: as many as the loss measured on the path asks for. Default auto."""
     capacity_interfaces: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Cloud: how many robot interfaces may be mapped to this server for the service; none: no limit."""
 
@@ -171,6 +176,12 @@ def config_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
+def _redundancy(fec: float | str | None) -> Redundancy:
+    if fec == "off":
+        return 0.0
+    return None if isinstance(fec, str) else fec
+
+
 def _rule(role: Role, service: ServiceConfig) -> ServiceRule:
     if role is Role.CLOUD:
         lifetime_ms = service.lifetime_ms or CLOUD_LIFETIME_MS
@@ -186,6 +197,7 @@ def _rule(role: Role, service: ServiceConfig) -> ServiceRule:
         idempotent=bool(service.idempotent),
         drop_late=bool(service.drop_late),
         priority=Priority[(service.priority or PriorityWord.NORMAL).name],
+        fec=_redundancy(service.fec),
         capacity=service.capacity_interfaces or _UNLIMITED,
     )
 

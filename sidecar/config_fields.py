@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, PlainValidator, WithJsonSchema
 
 _NODE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 _INTERFACE = re.compile(r"[^\s/]{1,15}")
@@ -40,6 +40,21 @@ def _check_service(text: str) -> str:
     return text
 
 
+def _check_repair_share(value: object) -> float | str:
+    if value is False:  # YAML reads an unquoted off so
+        return "off"
+    if value in ("off", "auto") and isinstance(value, str):
+        return value
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= 1:
+        return float(value)
+    raise ValueError(f"expected off, auto or a number from 0 to 1, got {value!r}")
+
+
 SidecarName = Annotated[str, AfterValidator(_check_node_name)]
 InterfacePattern = Annotated[str, AfterValidator(_check_interface)]
 ServicePattern = Annotated[str, AfterValidator(_check_service)]
+RepairShare = Annotated[
+    float | str,
+    PlainValidator(_check_repair_share),
+    WithJsonSchema({"anyOf": [{"enum": ["off", "auto"]}, {"type": "number", "minimum": 0, "maximum": 1}]}),
+]

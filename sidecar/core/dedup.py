@@ -65,6 +65,7 @@ class Reply:
     """Send this to the robot: wanted by `deadline`, of no use after `expires`."""
 
     waiter: Waiter
+    service: ServiceName
     message: ResponseMessage | RejectionMessage
     priority: Priority
     deadline: float
@@ -210,7 +211,7 @@ class ExecutionTable:
             self._stats.executions[message.service, "refused"] += 1
         rejection = RejectionMessage(message.request_id, message.copy, reason, text)
         expires = now + min(message.lifetime_left_s, MAX_LIFETIME_S)
-        return Reply(waiter, rejection, message.priority, now + message.deadline_left_s, expires)
+        return Reply(waiter, message.service, rejection, message.priority, now + message.deadline_left_s, expires)
 
     def complete(self, execution_id: ExecutionId, payload: bytes, processing_s: float, now: float) -> list[Reply]:
         """The local server answered."""
@@ -308,10 +309,10 @@ class ExecutionTable:
         request_id = execution.request_id
         if execution.payload is not None:
             response = ResponseMessage(request_id, waiter.copy, execution.processing_s, execution.payload)
-            return Reply(waiter, response, execution.priority, execution.deadline, expires)
+            return Reply(waiter, execution.service, response, execution.priority, execution.deadline, expires)
         reason, text = execution.refusal or (RejectReason.FORGOTTEN, "answered before; the answer is gone")
         rejection = RejectionMessage(request_id, waiter.copy, reason, text)
-        return Reply(waiter, rejection, execution.priority, execution.deadline, expires)
+        return Reply(waiter, execution.service, rejection, execution.priority, execution.deadline, expires)
 
     def _cache(self, execution: _Execution) -> None:
         size = len(execution.payload or b"")

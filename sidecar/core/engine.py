@@ -258,6 +258,7 @@ class Engine:
                 self._outbox.on_lost(event, now)
             case PathMeasured() if self._knows(event.path):
                 self.routes.set_rtt(event.path, event.smoothed_rtt_s)
+                self.routes.note_fates(event.path, event.arrived, event.missed)
                 self._measurements.path(event)
             case PathMeasured():
                 pass  # of a peer that left, or an interface that went, a moment ago

@@ -533,6 +533,7 @@ class Link:
                     tuple(path.rtts),
                     sent - path.reported_sent,
                     lost - path.reported_lost,
+                    *path.take_fates(),
                 )
             )
             path.rtts.clear()

@@ -203,6 +203,10 @@ class PathMeasured:
     rtts_s: tuple[float, ...]
     sent: int
     lost: int
+    arrived: int = 0
+    """Acknowledged datagrams."""
+    missed: int = 0
+    """Datagrams found missing while others arrived."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -103,6 +103,11 @@ class OutboundMessage:
         return self.count + self.repairs
 
     @property
+    def held_bytes(self) -> int:
+        """What the message may hold at the receiver before it is whole."""
+        return self.total + self.repairs * self.symbol
+
+    @property
     def newest(self) -> OutboundMessage:
         """What the bytes travel as by now: this message, or what it was cut into."""
         message = self

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.fragments import MAX_PEER_BYTES as REASSEMBLED_PEER_BYTES
+from sidecar.core.frame import symbol_count
 from sidecar.core.link_events import FragmentsLost, Resend, Send, SendAbandon
 from sidecar.core.outbound import OutboundMessage
+from sidecar.core.redundancy import repair_symbols
 from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from sidecar.core.messages import Encoded
     from sidecar.core.path_id import PathId
     from sidecar.core.priority import Priority
+    from sidecar.core.redundancy import Redundancy
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
 
@@ -69,15 +72,22 @@ class Outbox:
         priority: Priority,
         deadline: float,
         expires: float,
+        fec: Redundancy = None,
         answers: RequestId | None = None,
     ) -> OutboundMessage | None:
         """Send a message over `path`; None (counted) when there is no room.
 
+        `fec`: repair symbols for each source symbol, None: by the path's loss; none at all where they find no room.
         `answers`: the request that it answers, by which `drop_answers` finds it.
         """
         if not self.has_room(path.peer, content.size):
             self._stats.dropped["outbox_full"] += 1
             return None
+        symbol = self._routes.symbol_to(path.peer)
+        count = symbol_count(content.size, symbol)
+        repairs = repair_symbols(count, fec, self._routes.loss(path))
+        if repairs and not self.has_room(path.peer, (count + repairs) * symbol):
+            repairs = 0
         message = OutboundMessage(
             self._take_number(),
             path,
@@ -85,7 +95,8 @@ class Outbox:
             priority=priority,
             deadline=deadline,
             expires=expires,
-            symbol=self._routes.symbol_to(path.peer),
+            symbol=symbol,
+            repairs=repairs,
             answers=answers,
         )
         self._enter(message)
@@ -101,7 +112,7 @@ class Outbox:
         if message.answers is not None:
             self._answers.setdefault((message.peer, message.answers), []).append(message)
         self._shares_of_messages.take(message.peer)
-        self._shares_of_bytes.take(message.peer, message.total)
+        self._shares_of_bytes.take(message.peer, message.held_bytes)
         self._command(Send(message.path, message))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
@@ -140,7 +151,7 @@ class Outbox:
         message.over = True
         if self._messages.pop(message.number, None) is not None:
             self._shares_of_messages.give_back(message.peer)
-            self._shares_of_bytes.give_back(message.peer, message.total)
+            self._shares_of_bytes.give_back(message.peer, message.held_bytes)
             self._parked.get(message.peer, {}).pop(message.number, None)
             if message.answers is not None:
                 self._forget_answer((message.peer, message.answers), message)

@@ -58,6 +58,7 @@ class Path:
         "recovery",
         "remote",
         "remote_id",
+        "reported_fates",
         "reported_lost",
         "reported_sent",
         "rtts",
@@ -87,6 +88,7 @@ class Path:
         self.bytes_sent = 0
         self.reported_sent = 0
         self.reported_lost = 0
+        self.reported_fates = (0, 0)
         self._probe_gap = FIRST_PROBE_S
         self._probed_at = now - FIRST_PROBE_S
         self._next_probe_id = 0
@@ -172,6 +174,14 @@ class Path:
         """Keep the latest round-trip time for the next report."""
         if len(self.rtts) < MAX_RTT_SAMPLES:
             self.rtts.append(self.recovery.rtt.latest)
+
+    def take_fates(self) -> tuple[int, int]:
+        """Return how many datagrams arrived and were missed since the last call."""
+        recovery = self.recovery
+        arrived, missed = recovery.total_arrived, recovery.total_missed - recovery.reordering.spurious
+        before, self.reported_fates = self.reported_fates, (arrived, missed)
+        # Late arrivals may be more than what was missed in the meantime.
+        return arrived - before[0], max(0, missed - before[1])
 
     def waits_for_answer(self, now: float) -> None:
         """Something that wants an answer left."""

@@ -38,7 +38,9 @@ class Recovery:
         "rtt",
         "sample",
         "sent",
+        "total_arrived",
         "total_lost",
+        "total_missed",
         "total_sent",
     )
 
@@ -54,6 +56,10 @@ class Recovery:
         self.last_eliciting_at = 0.0
         self.total_sent = 0
         self.total_lost = 0
+        self.total_arrived = 0
+        """Acknowledged datagrams, of those that are (ack-eliciting ones)."""
+        self.total_missed = 0
+        """Those lost while the path lived, the ones that turned up late included."""
         self._next_number = first_number
         self._lost_at: float | None = None
         self._pto_count = 0
@@ -98,6 +104,7 @@ class Recovery:
             self._acknowledge(low, high, newly)
         self.sample = None
         if newly:
+            self.total_arrived += sum(run.datagrams for run in newly)
             self._measure(newly, largest, ack.delay_s, now)
             self._pto_count = 0
             self.largest_acked = max(self.largest_acked, largest)
@@ -181,6 +188,7 @@ class Recovery:
 
     def _lose(self, lost: list[Sent], *, by_threshold: bool) -> list[Sent]:
         if lost:
+            self.total_missed += sum(run.datagrams for run in lost)
             self.reordering.note_lost(lost, by_threshold=by_threshold)
         return self._forget(lost)
 

@@ -151,6 +151,7 @@ class RequestTable:
             path,
             encode_message(head),
             priority=request.rule.priority,
+            fec=request.rule.fec,
             deadline=request.deadline_at,
             expires=request.expires_at,
         )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
+from sidecar.core.loss_estimate import Loss, LossEstimate
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import BASE_BYTES
 
@@ -26,6 +27,7 @@ class Route:
     smoothed_rtt_s: float = 0.0
     max_datagram: int = BASE_BYTES
     """Bytes of UDP payload."""
+    estimate: LossEstimate = field(default_factory=LossEstimate)
 
     @property
     def order(self) -> tuple[int, float, PathId]:
@@ -54,6 +56,15 @@ class Routes:
     def set_rtt(self, path: PathId, smoothed_rtt_s: float) -> None:
         """Note a path's smoothed round-trip time."""
         self._get(path).smoothed_rtt_s = smoothed_rtt_s
+
+    def note_fates(self, path: PathId, arrived: int, missed: int) -> None:
+        """Note how many of a path's datagrams arrived and were missed since the last call."""
+        self._get(path).estimate.add(arrived, missed)
+
+    def loss(self, path: PathId) -> Loss:
+        """Return what to expect the path to lose."""
+        route = self._routes.get(path)
+        return Loss() if route is None else route.estimate.loss
 
     def _get(self, path: PathId) -> Route:
         route = self._routes.get(path)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import ServiceName
+    from sidecar.core.redundancy import Redundancy
 
 MAX_LIFETIME_S = 300.0
 """A request that may wait longer is a job, not a call; a server remembers every request for longer than this."""
@@ -54,6 +55,8 @@ class ServiceRule:
     """A response after the deadline is not delivered."""
     priority: Priority = Priority.NORMAL
     """Whose messages and executions go first where something waits."""
+    fec: Redundancy = None
+    """Repair symbols for each source symbol of the messages that are sent from here; None: by the measured loss."""
     capacity: int = 0
     """Cloud: how many robot interfaces may be mapped here; 0 means no limit."""
 

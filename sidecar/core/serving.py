@@ -107,6 +107,7 @@ class Serving:
     def _reply(self, replies: list[Reply]) -> None:
         routes = self._parts.routes
         for reply in replies:
+            rule = find_rule(self._parts.rules, reply.service)
             path = reply.waiter.path
             if routes.state(path) is PathState.DOWN:
                 path = routes.best_to(path.peer) or path
@@ -116,6 +117,7 @@ class Serving:
                 priority=reply.priority,
                 deadline=reply.deadline,
                 expires=reply.expires,
+                fec=rule.fec if rule else None,
                 answers=reply.message.request_id,
             )
 

@@ -125,6 +125,19 @@ def test_priorities_are_words(priority: Priority) -> None:
     assert rule.priority is priority
 
 
+@pytest.mark.parametrize(
+    ("written", "ratio"),
+    [("auto", None), ("off", 0.0), (False, 0.0), (0, 0.0), (0.25, 0.25), (1, 1.0)],
+)
+@pytest.mark.parametrize("role", [ROBOT, CLOUD])
+def test_repair_symbols_are_off_automatic_or_a_ratio(
+    role: dict[str, Any], written: object, ratio: float | None
+) -> None:
+    (rule,) = parse(with_service(role, fec=written)).service_rules()
+    assert rule.fec == ratio
+    assert parse(role).service_rules()[0].fec is None
+
+
 BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (ROBOT | {"interface": ["wlan0"]}, "interface", "unknown key; did you mean interfaces?"),
     (ROBOT | {"zzz": 1}, "zzz", "unknown key; expected one of advertise, control_plane"),
@@ -145,6 +158,9 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(CLOUD, idempotent=False), "services[0].idempotent", "on a robot only"),
     (with_service(CLOUD, drop_late=True), "services[0].drop_late", "on a robot only"),
     (with_service(CLOUD, priority="high"), "services[0].priority", "on a robot only"),
+    (with_service(ROBOT, fec=True), "services[0].fec", "expected off, auto or a number from 0 to 1, got True"),
+    (with_service(ROBOT, fec="lots"), "services[0].fec", "expected off, auto or a number from 0 to 1, got 'lots'"),
+    (with_service(CLOUD, fec=1.01), "services[0].fec", "expected off, auto or a number from 0 to 1, got 1.01"),
     (with_service(ROBOT, priority="urgent"), "services[0].priority", "expected 'low', 'normal' or 'high'"),
     (with_service(ROBOT, priority=1), "services[0].priority", "expected 'low', 'normal' or 'high'"),
     (
