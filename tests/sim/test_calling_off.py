@@ -121,6 +121,6 @@ def call_after_an_outage(dark_s: float, wait_s: float) -> float:
 
 def test_after_an_outage_what_is_asked_does_not_wait_for_the_backlog() -> None:
     undisturbed = call_after_an_outage(0.0, 0.0)
-    assert call_after_an_outage(10.0, 0.5) < 1.1 * undisturbed + 0.02, "a late request may be at the server"
-    # At once, the path's rate is not known again yet.
-    assert call_after_an_outage(10.0, 0.0) < 5 * undisturbed
+    for wait_s in (0.0, 0.1, 0.5):
+        after = call_after_an_outage(10.0, wait_s)
+        assert after < undisturbed + 0.035, "a late request may be at the server, and symbols in the network's queue"
