@@ -24,6 +24,9 @@ BURST_DATAGRAMS = 64
 MTU_PROBE_TIMEOUTS = 3
 """A probe of the path's MTU is given up after this many of its probe timeouts, if that is longer than its own limit."""
 
+MAX_RUNS_IN_FLIGHT = 1024
+"""With so many runs unacknowledged, FINISHED is sent without remembering it: no window holds it back, and a peer that
+finishes messages but acknowledges nothing would fill the memory. Lost then, it is sent again when the peer asks."""
 MAX_BATCH_DATAGRAMS = 64
 """As many segments as every kernel's offload takes (UDP_MAX_SEGMENTS of Linux before 6.10)."""
 MAX_BATCH_BYTES = 65_000
@@ -188,9 +191,11 @@ class DatagramBuilder:
             taken, finished = _fill(pending)
             number = path.recovery.take_numbers()
             datagram = b"".join((self._header(path, number), *taken))
-            if finished:
+            if finished and len(path.recovery.sent) < MAX_RUNS_IN_FLIGHT:
                 path.recovery.on_finished_sent(number, now, len(datagram), finished)
                 path.waits_for_answer(now)
+            elif finished:
+                self._stats.dropped["finished_unwatched"] += len(finished)
             self._add_alone(path, path.remote, datagram, burst)
 
     def _add_probe(self, path: Path, burst: Burst, now: float) -> None:

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 MAX_RUNNING = 8192
 """Requests that local servers work on at once."""
+MAX_RUNNING_BYTES = 512 * 1024 * 1024
+"""Payloads of those requests: local servers may be slower than the robots. One robot may hold half."""
 MAX_WAITERS = 16
 """Copies that wait for one result; a robot sends one for each of its interfaces."""
 MAX_CACHED_BYTES = 64 * 1024 * 1024
@@ -87,6 +89,8 @@ class _Execution:
     """When the local server is given up, whoever waits."""
     lifetime_s: float
     """The longest that a copy asked for."""
+    size: int
+    """Bytes of the request's payload."""
     waiters: list[Waiter] = field(default_factory=list)
     payload: bytes | None = None
     processing_s: float = 0.0
@@ -111,6 +115,7 @@ class ExecutionTable:
         """When each finished one is forgotten: a heap."""
         self._running: dict[ExecutionId, _Execution] = {}
         self._running_shares = Shares(MAX_RUNNING)
+        self._running_bytes = Shares(MAX_RUNNING_BYTES)
         self._finished_shares = Shares(MAX_REMEMBERED)
         # Ordered for cheap removal of the oldest: a dict walks over the holes at its front.
         self._cached: OrderedDict[RequestId, int] = OrderedDict()
@@ -160,7 +165,12 @@ class ExecutionTable:
         if self._early_cancels.holds(path.peer, message.request_id, now):
             count[message.service, "cancelled"] += 1
             return None
-        if not (self._running_shares.fits(path.peer) and self._finished_shares.fits(path.peer)):
+        size = len(message.payload)
+        if not (
+            self._running_shares.fits(path.peer)
+            and self._running_bytes.fits(path.peer, size)
+            and self._finished_shares.fits(path.peer)
+        ):
             self._stats.dropped["executions_full"] += 1
             return self.refuse_unseen(waiter, message, RejectReason.OVERLOADED, "too many requests", now)
         execution = _Execution(
@@ -173,10 +183,12 @@ class ExecutionTable:
             now + lifetime,
             now + patience_s,
             lifetime,
+            size,
             [waiter],
         )
         self._next_id += 1
         self._running_shares.take(path.peer)
+        self._running_bytes.take(path.peer, size)
         self._by_request[message.request_id] = execution
         self._running[execution.id] = execution
         self._arm(execution)
@@ -296,6 +308,7 @@ class ExecutionTable:
             return None
         del self._by_request[execution.request_id]
         self._running_shares.give_back(execution.robot)
+        self._running_bytes.give_back(execution.robot, execution.size)
         return execution
 
     def _remember(self, execution: _Execution, now: float) -> None:

@@ -52,6 +52,8 @@ if TYPE_CHECKING:
 
 MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""
+MAX_HELD_BYTES = 256 * 1024 * 1024
+"""Payloads of those requests, which may wait for the first path to a server: as much as the outbox takes."""
 MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""
 MAX_CALLED_OFF = 1024
@@ -83,6 +85,7 @@ class RequestTable:
         self._timers: list[tuple[float, RequestId]] = []
         self._called_off: OrderedDict[RequestId, None] = OrderedDict()
         self.unanswered = 0
+        self._held_bytes = 0
 
     # -- the application ------------------------------------------------------------------------------------------
 
@@ -105,6 +108,7 @@ class RequestTable:
             return
         self._requests[request_id] = request
         self.unanswered += 1
+        self._held_bytes += len(payload)
         heapq.heappush(self._timers, (request.deadline_at, request_id))
         self._dispatch(request, now)
 
@@ -116,6 +120,8 @@ class RequestTable:
             return f"the service's name or type is longer than {MAX_NAME_BYTES} bytes"
         if self.unanswered >= MAX_IN_FLIGHT:
             return f"{MAX_IN_FLIGHT} requests are in flight already"
+        if self._held_bytes + size > MAX_HELD_BYTES:
+            return f"the requests in flight have {self._held_bytes} bytes already"
         servers = self._parts.offers.servers(request.service)
         if servers and not self._with_room(servers, size):
             return "too much waits to be sent already"
@@ -365,6 +371,7 @@ class RequestTable:
 
     def _finish(self, request: Request, outcome: str) -> None:
         request.done = True
+        self._held_bytes -= len(request.payload or b"")
         request.payload = None
         self.unanswered -= 1
         self._parts.stats.requests[request.service, outcome] += 1

@@ -32,11 +32,15 @@ class Shares:
 
     def take(self, peer: NodeName, units: int = 1) -> None:
         """The peer takes these units; asking `fits` before is the caller's."""
+        if not units:
+            return
         self._held[peer] = self.held(peer) + units
         self.used += units
 
     def give_back(self, peer: NodeName, units: int = 1) -> None:
         """The peer returns units that it took."""
+        if not units:
+            return
         left = self._held[peer] - units
         if left:
             self._held[peer] = left

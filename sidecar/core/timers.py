@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
+SLACK = 64
+"""Outdated entries that may lie around before they are swept out; beyond it as many as there are live ones."""
+
 K = TypeVar("K", bound="Hashable")
 
 
@@ -29,6 +32,9 @@ class Timers(Generic[K]):
         elif self._due.get(key) != due:
             self._due[key] = due
             heapq.heappush(self._heap, (due, next(self._order), key))
+            if len(self._heap) > 2 * len(self._due) + SLACK:
+                self._heap = [(at, order, key) for at, order, key in self._heap if self._due.get(key) == at]
+                heapq.heapify(self._heap)
 
     def next(self) -> float | None:
         """When the earliest timer is due."""

@@ -208,7 +208,7 @@ class InterfaceManager:
     def _scan(self) -> None:
         started = time.monotonic()
         choice = choose(list_interfaces(), self._config.interfaces)
-        self._log_skipped({skipped.name: skipped.reason for skipped in choice.skipped})
+        self._log_skipped(choice)
         self._drop_gone(choice)
         self._socket_refused = False
         changed = added = False
@@ -331,12 +331,13 @@ class InterfaceManager:
         first = next(iter(self._managed), None)
         return [entry.address for entry in self._config.advertise if (entry.interface or first) == name]
 
-    def _log_skipped(self, skipped: dict[InterfaceName, str]) -> None:
-        for name, reason in skipped.items():
-            if name not in self._managed:
-                self._log_skipped_once(name, reason)
-        for name in [name for name in self._skipped if name in self._managed]:
-            del self._skipped[name]
+    def _log_skipped(self, choice: InterfaceChoice) -> None:
+        for skipped in choice.skipped:
+            if skipped.name not in self._managed:
+                self._log_skipped_once(skipped.name, skipped.reason)
+        there = {usable.name for usable in choice.usable} | {skipped.name for skipped in choice.skipped}
+        there -= self._managed.keys()
+        self._skipped = {name: reason for name, reason in self._skipped.items() if name in there}
 
     def _log_skipped_once(self, name: InterfaceName, reason: str) -> None:
         if self._skipped.get(name) != reason:

@@ -29,7 +29,7 @@ from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     import random
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from protos.model import InterfaceName
 
@@ -98,14 +98,25 @@ class Rogue:
                         Header(link.identity.interface_id, path.remote_id, self.node.session, number),
                     )
 
-    def attack(self, kind: str, count: int) -> None:
-        for _ in range(count):
+    def send(self, bodies: Iterable[bytes]) -> None:
+        """Each over every path, and then the victim's turn."""
+        for body in bodies:
             for interface, header in self.numbers():
-                datagram = frame.encode_header(header) + ATTACKS[kind](self.rng)
+                datagram = frame.encode_header(header) + body
                 target = self.victim.links[self.victim.interfaces[header.receiver_interface]]
                 source = self.node.address(interface)
                 target.receive_batch(memoryview(datagram), len(datagram), source, self.mesh.now)
         self.mesh.pump(self.victim)
+
+    def answer_probes(self) -> None:
+        """Stay up over there while the rogue's own sidecar is silent."""
+        for link in self.victim.links.values():
+            for path in link._paths.values():
+                if path.peer == self.node.name:
+                    self.send([frame.encode_probe_reply(ProbeReply(number)) for number in list(path._probes_out)])
+
+    def attack(self, kind: str, count: int) -> None:
+        self.send(ATTACKS[kind](self.rng) for _ in range(count))
         taken = sum(link.stats.datagrams["received", "data"] for link in self.victim.links.values())
         assert taken >= count or kind != "requests", "the attack itself went wrong"
 

@@ -49,6 +49,21 @@ def test_copies_of_a_running_request_wait_and_all_get_the_answer() -> None:
     assert (stats[ECHO, "run"], stats[ECHO, "coalesced"]) == (1, 2)
 
 
+def test_one_robots_running_requests_are_capped_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dedup, "MAX_RUNNING_BYTES", 4 * len(b"question"))
+    executions = table()
+    running = [run(executions, request(number)) for number in range(2)]
+    refusal = executions.on_request(ROBOT, request(2), 1.0)
+    assert isinstance(refusal, Reply)
+    assert isinstance(refusal.message, RejectionMessage)
+    assert refusal.message.reason is RejectReason.OVERLOADED
+    assert executions._stats.dropped["executions_full"] == 1
+    assert isinstance(executions.on_request(OTHER, request(3), 1.0), ExecuteRequest)
+    for execution in running:
+        executions.complete(execution.execution, b"answer", 0.0, 1.1)
+    run(executions, request(4))
+
+
 def test_a_late_copy_gets_the_cached_answer_and_is_not_run() -> None:
     executions = table()
     executions.complete(run(executions, request()).execution, b"answer", 0.05, 1.1)

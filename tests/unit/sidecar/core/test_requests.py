@@ -396,6 +396,19 @@ def test_what_cannot_be_sent_is_rejected_at_once(monkeypatch: pytest.MonkeyPatch
     assert table.stats.requests[ECHO, "rejected"] == 3
 
 
+def test_requests_that_wait_are_capped_in_bytes_and_leave_room_when_they_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(requests_module, "MAX_HELD_BYTES", 1000)
+    table = Table()
+    table.submit(1, payload=bytes(600))
+    table.submit(2, payload=bytes(600))
+    assert "bytes already" in table.only_failure().reason
+    table.table.handle_timer(1.0)
+    table.table.handle_timer(100.0)
+    table.events.clear()
+    table.submit(3, payload=bytes(600), now=100.0)
+    assert not table.events
+
+
 def test_a_full_outbox_towards_one_server_sends_to_the_other_only_and_two_full_ones_reject() -> None:
     table = Table()
     huge = Encoded(b"", bytes(8_000_000))

@@ -37,3 +37,12 @@ def test_units_given_back_are_free_again() -> None:
 def test_giving_back_what_was_not_taken_is_a_bug() -> None:
     with pytest.raises(KeyError):
         Shares(10).give_back(A)
+
+
+def test_nothing_may_be_taken_and_given_back() -> None:
+    shares = Shares(10)
+    for _ in range(2):
+        shares.take(A, 0)
+    for _ in range(2):
+        shares.give_back(A, 0)
+    assert (shares.used, shares.held(A), shares._held) == (0, 0, {})

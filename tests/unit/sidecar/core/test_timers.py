@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from sidecar.core.timers import Timers
+from sidecar.core.timers import SLACK, Timers
 
 
 def test_the_earliest_comes_first_and_a_new_time_replaces_the_old() -> None:
@@ -23,6 +23,15 @@ def test_disarmed_and_rearmed_to_the_same_time_fires_once() -> None:
     for due in (1.0, 2.0, 1.0, None, 1.0):
         timers.arm("a", due)
     assert [timers.pop_due(3.0), timers.pop_due(3.0)] == ["a", None]
+
+
+def test_outdated_times_do_not_pile_up() -> None:
+    timers: Timers[int] = Timers()
+    for turn in range(10_000):
+        timers.arm(turn % 10, 1.0 + turn % 7)
+        timers.arm(turn % 10, 1000.0 + turn)
+        assert len(timers._heap) <= 2 * 10 + SLACK + 1
+    assert timers.next() == 1000.0 + 9_990
 
 
 def test_behaves_as_a_dictionary_of_times() -> None:
