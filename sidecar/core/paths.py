@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.congestion import CongestionController
 from sidecar.core.frame import FINISHED_TYPE, finished_number
+from sidecar.core.link_events import PathMeasured
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
 from sidecar.core.received import ReceivedPackets
@@ -175,7 +176,25 @@ class Path:
         if len(self.rtts) < MAX_RTT_SAMPLES:
             self.rtts.append(self.recovery.rtt.latest)
 
-    def take_fates(self) -> tuple[int, int]:
+    def take_measured(self) -> PathMeasured | None:
+        """Return what was measured since the last call; None when nothing was."""
+        recovery = self.recovery
+        sent, lost = recovery.total_sent, recovery.total_lost
+        if not self.rtts and sent == self.reported_sent:
+            return None
+        measured = PathMeasured(
+            self.id,
+            recovery.rtt.smoothed,
+            tuple(self.rtts),
+            sent - self.reported_sent,
+            lost - self.reported_lost,
+            *self._take_fates(),
+        )
+        self.rtts.clear()
+        self.reported_sent, self.reported_lost = sent, lost
+        return measured
+
+    def _take_fates(self) -> tuple[int, int]:
         """Return how many datagrams arrived and were missed since the last call."""
         recovery = self.recovery
         arrived, missed = recovery.total_arrived, recovery.total_missed - recovery.reordering.spurious

@@ -13,7 +13,6 @@ from sidecar.core.dedup import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TI
 from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.fragments import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
 from sidecar.core.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
-from sidecar.core.link import MAX_PENDING_FRAMES
 from sidecar.core.messages import (
     CancelMessage,
     Message,
@@ -24,6 +23,7 @@ from sidecar.core.messages import (
 )
 from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES
 from sidecar.core.path_id import PathState
+from sidecar.core.path_table import MAX_PENDING_FRAMES
 from sidecar.core.priority import Priority
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 

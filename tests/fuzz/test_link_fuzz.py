@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from protos.model import InterfaceId, SessionId
 from sidecar.core import frame
 from sidecar.core.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
-from sidecar.core.link import MAX_PENDING_FRAMES
 from sidecar.core.link_events import Send
 from sidecar.core.path_id import PathId
+from sidecar.core.path_table import MAX_PENDING_FRAMES
 from tests.unit.sidecar.core.builders import (
     OUR_TOKEN,
     PEER_SESSION,

@@ -5,7 +5,6 @@ import pytest
 from protos.model import InterfaceId, InterfaceName, NodeName, SessionId
 from sidecar.core import frame, pmtu
 from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Hello, Probe, ProbeReply, encode_header
-from sidecar.core.link import MAX_PATHS_OF_A_PEER
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
@@ -26,6 +25,7 @@ from sidecar.core.link_events import (
     SetReady,
 )
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.path_table import MAX_PATHS_OF_A_PEER
 from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
 from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.rtt import UNSTABLE_FLOOR_S

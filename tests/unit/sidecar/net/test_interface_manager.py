@@ -102,7 +102,7 @@ def test_an_announced_end_of_a_link_suspends_it_before_any_look(host: Host) -> N
 def test_another_device_of_the_same_name_gets_a_new_socket_and_goes_on_with_the_packet_numbers(host: Host) -> None:
     host.look(LO)
     thread = host.links[LO.name]
-    thread.link._first_number = 1000
+    thread.link._table.first_number = 1000
     host.look(replace(LO, index=7))
     again = host.links[LO.name]
     assert again is not thread

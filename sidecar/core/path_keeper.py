@@ -1,0 +1,142 @@
+"""Loss and liveness of one link's paths: what is lost goes back to the engine, which knows the other paths."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core import frame
+from sidecar.core.link_events import (
+    FinishedLost,
+    FragmentsLost,
+    PathChanged,
+)
+from sidecar.core.path_id import PathState
+
+if TYPE_CHECKING:
+    from sidecar.core.link_mtu import LinkMtu
+    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.path_table import PathTable
+    from sidecar.core.paths import Path
+    from sidecar.core.sent import Sent
+
+
+class PathKeeper:
+    """Follows the paths of one link from up to down and back."""
+
+    __slots__ = ("_events", "_mtu", "_table")
+
+    def __init__(self, table: PathTable, mtu: LinkMtu) -> None:
+        self._table = table
+        self._mtu = mtu
+        self._events = table.events
+
+    def report_measured(self, path: Path) -> None:
+        """Tell the engine what was measured since the last time."""
+        measured = path.take_measured()
+        if measured is not None:
+            self._events.append(measured)
+
+    def on_ack(self, path: Path, ack: frame.AckFrame, now: float) -> None:
+        """An acknowledgement came over the path."""
+        recovery = path.recovery
+        newly = recovery.on_ack(ack, now)
+        if newly is None:
+            self._table.stats.dropped["acks_the_unsent"] += 1
+            return
+        _mark_acked(recovery.late(ack, now))
+        if not newly:
+            return
+        _mark_acked(newly)
+        path.mtu.on_delivered(max(run.longest for run in newly))
+        if recovery.sample is not None:
+            path.control.on_acked(recovery.sample, recovery.rtt, now)
+        path.note_rtt()
+        if path.made_progress(now):
+            self.path_up(path, now)
+        self._detect_lost(path, now)
+
+    def path_up(self, path: Path, now: float) -> None:
+        """The path answers."""
+        path.control.on_path_up(now)
+        self.report_measured(path)  # before its first request, so that its round-trip time counts in the choice
+        self._events.append(PathChanged(path.id, PathState.UP, "answers"))
+        self._mtu.search(path, now)
+
+    def on_timer(self, path: Path, now: float) -> None:
+        """Find what is lost by now, and whether the path was silent for too long."""
+        recovery = path.recovery
+        if recovery.loss_timer is not None and recovery.loss_timer <= now:
+            self._detect_lost(path, now)
+        elif recovery.pto_timer is not None and recovery.pto_timer <= now:
+            path.control.on_probe_timeout(now)
+            self._lost(path, recovery.on_probe_timeout(now), now, timed_out=True)
+        state = path.check_silence(now)
+        if state is not None:
+            if state is PathState.DOWN:
+                self.take_down(path, "silent")
+            else:
+                self._events.append(PathChanged(path.id, state, "silent"))
+
+    def _detect_lost(self, path: Path, now: float) -> None:
+        recovery = path.recovery
+        lost = recovery.detect_lost(now)
+        if lost:
+            size = sum(run.size for run in lost)
+            path.control.on_lost(size, lost[-1].at, recovery.in_flight, now)
+            self._lost(path, lost, now)
+
+    def take_all_down(self, reason: str) -> None:
+        """As `take_down`, for every path."""
+        for path in self._table.paths.values():
+            if path.state is not PathState.DOWN:
+                self.take_down(path, reason)
+
+    def take_down(self, path: Path, reason: str) -> None:
+        """Hand back what the path still carried, then say that it is down."""
+        path.go_down()
+        path.control.on_path_down()
+        self._events.append(PathChanged(path.id, PathState.DOWN, reason))
+        self._report_lost(path, path.recovery.give_up_all())
+        unsent = path.take_pending_finished()
+        if unsent:
+            self._events.append(FinishedLost(path.id, unsent))
+        for message, indices in path.queue.clear():
+            self._events.append(FragmentsLost(path.id, message, indices))
+
+    def rebind(self, path: Path, now: float) -> None:
+        """What is under way left from where we no longer are, or its answers go there: it travels again elsewhere."""
+        was_up = path.state is PathState.UP
+        self._mtu.start_afresh(path)
+        path.start_afresh(now)
+        self._table.dirty[path.id] = path
+        if was_up:
+            self._events.append(PathChanged(path.id, path.state, "rebinding"))
+        self._report_lost(path, path.recovery.give_up_all(), timed_out=True)
+
+    def _lost(self, path: Path, lost: list[Sent], now: float, *, timed_out: bool = False) -> None:
+        self._mtu.lost(path, lost, now)
+        self._report_lost(path, lost, timed_out=timed_out)
+
+    def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
+        by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}
+        finished: list[int] = []
+        for run in lost:
+            if run.message is not None:
+                missing = filter(run.message.needs, run.indices)
+                by_message.setdefault(run.message.number, (run.message, []))[1].extend(missing)
+            elif path.state is PathState.DOWN:
+                finished += run.finished
+            else:
+                for number in run.finished:
+                    self._table.owe(path, frame.encode_finished(frame.Finished(number)))
+        if finished:
+            self._events.append(FinishedLost(path.id, tuple(finished)))
+        for message, indices in by_message.values():
+            if indices:
+                self._events.append(FragmentsLost(path.id, message, tuple(indices), timed_out))
+
+
+def _mark_acked(runs: list[Sent]) -> None:
+    for run in runs:
+        if run.message is not None:
+            run.message.acked[run.symbol : run.symbol + run.datagrams] = b"\1" * run.datagrams
