@@ -193,13 +193,11 @@ class ExecutionTable:
         self._running[execution.id] = execution
         self._arm(execution)
         count[message.service, "run"] += 1
-        # bytes(): the buffer is the reassembler's and rmw wants bytes.
-        payload = bytes(message.payload)
         return ExecuteRequest(
             execution.id,
             message.service,
             message.type,
-            payload,
+            message.payload,
             path.peer,
             message.priority,
             message.deadline_left_s,

@@ -67,7 +67,8 @@ class ResponseArrived:
 
     request_id: RequestId
     service: ServiceName
-    payload: bytes = field(repr=False)
+    payload: bytes | memoryview = field(repr=False)
+    """A view is of a buffer of its own: whoever wants bytes copies them, which takes milliseconds for the largest."""
     server: NodeName
     interface: InterfaceName
     elapsed_s: float
@@ -102,7 +103,8 @@ class ExecuteRequest:
     execution: ExecutionId
     service: ServiceName
     type: str
-    payload: bytes = field(repr=False)
+    payload: bytes | memoryview = field(repr=False)
+    """A view is of a buffer of its own: whoever wants bytes copies them, which takes milliseconds for the largest."""
     robot: NodeName
     priority: Priority
     deadline_s: float

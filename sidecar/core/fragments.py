@@ -73,7 +73,7 @@ class Reassembler:
     def add(self, fragments: list[Fragment], now: float) -> list[Reassembled]:
         """Store symbols; returns what there is to tell.
 
-        Each symbol is copied once, to its place in the message. A message of one datagram is a view of it.
+        Each symbol is copied once, to its place in the message: nothing that is returned views a datagram.
         """
         out: dict[int, Reassembled] = {}
         partials = self._partials
@@ -126,7 +126,8 @@ class Reassembler:
         if total <= symbol:
             # Of a lone symbol, the repair symbol is its padded copy.
             self._remember(number, Fate.FINISHED)
-            out[number] = Reassembled(number, Fate.FINISHED, data[:total])
+            # A copy: the datagram's buffer is used again.
+            out[number] = Reassembled(number, Fate.FINISHED, memoryview(bytes(data[:total])))
             return None
         self._make_room(total, messages=1)
         partial = self._partials[number] = Partial(number, total, symbol, now)

@@ -44,10 +44,7 @@ class Inbound:
         """Finished messages whose peer could not be told for want of a path, oldest first."""
 
     def add(self, path: PathId, session: SessionId, fragments: list[Fragment], now: float) -> list[memoryview]:
-        """Store symbols that came over `path`; returns the messages that they complete.
-
-        A message of one datagram is a view of it; any other is a buffer of its own.
-        """
+        """Store symbols that came over `path`; returns the messages that they complete."""
         reassembler = self._reassemblers.get(path.peer)
         if reassembler is None:
             reassembler = self._reassemblers[path.peer] = Reassembler(path.peer, self._stats.dropped)

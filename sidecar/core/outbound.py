@@ -162,9 +162,17 @@ class OutboundMessage:
 
     def _repair(self, repair: int) -> bytes:
         blocks = fec.block_count(self.count)
-        sources = [self.symbol_data(index) for index in range(repair % blocks, self.count, blocks)]
-        if len(sources[-1]) < self.symbol:
-            sources[-1] = bytes(sources[-1]).ljust(self.symbol, b"\0")
+        indices = range(repair % blocks, self.count, blocks)
+        payload, size, before = self.content.payload, self.symbol, len(self.content.head)
+        # As `symbol_data` does, but the many in the middle at once: this costs as much as the coding.
+        sources: list[bytes | memoryview] = [
+            payload[start : start + size]
+            for start in range(indices[0] * size - before, self.total - before, blocks * size)
+            if start >= 0
+        ]
+        sources[:0] = [self.symbol_data(index) for index in indices[: len(indices) - len(sources)]]
+        if len(sources[-1]) < size:
+            sources[-1] = bytes(sources[-1]).ljust(size, b"\0")
         return fec.encode(sources, repair // blocks)
 
     def lost(self, indices: Iterable[int]) -> tuple[int, ...]:

@@ -204,8 +204,7 @@ class RequestTable:
             )
             return
         stats.wins[copy.path.interface, copy.path.peer, request.service] += 1
-        # bytes(): the buffer is the reassembler's and rmw wants bytes.
-        payload = bytes(response.payload)
+        payload = response.payload
         self._parts.emit(
             ResponseArrived(request.id, request.service, payload, copy.path.peer, copy.path.interface, elapsed, late)
         )

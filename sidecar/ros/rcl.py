@@ -196,13 +196,14 @@ class MessageType:
         ctypes.memset(self._buffer.buffer, 0, capacity)
         self._clean_capacity = capacity
 
-    def deserialize(self, payload: bytes) -> Message:
+    def deserialize(self, payload: bytes | memoryview) -> Message:
         """Return the message in `payload`, or raise RosBridgeError.
 
         The type support checks lengths against the bytes that are there, so hostile bytes neither crash nor make it
         allocate more than a small multiple of their size (tests/ros/hostile_bytes.py).
         """
         message = self.new()
+        payload = bytes(payload)
         self._last_length = len(payload)
         view = _View(payload, len(payload), len(payload))
         if self.functions().deserialize(view, self._type_support, message.pointer) != _OK:

@@ -59,7 +59,7 @@ class ServiceProxy:
                 return
             self._on_request(self, *taken, now)
 
-    def parse_answer(self, payload: bytes) -> Message:
+    def parse_answer(self, payload: bytes | memoryview) -> Message:
         """Return the response in `payload`, or raise RosBridgeError."""
         return self.type.response.deserialize(payload)
 

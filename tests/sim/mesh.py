@@ -250,7 +250,7 @@ class Mesh:
             node.server(event)
         elif isinstance(event, ExecuteRequest):
             session, execution = node.session, event.execution
-            node.executed.append(RequestId(event.payload))
+            node.executed.append(RequestId(bytes(event.payload)))
             delay = node.server_delay()
             if delay is None:
                 return

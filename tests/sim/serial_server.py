@@ -70,7 +70,7 @@ class SerialServer:
         self._idle = True
         self.ran += 1
         payload = self.requests.pop(execution).payload
-        self.node.executed.append(RequestId(payload))
+        self.node.executed.append(RequestId(bytes(payload)))
         self.window.answered(number, self.mesh.now)
         self.node.engine.complete(execution, b"echo:" + payload[:100] + self.answer, self.busy_s, self.mesh.now)
         self._release()
