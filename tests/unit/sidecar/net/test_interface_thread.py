@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import random
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+from protos.model import InterfaceId, InterfaceName, SessionId
+from sidecar.core.datagrams import Batch, LinkIdentity
+from sidecar.core.link import Link
+from sidecar.net.interface_thread import InterfaceThread
+
+if TYPE_CHECKING:
+    import pytest
+
+    from sidecar.core.link_events import LinkEvent
+    from sidecar.core.stun_events import StunEvent
+
+PATIENCE_S = 20.0
+
+
+class Owner:
+    """Nobody's engine."""
+
+    def on_link_events(self, events: list[LinkEvent]) -> None:
+        pass
+
+    def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
+        pass
+
+
+class SlowSocket(socket.socket):
+    """Every send waits for the test's leave."""
+
+    def __init__(self) -> None:
+        super().__init__(socket.AF_INET, socket.SOCK_DGRAM)
+        self.setblocking(False)
+        self.bind(("127.0.0.1", 0))
+        self.leave = threading.Event()
+        self.in_send = threading.Event()
+        self.sends = 0
+
+    def sendto(self, *_: Any) -> int:
+        self.in_send.set()
+        assert self.leave.wait(PATIENCE_S)
+        self.sends += 1
+        return 1
+
+
+def thread_with(sock: socket.socket, waiting: int) -> InterfaceThread:
+    """A thread that has so many datagrams to send."""
+    identity = LinkIdentity(InterfaceName("wlan0"), InterfaceId(0), SessionId(1), bytes(16), 1)
+    thread = InterfaceThread(sock, Link(identity, random.Random(1), time.monotonic()), None, Owner())
+    thread._unsent.extend(Batch(("127.0.0.1", 9), b"x", 1) for _ in range(waiting))
+    return thread
+
+
+def test_it_is_in_a_turn_only_while_it_does_not_wait() -> None:
+    sock = SlowSocket()
+    thread = thread_with(sock, 1)
+    assert thread.in_turn_for(time.monotonic()) == 0.0
+    thread.start()
+    assert sock.in_send.wait(PATIENCE_S)
+    began = time.monotonic()
+    time.sleep(0.01)
+    now = time.monotonic()
+    assert thread.in_turn_for(now) >= now - began
+    sock.leave.set()
+    end = time.monotonic() + PATIENCE_S
+    while thread.in_turn_for(time.monotonic()) and time.monotonic() < end:
+        time.sleep(0.001)
+    assert thread.in_turn_for(time.monotonic()) == 0.0
+    thread.stop(PATIENCE_S)
+    assert sock.fileno() == -1
+
+
+def test_a_thread_given_up_sends_nothing_more_once_its_driver_returns(caplog: pytest.LogCaptureFixture) -> None:
+    sock = SlowSocket()
+    thread = thread_with(sock, 5)
+    thread.start()
+    assert sock.in_send.wait(PATIENCE_S)
+    thread.stop(0.01)
+    assert "did not end within" in caplog.text
+    sock.leave.set()
+    thread._thread.join(PATIENCE_S)
+    assert not thread._thread.is_alive()
+    assert sock.sends == 1
+    assert sock.fileno() == -1
+
+
+def test_what_still_waits_leaves_before_the_thread_ends() -> None:
+    sock = SlowSocket()
+    sock.leave.set()
+    thread = thread_with(sock, 5)
+    thread.start()
+    thread.stop(PATIENCE_S)
+    assert sock.sends == 5
