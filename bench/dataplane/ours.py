@@ -49,7 +49,7 @@ class Ours:
             self._peers: list[Any] = []
             for cloud, program in self.clouds.items():
                 config = {"name": cloud, "role": "cloud", "interfaces": [cloud_interface], **common}
-                services = [{"name": service["name"]}]
+                services = [{key: service[key] for key in ("name", "fec") if key in service}]
                 self._peers.append(
                     program.ask("start", config={**config, "services": services}, answer_bytes=answer_bytes)
                 )
