@@ -28,8 +28,10 @@ MAX_BURST_BYTES = 64 * 1024
 """Largest burst between two pauses: one segmentation offload."""
 BURST_S = 0.001
 """A burst is what the path carries in this time, where that is more than two datagrams."""
-LATE_S = 0.004
-"""A sender woken late makes up for at most this much time: timers and schedulers are not exact."""
+LATE_S = 0.010
+"""A sender woken late makes up for at most this much time: a busy host's threads wait for their turn."""
+PAUSE_S = 0.004
+"""After a pause, what the path carries in this time may leave at once: on a fast path, a whole small request."""
 END_HOST_S = 0.005
 """Delay in the hosts beyond the path's round trip: delayed acknowledgements, other threads' turns. Also what is never
 taken for a standing queue."""
@@ -143,9 +145,13 @@ class CongestionController:
         if pace is not None:
             if now < self._release_at:
                 return 0
-            late = min(now - self._release_at, LATE_S) * pace
+            late = min(now - self._release_at, self._allowance_s) * pace
             room = min(room, max(burst(pace), late))
         return max(int(room), DATAGRAM_BYTES)
+
+    @property
+    def _allowance_s(self) -> float:
+        return PAUSE_S if self.rate.is_dry else LATE_S
 
     def next_release(self, in_flight: int) -> float | None:
         """Return when pacing lets more leave (it may have passed); None when only an acknowledgement can."""
@@ -190,6 +196,7 @@ class CongestionController:
 
     def on_sent(self, now: float, size: int, in_flight: int) -> None:
         """These bytes left; `in_flight` includes them."""
+        allowance_s = self._allowance_s
         self.rate.on_sent(now)
         self._probe_credit = 0
         if in_flight <= size:
@@ -197,7 +204,7 @@ class CongestionController:
         self.ceiling.on_sent(in_flight)
         pace = self.pacing_rate
         if pace is not None:
-            self._release_at = max(self._release_at, now - LATE_S) + size / pace
+            self._release_at = max(self._release_at, now - allowance_s) + size / pace
 
     def ran_dry(self) -> None:
         """More might leave, but nothing waits: what is delivered from here on says little of what the path can."""

@@ -12,8 +12,9 @@ from collections import deque
 
 MIN_ROUND_BYTES = 8 * 1200
 """A rate of fewer bytes is noise."""
-LIMITED_FACTOR = 1.1
-"""Acknowledgements this much further apart than what they acknowledge show the path's rate, not the sender's."""
+LIMITED_FACTOR = 1.5
+"""Acknowledgements this much further apart than what they acknowledge show the path's rate, not the sender's. Less may
+be a host that was slow to wake."""
 ROUNDS = 10
 """The best of so many rounds counts (BBR's filter)."""
 BELIEVED_ROUNDS = 2
@@ -29,7 +30,6 @@ class DeliveryRate:
         "_anchor_at",
         "_anchor_sent_at",
         "_bytes",
-        "_dry",
         "_last_at",
         "_last_sent_at",
         "_limited",
@@ -37,6 +37,7 @@ class DeliveryRate:
         "_rounds",
         "_trains",
         "best",
+        "is_dry",
         "limited_by_sender",
         "settled",
     )
@@ -49,7 +50,8 @@ class DeliveryRate:
         """Whether the last complete round says no more than what was offered."""
         self._rounds: deque[float] = deque(maxlen=ROUNDS)
         self._trains: deque[float] = deque()
-        self._dry = True
+        self.is_dry = True
+        """Whether what is sent next begins a train."""
         self._anchor_at: float | None = None
         self._anchor_sent_at = 0.0
         self._bytes = 0
@@ -60,15 +62,15 @@ class DeliveryRate:
 
     def on_sent(self, now: float) -> None:
         """Something left."""
-        if self._dry:
-            self._dry = False
+        if self.is_dry:
+            self.is_dry = False
             if len(self._trains) >= MAX_TRAINS:
                 self._trains.popleft()
             self._trains.append(now)
 
     def ran_dry(self) -> None:
         """Nothing waits to be sent: what is sent next begins a train."""
-        self._dry = True
+        self.is_dry = True
 
     def on_acked(self, size: int, sent_at: float, now: float, limit: float, *, held_back: bool = False) -> bool:
         """Take newly acknowledged bytes, the newest of them sent at `sent_at`; True when that ended a round.
@@ -138,7 +140,7 @@ class DeliveryRate:
         if rate:
             self._rounds.append(rate)
         self._trains.clear()
-        self._dry = True
+        self.is_dry = True
         self._anchor_at = None
         self._rate = 0.0
         self._update()

@@ -4,10 +4,10 @@ import pytest
 
 from sidecar.core.congestion import (
     INITIAL_WINDOW_BYTES,
-    LATE_S,
     MAX_BURST_BYTES,
     MIN_WINDOW_BYTES,
     OUTAGE_FRACTION,
+    PAUSE_S,
     CongestionController,
     Phase,
     RateSample,
@@ -93,7 +93,7 @@ def test_what_leaves_is_spread_over_time_and_the_timer_says_when_more_may(cruisi
     sent = 0
     while more := cruising.send():
         sent += more
-    assert 0 < sent <= burst(1.25 * RATE) + 2 * LATE_S * 1.25 * RATE
+    assert 0 < sent <= burst(1.25 * RATE) + 2 * PAUSE_S * 1.25 * RATE
     release = control.next_release(cruising.bytes)
     assert release is not None
     assert control.budget(cruising.now, cruising.bytes) == 0
@@ -105,7 +105,7 @@ def test_a_sender_woken_late_makes_up_for_it_but_not_for_a_pause(cruising: Sende
     paused = cruising.control.budget(cruising.now, 0)
     cruising.run(1.0, sending=False)
     assert cruising.control.budget(cruising.now, 0) == paused
-    assert paused <= max(burst(1.25 * RATE), LATE_S * 1.25 * RATE)
+    assert paused <= max(burst(1.25 * RATE), PAUSE_S * 1.25 * RATE)
 
 
 def test_the_window_is_a_round_trip_or_two(cruising: Sender) -> None:
