@@ -165,6 +165,8 @@ class Link:
 
     def batches_to_send(self, now: float) -> list[Batch]:
         """Build what may leave now, at most about BURST_DATAGRAMS; call again until nothing comes."""
+        if not self._dirty:
+            return []
         burst = Burst()
         probing = self._may_probe
         for path in list(self._dirty.values()):

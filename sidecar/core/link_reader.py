@@ -68,7 +68,9 @@ class LinkReader:
         if end - position < FRAGMENT_DATAGRAM_BYTES:
             return position
         unpack, new = FRAGMENT_DATAGRAM.unpack_from, tuple.__new__
-        head, session, first, *_ = unpack(data, position)
+        head, session, first, kind, *_ = unpack(data, position)
+        if kind != FRAGMENT_TYPE:
+            return position
         path = self._table.of_head(head, session)
         if path is None or first <= path.received.largest:
             return position
@@ -78,8 +80,12 @@ class LinkReader:
         fragments: list[Fragment] = []
         while end - position >= FRAGMENT_DATAGRAM_BYTES:
             its_head, its_session, number, kind, message, total, symbol, index = unpack(data, position)
-            stop = min(position + segment, end)
-            length = min(symbol, total - index * symbol)
+            stop = position + segment
+            if stop > end:
+                stop = end
+            length = total - index * symbol
+            if length > symbol:
+                length = symbol
             if (
                 number <= high
                 or kind != FRAGMENT_TYPE

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import random
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.model import InterfaceId, SessionId
 from sidecar.core import frame
 from sidecar.core.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
-from sidecar.core.link_events import Send
+from sidecar.core.link_events import FragmentsReceived, Send
 from sidecar.core.path_id import PathId
 from sidecar.core.path_table import MAX_PENDING_FRAMES
 from tests.unit.sidecar.core.builders import (
     OUR_TOKEN,
+    PEER_ADDRESS,
     PEER_SESSION,
     PEER_TOKEN,
     WLAN,
@@ -113,3 +117,47 @@ def test_real_datagrams_mangled_on_the_way(plan: list[tuple[list[tuple[int, int]
             bench.receive_datagram(bytes(body))
         bench.events()
         assert_bounded(bench)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_a_batch_does_what_its_datagrams_do_one_by_one(seed: int) -> None:
+    """Fragments in and out of order, doubled, mangled, of strangers, with other frames between them."""
+    rng = random.Random(seed)
+    symbol = frame.MIN_SYMBOL_BYTES
+    segment = frame.FRAGMENT_DATAGRAM_BYTES + symbol
+    together, apart = Bench(), Bench()
+    number = 0
+    for _ in range(20):
+        run: list[bytes] = []
+        for _ in range(rng.randint(1, 40)):
+            number += rng.choice([1, 1, 1, 1, 1, 2, 0, -3])
+            index = rng.randrange(12)
+            body = frame.encode_fragment_head(rng.randrange(3), 10 * symbol, symbol, min(index, 9)) + bytes(symbol)
+            if rng.random() < 0.1:
+                body = rng.choice([frame.encode_probe(Probe(1)), frame.encode_finished(frame.Finished(5))])
+                body += frame.encode_padding(segment - frame.HEADER_BYTES - len(body))
+            session = SessionId(77) if rng.random() < 0.03 else PEER_SESSION
+            datagram = bytearray(together.datagram(body, number=max(number, 0), session=session))
+            if rng.random() < 0.15:
+                datagram[rng.randrange(frame.FRAGMENT_DATAGRAM_BYTES)] = rng.randrange(256)
+            run.append(bytes(datagram))
+        if rng.random() < 0.3:
+            run[-1] = run[-1][: rng.randrange(segment)]
+        data = b"".join(run)
+        together.link.receive_batch(memoryview(data), segment, PEER_ADDRESS, together.now)
+        for one in filter(None, run):
+            apart.receive_datagram(one)
+        assert symbols(together) == symbols(apart)
+        for bench in (together, apart):
+            assert_bounded(bench)
+        assert together.link.stats.dropped == apart.link.stats.dropped
+        assert together.link.stats.datagrams == apart.link.stats.datagrams
+        assert together.sent() == apart.sent()
+
+
+def symbols(bench: Bench) -> list[object]:
+    """What was handed up, however it was grouped."""
+    out: list[object] = []
+    for event in bench.events():
+        out += [tuple(item) for item in event.fragments] if isinstance(event, FragmentsReceived) else [event]
+    return out
