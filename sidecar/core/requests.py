@@ -222,7 +222,7 @@ class RequestTable:
         self._parts.outbox.on_answered(copy.message)
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
         if not request.done:
-            self._rescue(request, now)
+            self._rescue(request, now, rejected=True)
             if not request.pending():
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
                 self._fail(request, "rejected", reason, now)
@@ -276,8 +276,11 @@ class RequestTable:
         else:
             self._rescue(request, now)
 
-    def _rescue(self, request: Request, now: float, *, insist: bool = False) -> None:
-        """Send one more copy when no pending one is on a path that is up (or when `insist`)."""
+    def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
+        """Send one more copy when no pending one is on a path that is up (or when `insist`).
+
+        Not to a server that refused one, unless there is no other and this is not about that (`rejected`).
+        """
         pending = request.pending()
         routes = self._parts.routes
         if not insist and any(routes.state(copy.path) is PathState.UP for copy in pending):
@@ -290,6 +293,10 @@ class RequestTable:
         busy = {copy.path.peer for copy in pending}
         refused = {copy.path.peer for copy in request.copies if copy.state is CopyState.REJECTED}
         others = tuple(server for server in servers if server not in busy | refused)
+        if not others and not rejected:
+            # All else is lost, and whoever could not run it then (it was starting, draining, full) may do so now.
+            hopeless = {copy.path.peer for copy in request.copies if not copy.certainly_not_run}
+            others = tuple(server for server in servers if server in refused - hopeless)
         path = self._parts.mapping.rescue(self._with_room(others, len(request.payload or b"")))
         if path is not None:
             self._send_copy(request, path, now)

@@ -355,6 +355,19 @@ def test_a_request_that_all_servers_reject_fails_with_the_last_reason() -> None:
     table.assert_empty()
 
 
+@pytest.mark.parametrize("reason", [RejectReason.NOT_OFFERED, RejectReason.BAD_PAYLOAD])
+def test_who_refused_while_starting_is_asked_again_when_all_else_is_lost(reason: RejectReason) -> None:
+    """A cloud's sidecar is up before its ROS side is; meanwhile the other cloud dies."""
+    table = Table()
+    table.submit()
+    table.sent()
+    table.reject(reason, B, 1)
+    assert table.sent() == [], "the other copy is on its way"
+    table.change(WLAN_A, PathState.DOWN)
+    assert table.sent() == ([WWAN_B] if reason.certainly_not_run else [])
+    assert table.events == []
+
+
 def test_a_second_rejection_of_a_copy_changes_nothing() -> None:
     table = Table()
     table.submit()
