@@ -161,3 +161,14 @@ def symbols(bench: Bench) -> list[object]:
     for event in bench.events():
         out += [tuple(item) for item in event.fragments] if isinstance(event, FragmentsReceived) else [event]
     return out
+
+
+def test_a_head_that_reaches_into_the_next_datagram_is_malformed() -> None:
+    bench = Bench()
+    bench.link.next_event()
+    # One symbol too far, by as many bytes as the datagram is too short.
+    head = bytes([frame.FRAGMENT_TYPE]) + frame.encode_fragment_head(1, 249, 256, 1)[1:]
+    data = bench.datagram(head).ljust(60, b"\0")
+    bench.link.receive_batch(memoryview(data), len(bench.datagram(head)) - 7, PEER_ADDRESS, bench.now)
+    assert bench.events() == []
+    assert bench.link.stats.dropped == {"malformed": 2}
