@@ -142,7 +142,6 @@ class DatagramBuilder:
         """Add a run's datagrams and return their bytes."""
         end, sources = run.first + run.symbols, run.message.count
         path.waits_for_answer(now)
-        self._stats.datagrams["sent", "data"] += run.symbols
         if run.first < sources < end:  # the last source symbol may be shorter than what follows
             head = self._add_symbols(path, remote, run.message, range(run.first, sources), burst, now)
             return head + self._add_symbols(path, remote, run.message, range(sources, end), burst, now)
@@ -158,7 +157,8 @@ class DatagramBuilder:
         first_number = path.recovery.take_numbers(count)
         head = frame.clear_head(self._identity.interface_id, path.remote_id)
         session = self._identity.session
-        kind = FRAGMENT_TYPE if indices.start < message.count else REPAIR_TYPE
+        kind, counted = (FRAGMENT_TYPE, "data") if indices.start < message.count else (REPAIR_TYPE, "repair")
+        self._stats.datagrams["sent", counted] += count
         pack, symbol_data = frame.FRAGMENT_DATAGRAM.pack_into, message.symbol_data
         buffer = bytearray(segment * count)
         end = 0

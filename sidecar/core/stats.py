@@ -36,7 +36,7 @@ class LinkStats:
 
     interface: InterfaceName
     datagrams: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """(direction: sent | received, kind: data | control | stun)."""
+    """(direction: sent | received, kind: data | repair | control | stun); received repair symbols count as data."""
     dropped: Counter[str] = field(default_factory=Counter)
     """Datagrams by the reason they were dropped for, received and unsendable ones alike."""
     bytes: Counter[str] = field(default_factory=Counter)

@@ -64,6 +64,13 @@ def measured(seed: int, loss: float, fec: float | None, size: int = SIZE) -> Out
     return outcome
 
 
+def test_what_is_added_is_counted() -> None:
+    mesh, robot = pair(1, 0.0, 0.1)
+    call(mesh, robot, 3)
+    (sent,) = (link.stats.datagrams for link in robot.links.values())
+    assert sent["sent", "repair"] == pytest.approx(sent["sent", "data"] / 10, rel=0.1)
+
+
 def test_without_loss_it_costs_nothing() -> None:
     auto, off = (measured(1, 0.0, fec) for fec in (None, 0.0))
     assert auto.bytes_per_call == pytest.approx(off.bytes_per_call, rel=0.001)
