@@ -233,7 +233,12 @@ class CongestionController:
     def on_lost(self, lost_bytes: int, sent_at: float, in_flight: int, now: float) -> None:
         """These bytes were lost, the newest of them sent at `sent_at`; `in_flight` is what is left."""
         rtt = self._rtt
-        if rtt is None or not self.ceiling.on_lost(lost_bytes, sent_at, in_flight, rtt, now):
+        if rtt is None:
+            return
+        # What the path is known to carry, if the application asked for less: a loss among few bytes in flight does
+        # not tell that the path ends there, and a ceiling that low would take many seconds to grow back.
+        known = int(self.rate.best * rtt.minimum)
+        if not self.ceiling.on_lost(lost_bytes, sent_at, max(in_flight, known), rtt, now):
             return
         if self.phase is Phase.STARTUP:
             self._enter(Phase.DRAIN)

@@ -13,6 +13,7 @@ from sidecar.core.congestion import (
     RateSample,
     burst,
 )
+from sidecar.core.loss_ceiling import CUT
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.units import DATAGRAM_BYTES
 
@@ -157,6 +158,16 @@ def test_a_loss_without_a_queue_changes_nothing(cruising: Sender) -> None:
     before = cruising.control.window
     cruising.control.on_lost(2 * DATAGRAM_BYTES, cruising.now, cruising.bytes, cruising.now)
     assert cruising.control.window == before
+
+
+def test_heavy_loss_among_few_bytes_does_not_cut_below_what_the_path_is_known_to_carry(cruising: Sender) -> None:
+    cruising.run(2.0, sending=False)  # the application asks for little
+    cruising.control.ceiling.end_round()
+    few = 20 * DATAGRAM_BYTES
+    cruising.control.on_sent(cruising.now, few, few)
+    cruising.control.on_lost(10 * DATAGRAM_BYTES, cruising.now, 10 * DATAGRAM_BYTES, cruising.now)
+    assert cruising.control.ceiling.bytes is not None
+    assert cruising.control.window >= 0.9 * CUT * RATE * RTT_S
 
 
 def test_the_minimum_is_looked_for_again_when_it_was_not_seen_for_long(cruising: Sender) -> None:
