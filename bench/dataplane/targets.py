@@ -57,6 +57,16 @@ TARGETS = (
         or_key="goodput_over_aioquic",
         or_at_least=5,
     ),
+    Target(
+        "ethernet_150k_over_aioquic", "the same with packets of 1500 bytes, as real networks carry them", at_most=0.25
+    ),
+    Target(
+        "ethernet_goodput_mbit_s",
+        "the goodput with packets of 1500 bytes",
+        at_least=800,
+        or_key="ethernet_goodput_over_aioquic",
+        or_at_least=5,
+    ),
     Target("proxied_over_direct_1k", "median ROS call of 1 kB through two sidecars over the direct call", at_most=5),
     Target("proxied_over_direct_150k", "the same with 150 kB", at_most=7),
     Target("blackhole_lost", "requests lost after one of two paths went silent", at_most=0),

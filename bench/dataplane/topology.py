@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 from bench.netlab import HostSpec, InterfaceSpec, LabConfig, LabError, LinkProfile, server
 
 if TYPE_CHECKING:
-    from bench.netlab import Lab
+    from bench.netlab import Host, Lab
 
 ROBOT = "robot"
 CLOUDS = ("cloud_a", "cloud_b")
 CLOUD = CLOUDS[0]
 CARRIERS = ("wlan0", "wwan0")
 CLOUD_INTERFACE = "eth0"
+ETHERNET_MTU = 1500
 _CORE = "internet"
 _TABLE = "inet cut"
 
@@ -35,6 +36,16 @@ def emulated(*profiles: LinkProfile) -> LabConfig:
             for name, profile in zip(CARRIERS, profiles, strict=False)
         )
     )
+
+
+def ethernet_loopback(lab: Lab) -> Host:
+    """Return a host whose loopback carries no longer packets than Ethernet: what its speed is worth on real networks.
+
+    Raises LabError.
+    """
+    host = lab.host(ROBOT)
+    host.ip_batch([f"link set lo mtu {ETHERNET_MTU}"])
+    return host
 
 
 def _lab(interfaces: tuple[InterfaceSpec, ...]) -> LabConfig:

@@ -9,6 +9,8 @@ from bench.dataplane.ours import SERVICE, Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import MS, Calls, median, ratio
+from bench.dataplane.topology import cables, ethernet_loopback
+from bench.netlab import Lab
 
 if TYPE_CHECKING:
     from bench.dataplane.section import Context
@@ -28,21 +30,26 @@ PATIENT = {**SERVICE, "deadline_ms": 20_000.0, "lifetime_ms": 60_000.0}
 def measure(context: Context) -> Findings:
     """Measure."""
     ours_runs: list[tuple[float | None, float]] = []
+    ethernet_runs: list[tuple[float | None, float]] = []
     aioquic_runs: list[tuple[float | None, float]] = []
     small: list[float | None] = []
     with contextlib.ExitStack() as stack:
         start = stack.enter_context
         ours = start(Ours(context.folder, clouds={"cloud_a": None}, service=PATIENT))
+        host = ethernet_loopback(start(Lab(cables())))
+        ethernet = start(Ours(context.folder, robot=host, clouds={"cloud_a": host}, service=PATIENT, name="ethernet"))
         server = start(Remote.start("quic", context.folder, name="quic.server"))
         client = start(Remote.start("quic", context.folder, name="quic.client"))
         client.ask("connect", host="127.0.0.1", port=server.ask("listen"))
         aioquic = (client, server)
         context.say("goodput: warming up")
         _bulk(ours.robot, WARM_UP)
+        _bulk(ethernet.robot, WARM_UP)
         _bulk(client, WARM_UP)
         for repeat in range(context.repeats):
             context.say(f"goodput: ours, {repeat + 1} of {context.repeats}")
-            ours_runs.append(_costed((ours.robot, *ours.clouds.values()), context.scaled(OURS_COUNT, WARM_UP)))
+            for runs, pair in ((ours_runs, ours), (ethernet_runs, ethernet)):
+                runs.append(_costed((pair.robot, *pair.clouds.values()), context.scaled(OURS_COUNT, WARM_UP)))
             context.say(f"goodput: aioquic, {repeat + 1} of {context.repeats}")
             aioquic_runs.append(_costed(aioquic, context.scaled(AIOQUIC_COUNT, WARM_UP)))
             context.say(f"requests a second: {repeat + 1} of {context.repeats}")
@@ -56,11 +63,17 @@ def measure(context: Context) -> Findings:
             ratio(one[0], other[0]) for one, other in zip(ours_runs, aioquic_runs, strict=True)
         ),
         "cpu_ms_per_mb": median(run[1] for run in ours_runs),
+        "ethernet_goodput_mbit_s": median(run[0] for run in ethernet_runs),
+        "ethernet_goodput_over_aioquic": median(
+            ratio(one[0], other[0]) for one, other in zip(ethernet_runs, aioquic_runs, strict=True)
+        ),
+        "ethernet_cpu_ms_per_mb": median(run[1] for run in ethernet_runs),
         "aioquic_cpu_ms_per_mb": median(run[1] for run in aioquic_runs),
         "requests_per_s": median(small),
     }
     rows: tuple[tuple[str, float | None, float | None], ...] = (
         ("ours", figures["goodput_mbit_s"], figures["cpu_ms_per_mb"]),
+        ("ours, packets of 1500 bytes", figures["ethernet_goodput_mbit_s"], figures["ethernet_cpu_ms_per_mb"]),
         ("aioquic", figures["aioquic_goodput_mbit_s"], figures["aioquic_cpu_ms_per_mb"]),
     )
     title = f"{AT_ONCE} messages of 1 MB in flight, loopback, two processes"

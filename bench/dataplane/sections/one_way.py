@@ -13,6 +13,8 @@ from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import MS, median, quantile, ratio, worst
+from bench.dataplane.topology import cables, ethernet_loopback
+from bench.netlab import Lab
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +26,7 @@ COUNT = 80
 WARM_UP = 20
 SIZES = {"1k": 1_000, "150k": 150_000}
 IN_MEMORY_COUNT = 30
-NAMES = {"engine": "ours", "aioquic": "aioquic", "udp": "plain UDP"}
+NAMES = {"engine": "ours", "ethernet": "ours, packets of 1500 bytes", "aioquic": "aioquic", "udp": "plain UDP"}
 
 Run = tuple[float | None, float | None]
 """Median and P99 of one repeat, milliseconds."""
@@ -46,9 +48,9 @@ def measure(context: Context) -> Findings:
                     times = run(size, context.scaled(COUNT, 20))
                     runs.setdefault((name, key), []).append((quantile(times, 0.5), quantile(times, 0.99)))
     figures = {f"{name}_{key}_ms": median(p50 for p50, _ in repeats) for (name, key), repeats in runs.items()}
-    figures["engine_150k_over_aioquic"] = median(
-        ratio(ours[0], theirs[0]) for ours, theirs in zip(runs["engine", "150k"], runs["aioquic", "150k"], strict=True)
-    )
+    for name in ("engine", "ethernet"):
+        pairs = zip(runs[name, "150k"], runs["aioquic", "150k"], strict=True)
+        figures[f"{name}_150k_over_aioquic"] = median(ratio(ours[0], theirs[0]) for ours, theirs in pairs)
     figures["aioquic_150k_memory_ms"] = _in_memory(context)
     rows = tuple(
         (f"{NAMES[name]}, {SIZES[key] // 1000} kB", figures[f"{name}_{key}_ms"], worst(p99 for _, p99 in repeats))
@@ -66,13 +68,11 @@ def measure(context: Context) -> Findings:
 def _start(context: Context, stack: contextlib.ExitStack) -> dict[str, Callable[[int, int], list[float]]]:
     """Start the contenders; each runs (size, count) and returns one-way milliseconds."""
     start = stack.enter_context
-    ours = start(Ours(context.folder, clouds={"cloud_a": None}))
-
-    def engine(size: int, count: int) -> list[float]:
-        ours.call(size=size, count=count, rate_hz=RATE_HZ)
-        return [seconds * MS for seconds in ours.take_one_way()]
-
-    contenders: dict[str, Callable[[int, int], list[float]]] = {"engine": engine}
+    ethernet = ethernet_loopback(start(Lab(cables())))
+    contenders = {
+        "engine": _ours(start(Ours(context.folder, clouds={"cloud_a": None}))),
+        "ethernet": _ours(start(Ours(context.folder, robot=ethernet, clouds={"cloud_a": ethernet}, name="ethernet"))),
+    }
     for name, program in (("aioquic", "quic"), ("udp", "udp")):
         server = start(Remote.start(program, context.folder, name=f"{program}.server"))
         client = start(Remote.start(program, context.folder, name=f"{program}.client"))
@@ -83,6 +83,14 @@ def _start(context: Context, stack: contextlib.ExitStack) -> dict[str, Callable[
             client.ask("connect", host="127.0.0.1", port=port)
         contenders[name] = _remote(client, server)
     return contenders
+
+
+def _ours(ours: Ours) -> Callable[[int, int], list[float]]:
+    def run(size: int, count: int) -> list[float]:
+        ours.call(size=size, count=count, rate_hz=RATE_HZ)
+        return [seconds * MS for seconds in ours.take_one_way()]
+
+    return run
 
 
 def _remote(client: Remote, server: Remote) -> Callable[[int, int], list[float]]:
