@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from sidecar.core import frame
 from sidecar.core.frame import BASE_FRAMES_BYTES, FRAGMENT_DATAGRAM_BYTES, FRAGMENT_TYPE, REPAIR_TYPE, Header
 from sidecar.core.path_id import PathState
+from sidecar.core.paths import NEVER
 
 if TYPE_CHECKING:
     import random
@@ -111,9 +112,10 @@ class DatagramBuilder:
             self._add_probe(path, burst, now)
         if probing and path.mtu.timer is not None and path.mtu.timer <= now:
             self._add_mtu_probe(path, burst, now)
-        if path.pending or path.received.ack_at is not None:
-            self._add_control(path, burst, now)
-        return self._add_fragments(path, burst, now)
+        complete = self._add_fragments(path, burst, now)
+        if path.control_at <= now:
+            self._add_control(path, path.take_control(now), burst, now)
+        return complete
 
     def _add_fragments(self, path: Path, burst: Burst, now: float) -> bool:
         queue = path.queue
@@ -139,9 +141,15 @@ class DatagramBuilder:
         return complete
 
     def _add_run(self, path: Path, remote: Address, run: Run, burst: Burst, now: float) -> int:
-        """Add a run's datagrams and return their bytes."""
+        """Add a run's datagrams and return their bytes. Control frames that wait go with it or before it."""
         end, sources = run.first + run.symbols, run.message.count
         path.waits_for_answer(now)
+        if path.control_at < NEVER:
+            control = path.take_control(now)
+            size = run.message.datagram_bytes + sum(map(len, control))
+            if run.symbols == 1 and size <= path.mtu.size and len(control) < frame.MAX_FRAMES:
+                return self._add_with_control(path, remote, control, run, burst, now)
+            self._add_control(path, control, burst, now)
         if run.first < sources < end:  # the last source symbol may be shorter than what follows
             head = self._add_symbols(path, remote, run.message, range(run.first, sources), burst, now)
             return head + self._add_symbols(path, remote, run.message, range(sources, end), burst, now)
@@ -175,20 +183,31 @@ class DatagramBuilder:
         self._sent(path, end)
         return end
 
+    def _add_with_control(
+        self, path: Path, remote: Address, control: list[bytes], run: Run, burst: Burst, now: float
+    ) -> int:
+        """Build one datagram of control frames and a symbol: a small answer and what its request is owed, say."""
+        message, index = run.message, run.first
+        number = path.recovery.take_numbers()
+        head = frame.encode_fragment_head(message.number, message.total, message.symbol, index)
+        datagram = b"".join((self._header(path, number), *control, head, message.symbol_data(index)))
+        size = len(datagram)
+        path.recovery.on_run_sent(number, 1, now, size, size, message, index, _finished(control))
+        self._stats.datagrams["sent", "data" if index < message.count else "repair"] += 1
+        burst.add(remote, datagram, size)
+        self._sent(path, size)
+        return size
+
     def _sent(self, path: Path, size: int) -> None:
         path.bytes_sent += size
         self._stats.bytes["sent"] += size
 
-    def _add_control(self, path: Path, burst: Burst, now: float) -> None:
-        pending = path.pending
-        if path.received.ack_at is not None and (pending or path.received.ack_at <= now or len(path.queue)):
-            ranges, delay = path.received.take_ack(now)
-            pending.append(frame.encode_ack(ranges, delay))
+    def _add_control(self, path: Path, control: list[bytes], burst: Burst, now: float) -> None:
         if path.remote is None:
-            pending.clear()
             return
-        while pending:
-            taken, finished = _fill(pending)
+        while control:
+            taken = _fill(control)
+            finished = _finished(taken)
             number = path.recovery.take_numbers()
             datagram = b"".join((self._header(path, number), *taken))
             if finished and len(path.recovery.sent) < MAX_RUNS_IN_FLIGHT:
@@ -225,18 +244,20 @@ class DatagramBuilder:
         return frame.encode_header(Header(me.interface_id, path.remote_id, me.session, number))
 
 
-def _fill(pending: list[bytes]) -> tuple[list[bytes], tuple[int, ...]]:
-    """Take the frames of one datagram from `pending`; returns them and the messages that they report FINISHED."""
+def _fill(control: list[bytes]) -> list[bytes]:
+    """Take the frames of one datagram from `control`."""
     size = 0
-    finished: list[int] = []
     count = 0
-    for encoded in pending:
+    for encoded in control:
         if size + len(encoded) > BASE_FRAMES_BYTES or count == frame.MAX_FRAMES:
             break
-        if encoded[0] == frame.FINISHED_TYPE:
-            finished.append(frame.finished_number(encoded))
         size += len(encoded)
         count += 1
-    taken = pending[:count]
-    del pending[:count]
-    return taken, tuple(finished)
+    taken = control[:count]
+    del control[:count]
+    return taken
+
+
+def _finished(control: list[bytes]) -> tuple[int, ...]:
+    """Return the messages that these frames report FINISHED."""
+    return tuple(frame.finished_number(encoded) for encoded in control if encoded[0] == frame.FINISHED_TYPE)

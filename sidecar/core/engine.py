@@ -83,7 +83,7 @@ class Engine:
         self._interfaces: set[InterfaceName] = set()
         self._carried: frozenset[ServiceName] = frozenset()
         self._sweep_at = now + SWEEP_EVERY_S
-        self._inbound = Inbound(self._to_link, self.stats)
+        self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
         self.peers = Peers()
         self.routes = Routes()
         self.mapping = MappingTable(self.routes)

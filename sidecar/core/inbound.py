@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sidecar.core.fragments import OVER_REMEMBERED, Fate, Reassembler
+from sidecar.core.frame import BASE_SYMBOL_BYTES
 from sidecar.core.link_events import MessageDecoded, SendFinished, SendForgotten
 from sidecar.core.partial import Partial
 
@@ -35,9 +36,11 @@ class Decoding:
 class Inbound:
     """The unfinished messages of all peers."""
 
-    def __init__(self, command: Callable[[PathCommand], None], stats: EngineStats) -> None:
+    def __init__(self, command: Callable[[PathCommand], None], stats: EngineStats, *, answers: bool) -> None:
+        """`answers`: nearly every message is answered, so that what its sender is owed has company before long."""
         self._command = command
         self._stats = stats
+        self._answers = answers
         self._reassemblers: dict[NodeName, Reassembler] = {}
         self._decodings: list[Decoding] = []
         self._untold: dict[NodeName, dict[int, None]] = {}
@@ -54,7 +57,7 @@ class Inbound:
                 self._command(SendForgotten(path, number))
                 continue
             # Also when it is still to be decoded: nothing that might come could help.
-            self._command(SendFinished(path, number))
+            self._command(SendFinished(path, number, at_once=not (self._answers and _is_small(content))))
             if isinstance(content, Partial):
                 self._decodings.append(Decoding(path, session, content))
             elif content is not None:
@@ -101,3 +104,8 @@ class Inbound:
         """Drop messages that wait for too long."""
         for reassembler in self._reassemblers.values():
             reassembler.expire(now)
+
+
+def _is_small(content: memoryview | Partial | None) -> bool:
+    """Whether a message came whole in one datagram: no symbol of it waits at its sender for FINISHED."""
+    return isinstance(content, memoryview) and len(content) <= BASE_SYMBOL_BYTES

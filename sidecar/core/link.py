@@ -34,6 +34,8 @@ from sidecar.core.link_reader import LinkReader
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.path_table import PathTable
+from sidecar.core.paths import NEVER
+from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.stats import PathStats
 from sidecar.core.timers import Timers
 
@@ -91,13 +93,14 @@ class Link:
                 path = self._live_path(path_id, message, indices)
                 if path is not None:
                     path.queue.resend(message, indices)
-            case SendFinished(path_id, number):
+            case SendFinished(path_id, number, at_once):
                 path = self._paths.get((path_id.peer, path_id.remote))
                 if path is None or path.state is PathState.DOWN:
                     self._events.append(PathChanged(path_id, PathState.DOWN, "not usable here"))
                     self._events.append(FinishedLost(path_id, (number,)))
                 else:
-                    self._table.owe(path, frame.encode_finished(frame.Finished(number)))
+                    by = now if at_once else now + MAX_ACK_DELAY_S
+                    self._table.owe(path, frame.encode_finished(frame.Finished(number)), by)
             case SendAbandon(path_id, number):
                 path = self._paths.get((path_id.peer, path_id.remote))
                 if path is not None and path.state is not PathState.DOWN:
@@ -259,9 +262,10 @@ class Link:
         timers = (
             path.probe_at if self._may_probe else None,
             path.mtu.timer if self._may_probe else None,
-            path.received.ack_at,
+            path.control_at,
             recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
             path.silence_timer,
             path.control.next_release(recovery.in_flight) if len(path.queue) else None,
         )
-        self._timers.arm(path.id, min((timer for timer in timers if timer is not None), default=None))
+        due = min(timer for timer in timers if timer is not None)
+        self._timers.arm(path.id, due if due < NEVER else None)

@@ -87,6 +87,8 @@ class SendFinished:
 
     path: PathId
     number: int
+    at_once: bool = True
+    """Otherwise with the next datagram, or after the delay that an acknowledgement may have."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,7 +124,7 @@ class PathKeeper:
             if run.message is not None:
                 missing = filter(run.message.needs, run.indices)
                 by_message.setdefault(run.message.number, (run.message, []))[1].extend(missing)
-            elif path.state is PathState.DOWN:
+            if path.state is PathState.DOWN:
                 finished += run.finished
             else:
                 for number in run.finished:

@@ -70,12 +70,13 @@ class PathTable:
         path = self.paths[peer.name, header.sender_interface] = Path(path_id, peer.session, (), self.next_number, now)
         return path
 
-    def owe(self, path: Path, encoded: bytes) -> None:
-        """Queue an encoded control frame for the path's next datagram."""
+    def owe(self, path: Path, encoded: bytes, by: float = 0.0) -> None:
+        """Queue an encoded control frame for the path's next datagram, which leaves at `by` (s) at the latest."""
         if len(path.pending) >= MAX_PENDING_FRAMES:
             self.stats.dropped["pending_frames_full"] += 1
             return
         path.pending.append(encoded)
+        path.pending_by = min(path.pending_by, by)
         self.dirty[path.id] = path
 
     def set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> list[Path]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.congestion import CongestionController
-from sidecar.core.frame import FINISHED_TYPE, finished_number
+from sidecar.core.frame import FINISHED_TYPE, encode_ack, finished_number
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
@@ -37,6 +37,9 @@ MAX_RTT_SAMPLES = 512
 """Round-trip times kept between two reports."""
 
 
+NEVER = float("inf")
+
+
 class Path:
     """Sender's and receiver's state of one path. Owned by its link."""
 
@@ -53,6 +56,7 @@ class Path:
         "id",
         "mtu",
         "pending",
+        "pending_by",
         "probe_at",
         "queue",
         "received",
@@ -83,7 +87,9 @@ class Path:
         self.mtu = PathMtu()
         self.queue = SendQueue()
         self.pending: list[bytes] = []
-        """Encoded control frames that wait for the next datagram."""
+        """Encoded control frames that wait for the next datagram ..."""
+        self.pending_by = NEVER
+        """... which leaves at this moment (s) at the latest; NEVER when none waits."""
         self.probe_at: float | None = now
         self.rtts: list[float] = []
         self.bytes_sent = 0
@@ -164,11 +170,27 @@ class Path:
         self.note_rtt()
         return True
 
+    @property
+    def control_at(self) -> float:
+        """When control frames leave without company (s); NEVER when none wait."""
+        ack_at = self.received.ack_at
+        return self.pending_by if ack_at is None else min(ack_at, self.pending_by)
+
+    def take_control(self, now: float) -> list[bytes]:
+        """Remove and return the control frames that wait, the acknowledgement that is owed included."""
+        if self.received.ack_at is not None:
+            ranges, delay_s = self.received.take_ack(now)
+            self.pending.append(encode_ack(ranges, delay_s))
+        taken, self.pending = self.pending, []
+        self.pending_by = NEVER
+        return taken
+
     def take_pending_finished(self) -> tuple[int, ...]:
         """Remove the FINISHED from the frames that wait, and return which messages they are of."""
         waiting = [encoded for encoded in self.pending if encoded[0] == FINISHED_TYPE]
         if waiting:
             self.pending = [encoded for encoded in self.pending if encoded[0] != FINISHED_TYPE]
+            self.pending_by = self.pending_by if self.pending else NEVER
         return tuple(map(finished_number, waiting))
 
     def note_rtt(self) -> None:

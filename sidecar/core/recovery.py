@@ -77,10 +77,21 @@ class Recovery:
         return number
 
     def on_run_sent(
-        self, first: int, count: int, now: float, segment: int, last: int, message: OutboundMessage, index: int
+        self,
+        first: int,
+        count: int,
+        now: float,
+        segment: int,
+        last: int,
+        message: OutboundMessage,
+        index: int,
+        finished: tuple[int, ...] = (),
     ) -> None:
-        """Datagrams left that carry the symbols of `message` from `index` on, one each; sizes as in `Sent`."""
-        self._note(Sent(first, count, now, segment, last, message, index))
+        """Datagrams left that carry the symbols of `message` from `index` on, one each; sizes as in `Sent`.
+
+        A single one may report messages FINISHED besides.
+        """
+        self._note(Sent(first, count, now, segment, last, message, index, finished))
 
     def on_finished_sent(self, number: int, now: float, size: int, finished: tuple[int, ...]) -> None:
         """A datagram left that reports these messages FINISHED."""

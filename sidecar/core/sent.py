@@ -24,7 +24,7 @@ class Sent(NamedTuple):
     symbol: int = 0
     """The first symbol."""
     finished: tuple[int, ...] = ()
-    """The messages that they report FINISHED (then it is one datagram)."""
+    """The messages that they report FINISHED; then it is one datagram."""
 
     @property
     def end(self) -> int:

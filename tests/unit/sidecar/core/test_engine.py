@@ -119,7 +119,7 @@ def test_a_request_is_told_finished_and_handed_to_the_application_and_its_answer
     sidecar = cloud()
     sidecar.receive(request())
     commands, (execution,) = sidecar.take()
-    assert commands == [SendFinished(sidecar.path, 1)]
+    assert commands == [SendFinished(sidecar.path, 1, at_once=False)]  # the answer is company
     assert isinstance(execution, ExecuteRequest)
     assert sidecar.engine.busy == 1
     sidecar.engine.complete(execution.execution, b"answer", 0.5, 0.2)
