@@ -58,6 +58,9 @@ MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""
 MAX_CALLED_OFF = 1024
 """Ids of requests whose copies were called off, kept to tell answers that were on their way from strays."""
+SMALL_ANSWER_BYTES = 1024
+"""An answer that fits one datagram with its head. Its server sent it to its other copies as well: a cancel would cost
+more than is left to be saved there."""
 CANCEL_DEADLINE_S = 0.1
 """A cancel is worth most at once: a server that has not begun need not. Among what is urgent, others go first only if
 their own time is shorter."""
@@ -186,7 +189,8 @@ class RequestTable:
         else:
             self._deliver(request, copy, response, now)
             if not request.observed:
-                self._call_off(request, request.pending(), now)
+                small = len(response.payload) <= SMALL_ANSWER_BYTES
+                self._call_off(request, request.pending(), now, untold=server if small else None)
         self._settle(request, now)
 
     def _deliver(self, request: Request, copy: Copy, response: ResponseMessage, now: float) -> None:
@@ -332,15 +336,15 @@ class RequestTable:
         copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
 
-    def _call_off(self, request: Request, copies: list[Copy], now: float) -> None:
-        """Send no more of these copies; tell their servers, except where nothing of them went to them or another copy
-        is still awaited."""
+    def _call_off(self, request: Request, copies: list[Copy], now: float, *, untold: NodeName | None = None) -> None:
+        """Send no more of these copies; tell their servers, except for `untold` and where nothing of them went to them
+        or another copy is still awaited."""
         for copy in copies:
             copy.state = CopyState.DEAD
             self._parts.outbox.drop(copy.message)
             self._parts.stats.called_off[copy.path.interface, copy.path.peer, request.service] += 1
         servers = {copy.path.peer for copy in copies if copy.message.begun}
-        servers -= {copy.path.peer for copy in request.pending()}
+        servers -= {untold, *(copy.path.peer for copy in request.pending())}
         for server in servers:
             path = self._parts.routes.best_to(server)
             if path is not None:

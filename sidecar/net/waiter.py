@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
+EARLY_S = 0.001
+"""A wait may end this much early, rather than that the timer is set again."""
+
+
 class Waiter:
     """One thread waits by it, any thread may wake that one.
 
@@ -55,7 +59,7 @@ class Waiter:
         self._called = False
 
     def wait(self, due: float, *, for_room: bool = False) -> bool:
-        """Wait until the socket is readable, `due` (s) has come, or somebody wakes us; a little early at times.
+        """Wait until the socket is readable, `due` (s) has come (EARLY_S early at times), or somebody wakes us.
 
         With `for_room` also until the socket takes datagrams again. Returns whether there is anything to receive.
         """
@@ -65,7 +69,10 @@ class Waiter:
             self._poller.modify(self._socket_fd, events)
         if due <= self._clock():
             return self._poll(0.0)
-        self._timer.arm_at_latest(due)
+        # Also to put it off: an acknowledgement that came makes most times superfluous, and to set the timer costs less
+        # than to wake up for nothing.
+        if not due - EARLY_S <= self._timer.due <= due:
+            self._timer.arm(due)
         self._asleep = True
         readable = self._poll(0.0 if self._called else None)
         self._asleep = False

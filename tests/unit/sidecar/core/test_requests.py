@@ -28,7 +28,7 @@ from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.priority import Priority
-from sidecar.core.requests import MAX_CALLED_OFF, MAX_COPIES, RequestParts, RequestTable
+from sidecar.core.requests import MAX_CALLED_OFF, MAX_COPIES, SMALL_ANSWER_BYTES, RequestParts, RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
 from sidecar.core.stats import EngineStats
@@ -87,8 +87,8 @@ class Table:
         reports = self.measurements.take(self.routes, []).latencies
         return {report.server: (sum(report.latency.counts), report.latency.lost) for report in reports}
 
-    def respond(self, server: str = A, copy: int = 0, number: int = 1, now: float = 0.1) -> None:
-        response = ResponseMessage(request_id(number), copy, 0.01, b"from " + server.encode())
+    def respond(self, server: str = A, copy: int = 0, number: int = 1, now: float = 0.1, size: int = 0) -> None:
+        response = ResponseMessage(request_id(number), copy, 0.01, (b"from " + server.encode()).ljust(size))
         self.table.on_response(peer(server).name, response, now)
 
     def reject(self, reason: RejectReason, server: str = A, copy: int = 0, now: float = 0.1) -> None:
@@ -247,9 +247,23 @@ def test_all_copies_at_one_server_are_called_off_with_one_cancel() -> None:
     table.routes.set_state(path(WWAN, A), PathState.UP)
     table.submit()
     assert table.sent() == [WLAN_A, path(WWAN, A)]
-    table.respond(A, copy=0)
+    table.respond(A, copy=0, size=SMALL_ANSWER_BYTES + 1)
     assert table.cancelled() == [(WLAN_A, request_id(1))]
     assert table.stats.called_off == {(WWAN, A, ECHO): 1}
+    table.assert_empty()
+
+
+def test_a_server_whose_answer_was_small_is_not_told_to_spare_the_same_answer() -> None:
+    table = Table()
+    table.routes.set_state(WWAN_B, PathState.DOWN)
+    table.routes.set_state(path(WWAN, A), PathState.UP)
+    table.submit()
+    assert table.sent() == [WLAN_A, path(WWAN, A)]
+    table.respond(A, copy=0, size=SMALL_ANSWER_BYTES)
+    assert table.cancelled() == []
+    assert table.stats.called_off == {(WWAN, A, ECHO): 1}
+    table.respond(A, copy=1)
+    assert table.stats.duplicate_responses == 1
     table.assert_empty()
 
 

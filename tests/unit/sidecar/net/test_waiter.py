@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.net.waiter import Waiter
+from sidecar.net.waiter import EARLY_S, Waiter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -66,6 +66,15 @@ def test_a_time_ends_the_wait_again_and_again(waiter: Waiter) -> None:
         due = time.monotonic() + 0.0003
         waiter.wait(due)
         assert time.monotonic() >= due
+
+
+def test_a_time_that_was_put_off_does_not_end_the_wait(waiter: Waiter) -> None:
+    waiter.wake()
+    waiter.wait(time.monotonic() + 0.01)
+    waiter.looked()
+    due = time.monotonic() + 0.05
+    waiter.wait(due)
+    assert time.monotonic() >= due - EARLY_S
 
 
 def test_a_sleeping_thread_is_woken_once(waiter: Waiter) -> None:
