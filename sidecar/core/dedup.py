@@ -29,6 +29,8 @@ from sidecar.core.rules import MAX_LIFETIME_S
 from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from protos.model import NodeName, ServiceName
     from sidecar.core.messages import RequestMessage
     from sidecar.core.path_id import PathId
@@ -128,6 +130,10 @@ class ExecutionTable:
     def running(self) -> int:
         """How many requests are being worked on."""
         return len(self._running)
+
+    def awaited(self, robots: Collection[NodeName]) -> int:
+        """How many of those being worked on one of these robots still waits for."""
+        return sum(1 for execution in self._running.values() if not execution.cancelled and execution.robot in robots)
 
     def knows(self, request_id: RequestId) -> bool:
         """Whether a copy of this request came before."""
@@ -262,11 +268,21 @@ class ExecutionTable:
             return None
         if execution.cancelled:
             return None
+        self._cancel(execution)
+        return CancelExecution(execution.id) if execution.id in self._running else None
+
+    def cancel_all(self, robot: NodeName) -> list[CancelExecution]:
+        """The robot's session is over, and nobody waits for its answers; returns what to tell the application."""
+        running = [one for one in self._running.values() if one.robot == robot and not one.cancelled]
+        for execution in running:
+            self._cancel(execution)
+        return [CancelExecution(execution.id) for execution in running]
+
+    def _cancel(self, execution: _Execution) -> None:
         execution.cancelled = True
         execution.waiters.clear()
         execution.payload = None
-        self._uncache(request_id)
-        return CancelExecution(execution.id) if execution.id in self._running else None
+        self._uncache(execution.request_id)
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""

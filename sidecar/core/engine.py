@@ -162,8 +162,10 @@ class Engine:
 
     @property
     def busy(self) -> int:
-        """Requests in flight here, in either role."""
-        return self._serving.running + self._requests.unanswered + len(self._outbox)
+        """Requests and messages in flight here that somebody still waits for: what is worth staying for."""
+        peers = frozenset(self.peers.names())
+        messages = sum(self._outbox.messages_to(peer) for peer in peers)
+        return self._serving.awaited(peers) + self._requests.unanswered + messages
 
     # -- the control plane ----------------------------------------------------------------------------------------
 
@@ -270,6 +272,7 @@ class Engine:
                 pass
             case PeerRestarted():
                 if self.peers.restarted(event, now):
+                    self._serving.on_session_over(event.peer)
                     self._end_session(event.peer, now)
                     self._commands.append((None, SetPeers(self.peers.for_links())))
             case PeerClosed(peer):
@@ -334,6 +337,7 @@ class Engine:
         for route in self.routes.all_to(name):
             self.routes.set_state(route.id, PathState.DOWN)
         self._outbox.drop_peer(name)
+        self._serving.on_session_over(name)
         self._update_offers(now)
         self._requests.on_peer_gone(name, now)
         self._drop_if_unlisted(name, now)

@@ -55,6 +55,10 @@ class Outbox:
         """Bytes of all undelivered messages."""
         return self._shares_of_bytes.used
 
+    def messages_to(self, peer: NodeName) -> int:
+        """How many messages to this peer are undelivered."""
+        return self._shares_of_messages.held(peer)
+
     def has_room(self, peer: NodeName, size: int) -> bool:
         """Whether another message of this size may be sent to this peer."""
         held = self._shares_of_bytes

@@ -13,7 +13,7 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Collection, Iterable
 
     from protos.model import NodeName, ServiceName, ServiceOffer
     from sidecar.core.events import ApplicationEvent, ExecutionId
@@ -47,6 +47,10 @@ class Serving:
     def running(self) -> int:
         """How many requests are being worked on."""
         return self.executions.running
+
+    def awaited(self, robots: Collection[NodeName]) -> int:
+        """How many of those one of these robots still waits for."""
+        return self.executions.awaited(robots)
 
     @property
     def offers(self) -> tuple[ServiceOffer, ...]:
@@ -93,6 +97,11 @@ class Serving:
         if event is not None:
             self._parts.emit(event)
         self._parts.outbox.drop_answers(robot, message.request_id)
+
+    def on_session_over(self, robot: NodeName) -> None:
+        """The robot said goodbye or restarted: what its servers have not got yet needs not run."""
+        for event in self.executions.cancel_all(robot):
+            self._parts.emit(event)
 
     # -- the application ------------------------------------------------------------------------------------------
 

@@ -94,8 +94,9 @@ class ThreadedDataPlane:
 
     @property
     def busy(self) -> int:
-        """Requests and messages in flight."""
-        return self._engine.busy
+        """Requests and messages in flight that somebody still waits for."""
+        with self._lock:
+            return self._engine.busy
 
     def stop(self) -> None:
         """Say goodbye to the peers and end the timer; the caller stops the links after it."""

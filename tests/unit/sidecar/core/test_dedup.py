@@ -196,6 +196,19 @@ def test_a_request_called_off_after_it_ran_frees_its_cached_answer() -> None:
     assert not executions.knows(request().request_id)
 
 
+def test_a_robot_that_said_goodbye_is_not_waited_for() -> None:
+    executions = table()
+    mine = run(executions, request(1))
+    assert isinstance(executions.on_request(OTHER, request(2), 1.0), ExecuteRequest)
+    both = (ROBOT.peer, OTHER.peer)
+    assert executions.awaited(both) == 2
+    assert executions.awaited((OTHER.peer,)) == 1
+    assert executions.cancel_all(ROBOT.peer) == [CancelExecution(mine.execution)]
+    assert executions.cancel_all(ROBOT.peer) == []
+    assert (executions.awaited(both), executions.running) == (1, 2)
+    assert executions.complete(mine.execution, b"answer", 0.0, 1.1) == []
+
+
 def test_a_cancel_that_overtakes_its_request_holds() -> None:
     executions = table()
     executions.cancel(ROBOT.peer, request().request_id, 1.0)
