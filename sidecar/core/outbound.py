@@ -28,6 +28,7 @@ class OutboundMessage:
     """
 
     __slots__ = (
+        "_copies",
         "_lost",
         "_lost_repairs",
         "acked",
@@ -89,6 +90,8 @@ class OutboundMessage:
         """The same bytes, cut anew into smaller symbols."""
         self.generation = 0
         """How many messages before this one carried the same bytes."""
+        self._copies: dict[int, int] = {}
+        """Symbols of which more than one datagram is under way: how many more."""
         self._lost: set[int] = set()
         self._lost_repairs: set[int] = set()
 
@@ -143,6 +146,16 @@ class OutboundMessage:
         """The symbols that did not arrive, as far as is known."""
         return tuple(index for index in range(self.symbols) if self.needs(index))
 
+    def give_up(self) -> tuple[int, ...]:
+        """Return what is missing, whatever of it is under way: nobody will tell any more. The engine's, as `lost`."""
+        self._copies.clear()
+        return self.missing()
+
+    def copied(self, indices: Iterable[int]) -> None:
+        """Note that these symbols travel once more than they were lost. The engine's, as `lost`."""
+        for index in indices:
+            self._copies[index] = self._copies.get(index, 0) + 1
+
     def needs(self, index: int) -> bool:
         """Whether this symbol still has to travel."""
         return not self.over and not self.acked[index]
@@ -178,16 +191,15 @@ class OutboundMessage:
     def lost(self, indices: Iterable[int]) -> tuple[int, ...]:
         """Note symbols as lost; returns the source symbols that must travel again. The engine's, as `interfaces`.
 
-        Of a block that lost no more source symbols than it has repair symbols which arrived or still may, nothing
-        does; a lost repair symbol never does.
+        A symbol of which another copy is under way does not. Of a block that lost no more source symbols than it has
+        repair symbols which arrived or still may, nothing does; a lost repair symbol never does.
         """
+        indices = [index for index in indices if self.needs(index) and not self._is_copied(index)]
         if not self.repairs:
-            return tuple(index for index in indices if self.needs(index))
+            return tuple(indices)
         blocks = fec.block_count(self.count)
         hit = set()
         for index in indices:
-            if not self.needs(index):
-                continue
             if index < self.count:
                 self._lost.add(index)
                 hit.add(index % blocks)
@@ -202,3 +214,12 @@ class OutboundMessage:
             again += uncovered[: max(0, len(uncovered) - left)]
         self._lost.difference_update(again)
         return tuple(sorted(again))
+
+    def _is_copied(self, index: int) -> bool:
+        """Whether another copy of a lost one is under way; it counts as the last one from now on."""
+        more = self._copies.get(index, 0)
+        if more > 1:
+            self._copies[index] = more - 1
+        elif more:
+            del self._copies[index]
+        return more > 0

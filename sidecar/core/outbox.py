@@ -8,7 +8,7 @@ from sidecar.core.fragments import MAX_PEER_BYTES as REASSEMBLED_PEER_BYTES
 from sidecar.core.frame import symbol_count
 from sidecar.core.link_events import FragmentsLost, Resend, Send, SendAbandon
 from sidecar.core.outbound import OutboundMessage
-from sidecar.core.redundancy import repair_symbols
+from sidecar.core.redundancy import repair_symbols, worth_a_copy
 from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
@@ -118,6 +118,9 @@ class Outbox:
         self._shares_of_messages.take(message.peer)
         self._shares_of_bytes.take(message.peer, message.held_bytes)
         self._command(Send(message.path, message))
+        if not message.repairs and worth_a_copy(1, self._routes.loss(message.path)):
+            # It leaves before the others, so a burst does not take both.
+            self._send_copies(message, message.path, (message.count - 1,))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
         """The peer holds all of it. None when it is not one of the peer's messages, or was over before."""
@@ -202,6 +205,13 @@ class Outbox:
             return
         message.interfaces.add(path.interface)
         self._command(Resend(path, message, indices))
+        if worth_a_copy(len(indices), self._routes.loss(path)):
+            self._send_copies(message, self._routes.beside(path, message.datagram_bytes) or path, indices)
+
+    def _send_copies(self, message: OutboundMessage, path: PathId, indices: tuple[int, ...]) -> None:
+        message.interfaces.add(path.interface)
+        message.copied(indices)
+        self._command(Resend(path, message, indices))
 
     def _cut_anew(self, message: OutboundMessage, path: PathId) -> None:
         """No path carries its symbols any more: the whole of it travels again, in smaller ones."""
@@ -214,7 +224,7 @@ class Outbox:
     def on_path_up(self, path: PathId) -> None:
         """Send what waited for a path to this peer."""
         for message in self._parked.pop(path.peer, {}).values():
-            missing = message.lost(message.missing())
+            missing = message.lost(message.give_up())
             if missing:
                 self._resend(message, path, missing)
 
@@ -225,7 +235,7 @@ class Outbox:
         """
         for message in [message for message in self._messages.values() if interface in message.interfaces]:
             message.interfaces.discard(interface)
-            self.on_lost(FragmentsLost(message.path, message, message.missing()), now)
+            self.on_lost(FragmentsLost(message.path, message, message.give_up()), now)
 
     def expire(self, now: float) -> None:
         """Drop messages whose time is over."""

@@ -135,6 +135,20 @@ class Routes:
         best = min(routes, key=lambda route: (reluctance(route), route.order), default=None)
         return None if best is None else best.id
 
+    def beside(self, path: PathId, size: int) -> PathId | None:
+        """Return another path to the same peer that is up, carries `size` bytes and is not much slower, the best."""
+        slowest = 2.0 * self._get(path).smoothed_rtt_s
+        others = [
+            route
+            for route in self.all_to(path.peer)
+            if route.id != path
+            and route.state is PathState.UP
+            and route.max_datagram >= size
+            and route.smoothed_rtt_s <= slowest
+        ]
+        best = min(others, key=lambda route: route.order, default=None)
+        return None if best is None else best.id
+
     def max_datagram(self, path: PathId) -> int:
         """Return how long the path's datagrams may be, in bytes of UDP payload."""
         route = self._routes.get(path)

@@ -78,8 +78,9 @@ class Node:
         self.token = mesh.rng.randbytes(16)
         self.offers: tuple[ServiceOffer, ...] = ()
         self.server_delay: Callable[[], float | None] = lambda: 0.001
+        self.answer: Callable[[bytes], bytes] = b"echo:".__add__
         self.server: Callable[[ApplicationEvent], None] | None = None
-        """Runs this cloud's requests in place of `server_delay`."""
+        """Runs this cloud's requests in place of `server_delay` and `answer`."""
         self.events: list[ApplicationEvent] = []
         self.alive = True
         self.start()
@@ -257,7 +258,7 @@ class Mesh:
 
             def answer() -> None:
                 if node.alive and node.session == session:
-                    node.engine.complete(execution, b"echo:" + event.payload, delay, self.now)
+                    node.engine.complete(execution, node.answer(bytes(event.payload)), delay, self.now)
                     self.pump(node)
 
             self.at(delay, answer)

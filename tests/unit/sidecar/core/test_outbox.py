@@ -11,6 +11,7 @@ from sidecar.core.outbox import MAX_BYTES, MAX_GENERATIONS, MAX_MESSAGES, Outbox
 from sidecar.core.path_id import PathState
 from sidecar.core.pmtu import BASE_BYTES
 from sidecar.core.priority import Priority
+from sidecar.core.redundancy import MAX_COPIES
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
@@ -86,6 +87,82 @@ def test_after_a_timeout_the_other_path_is_taken_and_the_same_one_only_for_want_
     box.routes.set_state(OVER_WWAN, PathState.DOWN)
     box.lost(message, 0, timed_out=True)
     assert box.commands.pop() == Resend(OVER_WLAN, message, (0,))
+
+
+def lossy(box: Box, *paths: PathId) -> None:
+    for each in paths:
+        box.routes.set_rtt(each, 0.05)
+        box.routes.note_fates(each, 980, 20)
+
+
+def test_symbols_sent_again_over_a_lossy_path_travel_twice_and_again_only_when_both_are_lost() -> None:
+    box = Box(OVER_WLAN)
+    message = box.send()
+    lossy(box, OVER_WLAN)
+    box.lost(message, 0, 1)
+    twice = [Resend(OVER_WLAN, message, (0, 1))] * 2
+    assert box.commands == twice
+    box.lost(message, 0, 1)
+    assert box.commands == twice
+    message.acked[1] = 1
+    box.lost(message, 0, 1)
+    assert box.commands[2:] == [Resend(OVER_WLAN, message, (0,))] * 2
+
+
+def test_the_copy_takes_another_path_when_it_is_as_good() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = box.send()
+    lossy(box, OVER_WLAN, OVER_WWAN)
+    box.lost(message, 0)
+    assert [command.path for command in box.commands if isinstance(command, Resend)] == [OVER_WLAN, OVER_WWAN]
+    assert message.interfaces == {WLAN, WWAN}
+    box.routes.set_rtt(OVER_WWAN, 0.11)
+    box.lost(message, 1)
+    assert box.commands[2:] == [Resend(OVER_WLAN, message, (1,))] * 2
+
+
+def test_the_last_symbol_travels_twice_over_a_lossy_path_unless_repair_symbols_cover_it() -> None:
+    box = Box(OVER_WLAN)
+    lossy(box, OVER_WLAN)
+    for fec, doubled in ((0.0, True), (None, False), (0.1, False)):
+        box.commands.clear()
+        content = Encoded(b"", bytes(5000))
+        message = box.outbox.send(OVER_WLAN, content, priority=Priority.NORMAL, deadline=1.0, expires=9.0, fec=fec)
+        assert message is not None
+        expected = [Send(OVER_WLAN, message), Resend(OVER_WLAN, message, (message.count - 1,))]
+        assert box.commands == expected[: 1 + doubled]
+
+
+def test_many_symbols_lost_at_once_travel_once() -> None:
+    box = Box(OVER_WLAN)
+    message = box.send(size=100_000)
+    lossy(box, OVER_WLAN)
+    box.lost(message, *range(MAX_COPIES + 1))
+    assert box.commands == [Resend(OVER_WLAN, message, tuple(range(MAX_COPIES + 1)))]
+
+
+def test_copies_do_not_hold_back_what_an_interface_took_with_it() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = box.send()
+    lossy(box, OVER_WLAN)
+    box.routes.set_rtt(OVER_WWAN, 1.0)
+    box.lost(message, 0)
+    box.commands.clear()
+    box.routes.set_state(OVER_WLAN, PathState.DOWN)
+    box.outbox.on_interface_gone(WLAN, 1.0)
+    assert box.commands == [Resend(OVER_WWAN, message, (0, 1, 2))]
+
+
+def test_copies_do_not_hold_back_what_waited_for_a_path() -> None:
+    box = Box(OVER_WLAN)
+    message = box.send()
+    lossy(box, OVER_WLAN)
+    box.lost(message, 0)
+    box.routes.set_state(OVER_WLAN, PathState.DOWN)
+    box.lost(message, 0, 1)
+    box.commands.clear()
+    box.outbox.on_path_up(OVER_WWAN)
+    assert box.commands == [Resend(OVER_WWAN, message, (0, 1, 2))]
 
 
 def test_without_a_path_messages_wait_and_all_missing_symbols_leave_with_the_first_one_up() -> None:

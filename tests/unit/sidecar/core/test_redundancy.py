@@ -6,7 +6,7 @@ import pytest
 
 from sidecar.core import fec
 from sidecar.core.loss_estimate import Loss
-from sidecar.core.redundancy import FAILURES, FLOOR, LONE_FLOOR, MAX_RATIO, repair_symbols
+from sidecar.core.redundancy import FAILURES, FLOOR, MAX_COPIES, MAX_RATIO, WORTH_A_COPY, repair_symbols, worth_a_copy
 
 COUNTS = (1, 2, 3, 5, 20, 128, 129, 132, 1000, 14_700)
 
@@ -33,9 +33,17 @@ def test_more_loss_never_asks_for_less() -> None:
         assert asked[-1] <= max(1, count * MAX_RATIO) + fec.block_count(count)
 
 
-def test_a_lone_datagram_is_doubled_only_where_it_pays() -> None:
-    assert repair_symbols(1, None, Loss(0.9 * LONE_FLOOR)) == 0
-    assert repair_symbols(1, None, Loss(LONE_FLOOR)) == 1
+def test_few_datagrams_are_doubled_only_where_it_pays() -> None:
+    assert not worth_a_copy(1, Loss())
+    assert not worth_a_copy(1, Loss(0.9 * WORTH_A_COPY))
+    assert worth_a_copy(1, Loss(1.01 * WORTH_A_COPY))
+    assert worth_a_copy(2, Loss(0.9 * WORTH_A_COPY)), "one of two is lost more often than one of one"
+    assert worth_a_copy(MAX_COPIES, Loss(0.02))
+    assert not worth_a_copy(MAX_COPIES + 1, Loss(0.02))
+
+
+def test_a_lone_datagram_gets_no_repair_symbol_by_the_loss() -> None:
+    assert repair_symbols(1, None, Loss(0.1)) == 0
 
 
 def test_the_overhead_of_a_camera_frame_is_modest() -> None:
