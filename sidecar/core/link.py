@@ -35,7 +35,6 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.path_table import PathTable
 from sidecar.core.paths import NEVER
-from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.stats import PathStats
 from sidecar.core.timers import Timers
 
@@ -49,6 +48,9 @@ if TYPE_CHECKING:
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.paths import Path
 
+MAX_FINISHED_DELAY_S = 0.003
+"""How long FINISHED of a small request waits for its answer, and the acknowledgement with it: less than
+MAX_ACK_DELAY_S, so that a busy host's lateness does not pass for a loss at the sender."""
 MEASURE_EVERY_S = 0.25
 """How often a path's round-trip times go to the engine."""
 
@@ -99,7 +101,7 @@ class Link:
                     self._events.append(PathChanged(path_id, PathState.DOWN, "not usable here"))
                     self._events.append(FinishedLost(path_id, (number,)))
                 else:
-                    by = now if at_once else now + MAX_ACK_DELAY_S
+                    by = now if at_once else now + MAX_FINISHED_DELAY_S
                     self._table.owe(path, frame.encode_finished(frame.Finished(number)), by)
             case SendAbandon(path_id, number):
                 path = self._paths.get((path_id.peer, path_id.remote))

@@ -88,7 +88,7 @@ class SendFinished:
     path: PathId
     number: int
     at_once: bool = True
-    """Otherwise with the next datagram, or after the delay that an acknowledgement may have."""
+    """Otherwise with the next datagram, or after MAX_FINISHED_DELAY_S (link.py)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from sidecar.core import frame
 from sidecar.core.frame import BASE_SYMBOL_BYTES, AckFrame, Finished, Fragment
+from sidecar.core.link import MAX_FINISHED_DELAY_S
 from sidecar.core.link_events import FragmentsLost, Send, SendFinished
-from sidecar.core.received import MAX_ACK_DELAY_S
 from tests.unit.sidecar.core.builders import message
 from tests.unit.sidecar.core.test_link import PATH, fragment, frames, numbers, up
 
 
-def test_a_finished_that_may_wait_goes_when_the_acknowledgement_would() -> None:
+def test_a_finished_that_may_wait_waits_for_a_moment_only() -> None:
     bench = up()
     bench.execute(SendFinished(PATH, 1, at_once=False))
     assert bench.sent() == []
-    assert [type(item) for item in frames(bench.wait(MAX_ACK_DELAY_S))] == [Finished]
+    assert [type(item) for item in frames(bench.wait(MAX_FINISHED_DELAY_S))] == [Finished]
 
 
 def test_what_is_owed_travels_with_a_small_answer_and_both_are_repeated_when_lost() -> None:
