@@ -331,6 +331,12 @@ _ABOUT_A_MESSAGE: dict[int, type[Finished | Abandon | Forgotten]] = {
 }
 
 
+def is_repair_index(index: int, total: int, symbol: int) -> bool:
+    """Whether a message of `total` bytes in symbols of `symbol` bytes (not 0) may have this repair symbol."""
+    count = symbol_count(total, symbol)
+    return count <= index < 2 * count
+
+
 def _decode_fragment(kind: int, view: memoryview, position: int) -> tuple[Fragment, int]:
     message, total, symbol, index = _FRAGMENT_HEAD.unpack_from(view, position)
     position += _FRAGMENT_HEAD.size
@@ -344,8 +350,7 @@ def _decode_fragment(kind: int, view: memoryview, position: int) -> tuple[Fragme
             raise DecodeError("fragment beyond the end of its message")
         length = min(symbol, total - start)
     else:
-        count = symbol_count(total, symbol)
-        if not count <= index < 2 * count:
+        if not is_repair_index(index, total, symbol):
             raise DecodeError("repair symbol that no block has")
         length = symbol
     data = view[position : position + length]

@@ -14,8 +14,10 @@ from sidecar.core.frame import (
     MAX_MESSAGE_BYTES,
     MAX_SYMBOL_BYTES,
     MIN_SYMBOL_BYTES,
+    REPAIR_TYPE,
     Fragment,
     Header,
+    is_repair_index,
 )
 from sidecar.core.link_events import (
     FragmentsReceived,
@@ -60,16 +62,16 @@ class LinkReader:
             position = self._receive_fragments(data, position, segment, source, now)
 
     def _receive_fragments(self, data: memoryview, position: int, segment: int, source: Address, now: float) -> int:
-        """Take the datagrams from `position` on that hold one FRAGMENT and nothing else, as long as they are of one
-        path and come in order; returns the position of the first that is not. Nearly all datagrams of a long message
-        are such. What looks odd is left to `_receive_datagram`.
+        """Take the datagrams from `position` on that hold one FRAGMENT or REPAIR and nothing else, as long as they are
+        of one path and come in order; returns the position of the first that is not. Nearly all datagrams of a long
+        message are such. What looks odd is left to `_receive_datagram`.
         """
         end = len(data)
         if end - position < FRAGMENT_DATAGRAM_BYTES:
             return position
         unpack, new = FRAGMENT_DATAGRAM.unpack_from, tuple.__new__
         head, session, first, kind, *_ = unpack(data, position)
-        if kind != FRAGMENT_TYPE:
+        if kind != FRAGMENT_TYPE and kind != REPAIR_TYPE:
             return position
         path = self._table.of_head(head, session)
         if path is None or first <= path.received.largest:
@@ -83,12 +85,16 @@ class LinkReader:
             stop = position + segment
             if stop > end:
                 stop = end
-            length = total - index * symbol
-            if length > symbol:
+            if kind == FRAGMENT_TYPE:
+                length = total - index * symbol
+                if length > symbol:
+                    length = symbol
+            elif kind == REPAIR_TYPE and symbol and is_repair_index(index, total, symbol):
                 length = symbol
+            else:
+                break
             if (
                 number <= high
-                or kind != FRAGMENT_TYPE
                 or its_head != head
                 or its_session != session
                 or position + FRAGMENT_DATAGRAM_BYTES + length != stop
