@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model import ServiceName
+    from protos.model import NodeName, ServiceName
     from sidecar.core.events import RequestId
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_id import PathId
@@ -18,6 +18,9 @@ OBSERVED_ONE_IN = 8
 
 At 10 requests a second and the estimator's half-life of 60 s, this leaves the weight of 100 requests for each path,
 where its estimate stands on real requests alone; seven eighths of what losers would waste are saved."""
+
+HEDGE_AT = 0.5
+"""At this part of the deadline, a server that has the request alone and is silent makes another one worth asking."""
 
 
 class CopyState(enum.Enum):
@@ -63,11 +66,38 @@ class Request:
         return self.submitted_at + self.rule.deadline_s
 
     @property
+    def hedge_at(self) -> float:
+        return self.submitted_at + HEDGE_AT * self.rule.deadline_s
+
+    @property
     def expires_at(self) -> float:
         return self.submitted_at + self.rule.lifetime_s
 
     def pending(self) -> list[Copy]:
         return [copy for copy in self.copies if copy.state is CopyState.PENDING]
+
+    def waits_for_one_server(self) -> bool:
+        """Whether a single server was asked, holds the request, and has not answered."""
+        asked = {copy.path.peer for copy in self.copies}
+        return len(asked) == 1 and any(copy.message.newest.over for copy in self.pending())
+
+    def certainly_not_run(self) -> bool:
+        """Whether no server has run it, nor will."""
+        return all(copy.state is CopyState.REJECTED and copy.certainly_not_run for copy in self.copies)
+
+    def worth_another_copy(self, servers: tuple[NodeName, ...], *, rejected: bool) -> tuple[NodeName, ...]:
+        """Return those of `servers` that have no pending copy and refused none.
+
+        When all else is lost and this is not about a refusal (`rejected`): those that could not run it (starting,
+        draining, full) and may do so now.
+        """
+        busy = {copy.path.peer for copy in self.pending()}
+        refused = {copy.path.peer for copy in self.copies if copy.state is CopyState.REJECTED}
+        others = tuple(server for server in servers if server not in busy | refused)
+        if others or rejected:
+            return others
+        hopeless = {copy.path.peer for copy in self.copies if not copy.certainly_not_run}
+        return tuple(server for server in servers if server in refused - hopeless)
 
     def choose_observation(self) -> None:
         """Decide, when the first copies go out, whether this request is a full race.

@@ -57,7 +57,7 @@ class MappingTable:
         if not any(route.state is PathState.UP for route in chosen):
             chosen = self._merge(chosen, self._by_round_trip_time(servers))
         if not idempotent:
-            chosen = self._one_server(chosen)
+            chosen = self._over_every_interface(chosen)
         return tuple(route.id for route in chosen)
 
     def _mapped(self, service: ServiceName, servers: Collection[NodeName]) -> list[Route]:
@@ -89,11 +89,14 @@ class MappingTable:
     def _merge(self, first: list[Route], more: list[Route]) -> list[Route]:
         return first + [route for route in more if route not in first]
 
-    def _one_server(self, routes: list[Route]) -> list[Route]:
+    def _over_every_interface(self, routes: list[Route]) -> list[Route]:
+        """Keep one server, and reach it over each of the interfaces that were to reach one."""
         if not routes:
             return routes
         server = next((route for route in routes if route.state is PathState.UP), routes[0]).id.peer
-        return [route for route in routes if route.id.peer == server]
+        interfaces = dict.fromkeys(route.id.interface for route in routes)
+        over = (self._routes.best_over(interface, server) for interface in interfaces)
+        return [route for route in over if route is not None]
 
     def rescue(self, servers: Collection[NodeName]) -> PathId | None:
         """Return the best path to any of these servers that is up, for a request whose copies are in trouble."""

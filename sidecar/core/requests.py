@@ -12,12 +12,12 @@ lost: its latency is known to be beyond the deadline, which is all that the pred
 from __future__ import annotations
 
 import heapq
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
 from protos.model import Assignment
+from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.events import (
     ApplicationEvent,
@@ -29,14 +29,12 @@ from sidecar.core.events import (
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
     MAX_PAYLOAD_BYTES,
-    CancelMessage,
     RejectionMessage,
     RequestMessage,
     ResponseMessage,
     encode_message,
 )
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -56,14 +54,6 @@ MAX_HELD_BYTES = 256 * 1024 * 1024
 """Payloads of those requests, which may wait for the first path to a server: as much as the outbox takes."""
 MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""
-MAX_CALLED_OFF = 1024
-"""Ids of requests whose copies were called off, kept to tell answers that were on their way from strays."""
-SMALL_ANSWER_BYTES = 1024
-"""An answer that fits one datagram with its head. Its server sent it to its other copies as well: a cancel would cost
-more than is left to be saved there."""
-CANCEL_DEADLINE_S = 0.1
-"""A cancel is worth most at once: a server that has not begun need not. Among what is urgent, others go first only if
-their own time is shorter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +76,7 @@ class RequestTable:
         self._parts = parts
         self._requests: dict[RequestId, Request] = {}
         self._timers: list[tuple[float, RequestId]] = []
-        self._called_off: OrderedDict[RequestId, None] = OrderedDict()
+        self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self.unanswered = 0
         self._held_bytes = 0
 
@@ -141,6 +131,8 @@ class RequestTable:
         idempotent = request.rule.idempotent
         for path in self._parts.mapping.choose(request.service, servers, idempotent=idempotent):
             self._send_copy(request, path, now)
+        if idempotent and len({copy.path.peer for copy in request.copies}) == 1:
+            heapq.heappush(self._timers, (request.hedge_at, request.id))
         request.choose_observation()
 
     def _send_copy(self, request: Request, path: PathId, now: float) -> None:
@@ -190,7 +182,7 @@ class RequestTable:
             self._deliver(request, copy, response, now)
             if not request.observed:
                 small = len(response.payload) <= SMALL_ANSWER_BYTES
-                self._call_off(request, request.pending(), now, untold=server if small else None)
+                self._calling_off.call_off(request, request.pending(), now, untold=server if small else None)
         self._settle(request, now)
 
     def _deliver(self, request: Request, copy: Copy, response: ResponseMessage, now: float) -> None:
@@ -236,7 +228,7 @@ class RequestTable:
         dropped = self._parts.stats.dropped
         request = self._requests.get(request_id)
         if request is None:
-            if request_id in self._called_off:
+            if request_id in self._calling_off:
                 self._parts.stats.duplicate_responses += 1
             else:
                 dropped["answer_to_unknown_request"] += 1
@@ -283,25 +275,16 @@ class RequestTable:
     def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
         """Send one more copy when no pending one is on a path that is up (or when `insist`).
 
-        Not to a server that refused one, unless there is no other and this is not about that (`rejected`).
+        A request that is not idempotent may go to another server only when it is certain that none has run it.
         """
-        pending = request.pending()
         routes = self._parts.routes
+        pending = request.pending()
         if not insist and any(routes.state(copy.path) is PathState.UP for copy in pending):
             return
-        servers = self._parts.offers.servers(request.service)
-        if not request.rule.idempotent:
-            # Another server may run it only when it is certain that none has.
-            if not all(copy.state is CopyState.REJECTED and copy.certainly_not_run for copy in request.copies):
-                return
-        busy = {copy.path.peer for copy in pending}
-        refused = {copy.path.peer for copy in request.copies if copy.state is CopyState.REJECTED}
-        others = tuple(server for server in servers if server not in busy | refused)
-        if not others and not rejected:
-            # All else is lost, and whoever could not run it then (it was starting, draining, full) may do so now.
-            hopeless = {copy.path.peer for copy in request.copies if not copy.certainly_not_run}
-            others = tuple(server for server in servers if server in refused - hopeless)
-        path = self._parts.mapping.rescue(self._with_room(others, len(request.payload or b"")))
+        if not request.rule.idempotent and not request.certainly_not_run():
+            return
+        servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=rejected)
+        path = self._parts.mapping.rescue(self._with_room(servers, len(request.payload or b"")))
         if path is not None:
             self._send_copy(request, path, now)
 
@@ -323,6 +306,9 @@ class RequestTable:
             if request.expires_at <= now:
                 self._expire(request, now)
                 continue
+            if now < request.deadline_at:
+                self._hedge(request, now)
+                continue
             heapq.heappush(self._timers, (request.expires_at, request_id))
             if request.done:
                 self._settle(request, now)
@@ -331,34 +317,18 @@ class RequestTable:
                 if request.rule.idempotent:
                     self._rescue(request, now, insist=True)
 
+    def _hedge(self, request: Request, now: float) -> None:
+        """Ask another server when the only one asked has the request and is silent: it may have died unnoticed.
+
+        Not when the request has not arrived: then the path is slow, which another copy would only make worse.
+        """
+        if not request.done and request.waits_for_one_server():
+            self._rescue(request, now, insist=True)
+
     def _miss(self, request: Request) -> None:
         request.missed = True
         copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
-
-    def _call_off(self, request: Request, copies: list[Copy], now: float, *, untold: NodeName | None = None) -> None:
-        """Send no more of these copies; tell their servers, except for `untold` and where nothing of them went to them
-        or another copy is still awaited."""
-        for copy in copies:
-            copy.state = CopyState.DEAD
-            self._parts.outbox.drop(copy.message)
-            self._parts.stats.called_off[copy.path.interface, copy.path.peer, request.service] += 1
-        servers = {copy.path.peer for copy in copies if copy.message.begun}
-        servers -= {untold, *(copy.path.peer for copy in request.pending())}
-        for server in servers:
-            path = self._parts.routes.best_to(server)
-            if path is not None:
-                self._parts.outbox.send(
-                    path,
-                    encode_message(CancelMessage(request.id)),
-                    priority=Priority.HIGH,
-                    deadline=now + CANCEL_DEADLINE_S,
-                    expires=request.expires_at,
-                )
-        if copies:
-            self._called_off[request.id] = None
-            if len(self._called_off) > MAX_CALLED_OFF:
-                self._called_off.popitem(last=False)
 
     def _lost(self, request: Request, copy: Copy) -> None:
         if request.observed:
@@ -393,6 +363,6 @@ class RequestTable:
             undelivered = [copy for copy in request.pending() if not copy.message.newest.over]
             for copy in undelivered:
                 self._lost(request, copy)
-            self._call_off(request, undelivered, now)
+            self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
             self._requests.pop(request.id, None)

@@ -80,9 +80,15 @@ def test_nothing_reachable_nothing_chosen() -> None:
 
 
 def test_not_idempotent_goes_to_one_server_preferably_over_a_path_that_is_up() -> None:
-    assert choose(table(*MAPPED), idempotent=False) == (WLAN_B,)
-    assert choose(table(*MAPPED, wlan_b=UNSTABLE), idempotent=False) == (WWAN_A,)
+    assert choose(table(*MAPPED, wwan_b=DOWN), idempotent=False) == (WLAN_B,)
+    assert choose(table(*MAPPED, wlan_b=UNSTABLE), idempotent=False) == (WLAN_A, WWAN_A)
     assert choose(table((WLAN, A), (WWAN, A)), idempotent=False) == (WLAN_A, WWAN_A)
+
+
+def test_not_idempotent_reaches_its_server_over_every_interface_that_would_carry_a_copy() -> None:
+    assert choose(table(), idempotent=False) == (WLAN_A, WWAN_A)
+    assert choose(table(*MAPPED), idempotent=False) == (WLAN_B, WWAN_B)
+    assert choose(table((WLAN, B)), idempotent=False) == (WLAN_B,), "the mapping leaves the other one out"
 
 
 def test_only_a_path_that_is_up_rescues() -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core import requests as requests_module
+from sidecar.core.calling_off import MAX_CALLED_OFF, SMALL_ANSWER_BYTES
 from sidecar.core.copies import OBSERVED_ONE_IN
 from sidecar.core.events import (
     ApplicationEvent,
@@ -28,7 +29,7 @@ from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.priority import Priority
-from sidecar.core.requests import MAX_CALLED_OFF, MAX_COPIES, SMALL_ANSWER_BYTES, RequestParts, RequestTable
+from sidecar.core.requests import MAX_COPIES, RequestParts, RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
 from sidecar.core.stats import EngineStats
@@ -158,6 +159,9 @@ def test_a_missed_deadline_is_told_once_and_one_more_copy_goes_out() -> None:
     table.submit()
     assert table.sent() == [WLAN_A]
     table.change(WWAN_B, PathState.UP)
+    assert table.table.next_timer() == 0.5, "to ask another server if A has it and is silent; A does not have it"
+    table.table.handle_timer(0.5)
+    assert table.sent() == []
     assert table.table.next_timer() == 1.0
     table.table.handle_timer(1.0)
     table.table.handle_timer(1.0)
@@ -296,7 +300,7 @@ def test_ids_of_what_was_called_off_are_kept_for_a_while_only() -> None:
     for number in range(1, 2 * MAX_CALLED_OFF):
         table.submit(number)
         table.respond(A, number=number)
-    assert len(table.table._called_off) == MAX_CALLED_OFF
+    assert len(table.table._calling_off) == MAX_CALLED_OFF
 
 
 def test_an_answer_from_a_server_given_up_still_counts_but_is_not_measured_twice() -> None:

@@ -1,0 +1,69 @@
+"""Robot side: copies that nobody waits for any more are taken back, and their servers told."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import TYPE_CHECKING
+
+from sidecar.core.copies import CopyState
+from sidecar.core.messages import CancelMessage, encode_message
+from sidecar.core.priority import Priority
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+    from sidecar.core.copies import Copy, Request
+    from sidecar.core.events import RequestId
+    from sidecar.core.outbox import Outbox
+    from sidecar.core.routes import Routes
+    from sidecar.core.stats import EngineStats
+
+MAX_CALLED_OFF = 1024
+"""Ids of requests whose copies were called off, kept to tell answers that were on their way from strays."""
+SMALL_ANSWER_BYTES = 1024
+"""An answer that fits one datagram with its head. Its server sent it to its other copies as well: a cancel would cost
+more than is left to be saved there."""
+CANCEL_DEADLINE_S = 0.1
+"""A cancel is worth most at once: a server that has not begun need not. Among what is urgent, others go first only if
+their own time is shorter."""
+
+
+class CallingOff:
+    """Calls copies off, and remembers of which requests."""
+
+    def __init__(self, routes: Routes, outbox: Outbox, stats: EngineStats) -> None:
+        self._routes = routes
+        self._outbox = outbox
+        self._stats = stats
+        self._requests: OrderedDict[RequestId, None] = OrderedDict()
+
+    def __contains__(self, request_id: RequestId) -> bool:
+        """Whether copies of this request were called off lately."""
+        return request_id in self._requests
+
+    def __len__(self) -> int:
+        """How many requests are remembered."""
+        return len(self._requests)
+
+    def call_off(self, request: Request, copies: list[Copy], now: float, *, untold: NodeName | None = None) -> None:
+        """Send no more of these copies; tell their servers, except for `untold` and where nothing of them went to them
+        or another copy is still awaited."""
+        for copy in copies:
+            copy.state = CopyState.DEAD
+            self._outbox.drop(copy.message)
+            self._stats.called_off[copy.path.interface, copy.path.peer, request.service] += 1
+        servers = {copy.path.peer for copy in copies if copy.message.begun}
+        servers -= {untold, *(copy.path.peer for copy in request.pending())}
+        for server in servers:
+            path = self._routes.best_to(server)
+            if path is not None:
+                self._outbox.send(
+                    path,
+                    encode_message(CancelMessage(request.id)),
+                    priority=Priority.HIGH,
+                    deadline=now + CANCEL_DEADLINE_S,
+                    expires=request.expires_at,
+                )
+        if copies:
+            self._requests[request.id] = None
+            if len(self._requests) > MAX_CALLED_OFF:
+                self._requests.popitem(last=False)
