@@ -49,7 +49,9 @@ PROBE_GROWTH = 1.1
 """Asking for more found that much: ask again at once."""
 FULL_GROWTH = 1.25
 FULL_ROUNDS = 3
-"""The path is full when the rate did not grow by FULL_GROWTH within FULL_ROUNDS."""
+"""The path is full when the rate did not grow by FULL_GROWTH within FULL_ROUNDS ..."""
+QUEUED_ROUNDS = 2
+"""... or when a queue stands for so many: in a single round, all may have waited for a busy host's thread."""
 QUEUE_FACTOR = 0.25
 """A round trip this much above the minimum shows a queue."""
 PROBE_AGAIN_S = 1.0
@@ -98,6 +100,7 @@ class CongestionController:
         "_probe_credit",
         "_probe_min_rtt",
         "_probed_rtt_at",
+        "_queued_rounds",
         "_rate_before",
         "_rate_before_silence",
         "_release_at",
@@ -125,6 +128,7 @@ class CongestionController:
         self._cycle = 2
         self._full_rate = 0.0
         self._full_rounds = 0
+        self._queued_rounds = 0
         self._phase_rounds = 0
         self._standing_rounds = 0
         self._believed_before = 0.0
@@ -222,13 +226,23 @@ class CongestionController:
             if self.phase is Phase.PROBE_RTT:
                 self._probe_rtt(sample, rtt, now)
         limit = STARTUP_GAIN * (self.rate.settled or self._first_window / max(rtt.minimum, 1e-4))
-        probing_rtt = self.phase is Phase.PROBE_RTT
-        round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit, held_back=probing_rtt)
+        held_back = self.phase is Phase.PROBE_RTT or self._ceiling_binds(rtt)
+        round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit, held_back=held_back)
         self.ceiling.on_acked(sample.acked_bytes, sample.rtt_s, rtt, self._model_window(), now)
         if self.phase is Phase.DRAIN and sample.in_flight <= self.rate.best * rtt.minimum:
             self._cruise()
         if round_over:
             self._end_round(rtt, now)
+
+    def _ceiling_binds(self, rtt: RttEstimator) -> bool:
+        """Whether less is in flight than the path holds, so that a round without a queue tells nothing of its rate."""
+        if self.ceiling.bytes is None or self.ceiling.bytes >= self._model_window():
+            return False
+        return not self._stands(self._round_min_rtt, rtt)
+
+    @staticmethod
+    def _stands(round_min_rtt: float, rtt: RttEstimator) -> bool:
+        return rtt.minimum + QUEUE_FACTOR * rtt.minimum + END_HOST_S < round_min_rtt < float("inf")
 
     def on_lost(self, lost_bytes: int, sent_at: float, in_flight: int, now: float) -> None:
         """These bytes were lost, the newest of them sent at `sent_at`; `in_flight` is what is left."""
@@ -274,10 +288,10 @@ class CongestionController:
 
     def _end_round(self, rtt: RttEstimator, now: float) -> None:
         standing_s = self._round_min_rtt - rtt.minimum if self._round_min_rtt < float("inf") else 0.0
+        queued = self._stands(self._round_min_rtt, rtt)
         self._round_min_rtt = float("inf")
-        queued = standing_s > QUEUE_FACTOR * rtt.minimum + END_HOST_S
         self._phase_rounds += 1
-        self.ceiling.end_round()
+        self.ceiling.end_round(rtt, now)
         if standing_s > rtt.minimum + 2 * END_HOST_S:
             self._standing_rounds += 1
             self._believed_before = max(self._believed_before, self.rate.best)
@@ -321,8 +335,10 @@ class CongestionController:
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
         self._phase_rounds = 0
+        self._queued_rounds = 0
 
     def _check_full(self, *, queued: bool) -> None:
+        self._queued_rounds = self._queued_rounds + 1 if queued else 0
         if self.rate.limited_by_sender:
             return
         if self.rate.best > FULL_GROWTH * self._full_rate:
@@ -330,7 +346,7 @@ class CongestionController:
             self._full_rounds = 0
         else:
             self._full_rounds += 1
-        if queued or self._full_rounds >= FULL_ROUNDS:
+        if self._queued_rounds >= QUEUED_ROUNDS or self._full_rounds >= FULL_ROUNDS:
             self._enter(Phase.DRAIN)
 
     def _cruise(self) -> None:

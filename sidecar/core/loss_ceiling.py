@@ -27,7 +27,17 @@ MEMORY_BYTES = 500 * DATAGRAM_BYTES
 """Over how much the frequency of losses without a queue is measured."""
 HEAVY_LOSS = 0.2
 HEAVY_BYTES = 8 * DATAGRAM_BYTES
-"""Losing this share of a round and this much of it is congestion even without a queue: a policer, a tiny buffer."""
+"""Losing this share and this much of what was sent of late is congestion even without a queue: a policer, a tiny
+buffer. Of late: a window, not the round, because on a busy host one acknowledgement tells first that most of a
+window arrived, which ends a round, and then what is missing from it."""
+PATIENCE_ROUNDS = 20
+PATIENCE_S = 1.0
+"""A ceiling that a queue's losses set is left alone for so long: others that yielded as well come back by then."""
+RECENT_BYTES = 64 * DATAGRAM_BYTES
+"""The least that counts as of late."""
+REGAIN = 1.25
+"""A ceiling that binds grows this much with each round that neither met a queue nor lost more than usual. It need not
+find where the path ends: the model of the path, whose rate is what was delivered, sees to that."""
 QUEUE_FACTOR = 0.2
 """A round trip that is longer than the floor by this share, and by more than it varies, shows a queue."""
 VARIATIONS = 2.5
@@ -46,9 +56,14 @@ class LossCeiling:
         "_floor_at",
         "_floor_s",
         "_lost",
+        "_most_before",
         "_most_in_flight",
         "_queue_before",
+        "_queue_cut",
         "_queued",
+        "_recent",
+        "_recent_lost",
+        "_regained_at",
         "_start",
         "_top",
         "_usual_bytes",
@@ -64,7 +79,11 @@ class LossCeiling:
         self._top = 0.0
         self._acked = self._lost = 0
         """Bytes of this round."""
-        self._most_in_flight = 0
+        self._most_in_flight = self._most_before = 0
+        self._recent = self._recent_lost = 0.0
+        self._regained_at = 0.0
+        self._queue_cut = False
+        """Whether the last cut was for losses while a queue stood."""
         self._queued = False
         self._queue_before = False
         self._usual_bytes = 0.0
@@ -79,6 +98,7 @@ class LossCeiling:
     def on_acked(self, size: int, rtt_s: float, rtt: RttEstimator, wanted: float, now: float) -> None:
         """Grow. `wanted` is the window without a ceiling; one that is far above it is forgotten."""
         self._acked += size
+        self._note_recent(size)
         if rtt_s:
             if rtt_s <= self._floor_s:
                 if rtt_s < self._floor_s - self._short_s:
@@ -86,7 +106,7 @@ class LossCeiling:
                 self._floor_s, self._floor_at = rtt_s, now
             elif now - self._floor_at > FLOOR_MEMORY_S:
                 self._floor_s, self._floor_at = rtt.minimum, now
-            self._queued |= rtt_s - self._floor_s > self._short_s
+            self._queued |= rtt_s - self._floor_s > max(self._short_s, VARIATIONS * rtt.variation)
         if self.bytes is not None:
             self.bytes = self._grown(now - self._at, rtt.smoothed)
             if self.bytes > 2 * max(wanted, self._top):
@@ -95,10 +115,14 @@ class LossCeiling:
     def on_lost(self, size: int, sent_at: float, in_flight: int, rtt: RttEstimator, now: float) -> bool:
         """Take a loss, the newest datagram of it sent at `sent_at`; True when it cut the ceiling."""
         self._lost += size
+        self._note_recent(size)
+        self._recent_lost += size
         if sent_at <= self._at:
             return False  # it left before the last cut could help (RFC 9002 section 7.3.2)
-        if not self._is_heavy() and not (self._queue_stands(rtt) and self._is_unusual()):
+        queue = self._queue_stands(rtt) and self._is_unusual()
+        if not queue and not self._is_heavy():
             return False
+        self._queue_cut = queue
         before = float(max(in_flight + size, self._most_in_flight))
         if self.bytes is not None:
             before = min(before, self.bytes)
@@ -106,11 +130,13 @@ class LossCeiling:
         self._top = before if before >= self._top else before * (1 + CUT) / 2
         self._start = self.bytes = max(CUT * before, LEAST_BYTES)
         self._at = now
+        self._recent_lost = 0.0
         return True
 
-    def end_round(self) -> None:
+    def end_round(self, rtt: RttEstimator, now: float) -> None:
         """A round trip is over. What it lost while no datagram met a queue, nor in the one before, is usual."""
         if not self._queued and not self._queue_before and not self._is_heavy():
+            self._regain(rtt, now)
             if self._usual_bytes > MEMORY_BYTES:
                 self._usual_bytes /= 2
                 self._usual_lost /= 2
@@ -119,7 +145,24 @@ class LossCeiling:
         self._queue_before = self._queued
         self._queued = False
         self._acked = self._lost = 0
-        self._most_in_flight = 0
+        self._most_before, self._most_in_flight = self._most_in_flight, 0
+
+    def _regain(self, rtt: RttEstimator, now: float) -> None:
+        binds = self.bytes is not None and max(self._most_in_flight, self._most_before) >= self.bytes / 2
+        if self.bytes is None or not binds or now - max(self._at, self._regained_at) < rtt.smoothed:
+            return
+        if self._queue_cut and now - self._at < max(PATIENCE_ROUNDS * rtt.smoothed, PATIENCE_S):
+            return
+        self._regained_at = now
+        self._start = self.bytes = REGAIN * self.bytes
+
+    def _note_recent(self, size: int) -> None:
+        """Make room for these bytes among the recent ones."""
+        keep = max(self._most_in_flight, self._most_before, RECENT_BYTES) - size
+        if self._recent > keep:
+            self._recent_lost *= max(keep, 0) / self._recent
+            self._recent = max(keep, 0)
+        self._recent += size
 
     def forget(self) -> None:
         """No ceiling."""
@@ -146,10 +189,10 @@ class LossCeiling:
         return max(QUEUE_FACTOR * self._floor_s, QUEUE_S)
 
     def _is_heavy(self) -> bool:
-        return self._lost > max(HEAVY_LOSS * (self._lost + self._acked), HEAVY_BYTES)
+        return self._recent_lost > max(HEAVY_LOSS * self._recent, HEAVY_BYTES)
 
     def _is_unusual(self) -> bool:
         if self._usual_lost <= UNUSUAL * self._usual_bytes:
             return True
-        usual = self._usual_lost / self._usual_bytes * (self._acked + self._lost)
-        return self._lost > SIGNIFICANT * (usual + DATAGRAM_BYTES)
+        usual = self._usual_lost / self._usual_bytes * self._recent
+        return self._recent_lost > SIGNIFICANT * (usual + DATAGRAM_BYTES)

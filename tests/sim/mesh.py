@@ -83,6 +83,8 @@ class Node:
         """Runs this cloud's requests in place of `server_delay` and `answer`."""
         self.events: list[ApplicationEvent] = []
         self.alive = True
+        self.late_s: Callable[[], float] | None = None
+        """How late its threads get their turn on a busy host; what came in the meantime is taken in one go then."""
         self.start()
 
     def start(self) -> None:
@@ -103,6 +105,8 @@ class Node:
         self.engine.set_interfaces(self.links, now)
         self.engine.set_offers(self.offers)
         self.executed: list[RequestId | int] = []
+        self.inbox: list[tuple[InterfaceName, bytes, Address]] = []
+        self.awaits_turn = False
         self.sequence = 0
         self.alive = True
 
@@ -127,6 +131,8 @@ class Node:
         return [event for event in self.events if isinstance(event, ResponseArrived)]
 
     def next_timer(self) -> float:
+        if self.awaits_turn:
+            return float("inf")
         return min(self.engine.next_timer(), *(link.next_timer() for link in self.links.values()))
 
 
@@ -211,13 +217,37 @@ class Mesh:
                 heapq.heappop(self._due).act()
             else:
                 node = alive[index]
-                node.engine.handle_timer(self.now)
-                for link in node.links.values():
-                    link.handle_timer(self.now)
-                self.pump(node)
+                if node.late_s is None:
+                    self._turn(node)
+                else:
+                    self._await_turn(node)
+
+    def _await_turn(self, node: Node) -> None:
+        if not node.awaits_turn:
+            assert node.late_s is not None
+            node.awaits_turn = True
+            self.at(node.late_s(), lambda: self._turn(node))
+
+    def _turn(self, node: Node) -> None:
+        if not node.alive:
+            return
+        node.awaits_turn = False
+        inbox, node.inbox = node.inbox, []
+        for interface, data, source in inbox:
+            node.links[interface].receive_batch(memoryview(data), len(data), source, self.now)
+        node.engine.handle_timer(self.now)
+        for link in node.links.values():
+            link.handle_timer(self.now)
+        self._pump(node)
 
     def pump(self, node: Node) -> None:
-        """Move everything that is ready inside one node, and its datagrams onto the wires."""
+        """Move everything that is ready inside one node, and its datagrams onto the wires; once it has its turn."""
+        if node.late_s is None:
+            self._pump(node)
+        else:
+            self._await_turn(node)
+
+    def _pump(self, node: Node) -> None:
         engine, now = node.engine, self.now
         while True:
             busy = False
@@ -288,7 +318,10 @@ class Mesh:
         node = self.nodes.get(name)
         if node is None or not node.alive:
             return
-        node.links[InterfaceName(interface)].receive_batch(memoryview(data), len(data), source, self.now)
+        if node.late_s is None:
+            node.links[InterfaceName(interface)].receive_batch(memoryview(data), len(data), source, self.now)
+        else:
+            node.inbox.append((InterfaceName(interface), data, source))
         self.pump(node)
 
 

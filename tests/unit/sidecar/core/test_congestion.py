@@ -162,10 +162,11 @@ def test_a_loss_without_a_queue_changes_nothing(cruising: Sender) -> None:
 
 def test_heavy_loss_among_few_bytes_does_not_cut_below_what_the_path_is_known_to_carry(cruising: Sender) -> None:
     cruising.run(2.0, sending=False)  # the application asks for little
-    cruising.control.ceiling.end_round()
+    for _ in range(2):
+        cruising.control.ceiling.end_round(cruising.rtt, cruising.now)
     few = 20 * DATAGRAM_BYTES
     cruising.control.on_sent(cruising.now, few, few)
-    cruising.control.on_lost(10 * DATAGRAM_BYTES, cruising.now, 10 * DATAGRAM_BYTES, cruising.now)
+    cruising.control.on_lost(few, cruising.now, 0, cruising.now)
     assert cruising.control.ceiling.bytes is not None
     assert cruising.control.window >= 0.9 * CUT * RATE * RTT_S
 

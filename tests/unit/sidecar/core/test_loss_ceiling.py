@@ -28,7 +28,7 @@ class World:
             self.rtt.sample(rtt_s, self.now)
             self.ceiling.on_acked(DATAGRAM_BYTES, rtt_s, self.rtt, WANTED, self.now)
         cut = bool(lost) and self.ceiling.on_lost(lost * DATAGRAM_BYTES, self.now, 0, self.rtt, self.now)
-        self.ceiling.end_round()
+        self.ceiling.end_round(self.rtt, self.now)
         return cut
 
 
