@@ -27,6 +27,9 @@ FIRST_PROBE_S = 0.05
 MAX_PROBE_S = 1.0
 """... and back off to this, so that a path that comes back is seen within a second."""
 PROBE_BACKOFF = 1.5
+RETURN_BACKOFF = 1.02
+"""A path that was up is likely to come back, and requests may wait for it: its probes are as far apart as a fiftieth of
+the time that it is down, 0.25 s after ten seconds. Both ends probe, so that the wait is mostly half of that or less."""
 DOWN_FACTOR = 4.0
 """An unstable path is down after this many times the silence that made it unstable ..."""
 DOWN_FLOOR_S = 0.5
@@ -50,6 +53,7 @@ class Path:
         "_probes_out",
         "_rebound",
         "_waiting_since",
+        "_was_up",
         "bytes_sent",
         "candidates",
         "control",
@@ -102,6 +106,7 @@ class Path:
         self._probes_out: dict[int, float] = {}
         self._waiting_since: float | None = None
         self._rebound = False
+        self._was_up = False
 
     @property
     def peer(self) -> NodeName:
@@ -130,7 +135,8 @@ class Path:
             gap = max(FIRST_PROBE_S, self.recovery.rtt.smoothed)
         else:
             gap = self._probe_gap
-            self._probe_gap = min(gap * PROBE_BACKOFF, MAX_PROBE_S)
+            backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
+            self._probe_gap = min(gap * backoff, MAX_PROBE_S)
         self.probe_at = now + gap * rng.uniform(0.9, 1.1)
         return probe_id
 
@@ -238,6 +244,7 @@ class Path:
                 self.probe_at = now + IDLE_PROBE_S
             return False
         self.state = PathState.UP
+        self._was_up = True
         self._probe_gap = FIRST_PROBE_S
         self.probe_at = now + IDLE_PROBE_S
         return True

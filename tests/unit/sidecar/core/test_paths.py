@@ -100,6 +100,21 @@ def test_an_unstable_path_is_probed_fast() -> None:
     assert subject.probe_at <= 101.1 + 1.1 * FIRST_PROBE_S
 
 
+def test_a_path_that_was_up_is_asked_at_least_four_times_a_second_for_ten_seconds() -> None:
+    subject = up()
+    subject.go_down()
+    gaps: list[float] = []
+    while sum(gaps) < 100.0:
+        now = 101.0 + sum(gaps)
+        subject.next_probe(now, RNG)
+        assert subject.probe_at is not None
+        gaps.append(subject.probe_at - now)
+    within = [gap for count, gap in enumerate(gaps) if sum(gaps[:count]) < 10.0]
+    assert max(within) < 0.3
+    assert len(within) < 10.0 / (2 * FIRST_PROBE_S)
+    assert gaps[-1] == pytest.approx(MAX_PROBE_S, rel=0.11)
+
+
 def test_hearing_a_dead_path_hastens_its_probe_but_no_flood_does() -> None:
     subject = new()
     now = 100.0
