@@ -189,6 +189,8 @@ class CongestionController:
         if not rate or self._rtt is None:
             return None
         if self.phase is Phase.STARTUP:
+            if self._queued_rounds:
+                return DRAIN_GAIN * rate  # as if it were full; the next round tells
             return max(STARTUP_GAIN * rate, self._first_window / max(self._rtt.smoothed, 1e-4))
         if self.phase is Phase.DRAIN:
             return DRAIN_GAIN * rate
