@@ -303,6 +303,8 @@ class CongestionController:
             self._believed_before = 0.0
         if self.phase is Phase.STARTUP:
             self._check_full(queued=queued)
+            if standing_s > rtt.minimum + 2 * END_HOST_S:
+                self._enter(Phase.DRAIN)  # longer than a busy host makes wait
         elif self.phase is Phase.DRAIN and self._phase_rounds > DRAIN_ROUNDS:
             self._cruise()
         elif self.phase is Phase.CRUISE:

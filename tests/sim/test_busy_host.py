@@ -53,7 +53,7 @@ def make_late(seed: int, *nodes: Node) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("loss", [0.0, 0.02, 0.05])
+@pytest.mark.parametrize("loss", [0.0, 0.02])
 def test_late_turns_beside_losses_do_not_collapse_the_rate(seed: int, loss: float) -> None:
     times = elapsed(seed, loss)
     assert len(times) == CALLS
