@@ -293,8 +293,10 @@ class ExecutionTable:
     def handle_timer(self, now: float) -> tuple[list[AbandonExecution], list[Reply]]:
         """Give up executions that took too long; they may have run, so their ids stay.
 
-        Returns them, and what those robots are told that still wait.
+        Returns them, and what those robots are told that still wait. Also forgets what no copy can ask for any more,
+        so that answers do not stay in memory when the traffic ends.
         """
+        self._forget_old(now)
         abandoned = []
         replies = []
         while self._timers and self._timers[0][0] <= now:

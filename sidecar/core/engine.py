@@ -35,6 +35,7 @@ from sidecar.core.link_events import (
     PathMtuChanged,
     PeerClosed,
     PeerRestarted,
+    Seek,
     SetPeers,
 )
 from sidecar.core.mapping import MappingTable
@@ -100,6 +101,7 @@ class Engine:
                 self._measurements,
                 self.stats,
                 self._events.append,
+                self._seek,
             )
         )
 
@@ -122,6 +124,9 @@ class Engine:
 
     def _to_link(self, command: PathCommand) -> None:
         self._commands.append((command.path.interface, command))
+
+    def _seek(self, peers: frozenset[NodeName]) -> None:
+        self._commands.append((None, Seek(peers)))
 
     # -- the application's calls ----------------------------------------------------------------------------------
 

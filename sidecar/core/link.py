@@ -19,6 +19,7 @@ from sidecar.core.link_events import (
     Rebind,
     Resend,
     ResetPaths,
+    Seek,
     Send,
     SendAbandon,
     SendClose,
@@ -124,6 +125,11 @@ class Link:
             case ResetPaths(reason):
                 self._keeper.take_all_down(reason)
                 self._probe_what_is_down(now)
+            case Seek(peers):
+                for path in self._paths.values():
+                    if path.peer in peers and path.state is PathState.DOWN:
+                        path.hasten_probe(now)
+                        self._dirty[path.id] = path
             case SetMtu(mtu):
                 self._mtu.set_interface(mtu, self._paths.values(), now)
                 self._dirty.update((path.id, path) for path in self._paths.values())

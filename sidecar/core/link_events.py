@@ -58,6 +58,13 @@ class Rebind:
 
 
 @dataclass(frozen=True, slots=True)
+class Seek:
+    """A request waits for any path to these peers: probe those that are down, however long they have been."""
+
+    peers: frozenset[NodeName]
+
+
+@dataclass(frozen=True, slots=True)
 class SetMtu:
     """The interface's MTU: bytes, IP header included."""
 
@@ -114,7 +121,7 @@ class SendClose:
 
 PathCommand = Send | Resend | SendFinished | SendAbandon | SendForgotten
 """What is for one path."""
-LinkCommand = SetPeers | SetReady | SetCarrier | ResetPaths | Rebind | SetMtu | PathCommand | SendClose
+LinkCommand = SetPeers | SetReady | SetCarrier | ResetPaths | Rebind | Seek | SetMtu | PathCommand | SendClose
 
 
 class FragmentsReceived(NamedTuple):

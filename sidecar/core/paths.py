@@ -147,7 +147,7 @@ class Path:
         return probe_id
 
     def hasten_probe(self, now: float) -> None:
-        """The peer was heard: it may be reachable again. Never closer than FIRST_PROBE_S, whatever the peer sends."""
+        """It is time to ask again. Never sooner than FIRST_PROBE_S after the last time, whoever wishes it."""
         if self.probe_at is not None:
             self.probe_at = min(self.probe_at, max(now, self._probed_at + FIRST_PROBE_S))
 

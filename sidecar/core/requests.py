@@ -67,6 +67,8 @@ class RequestParts:
     measurements: Measurements
     stats: EngineStats
     emit: Callable[[ApplicationEvent], None]
+    seek: Callable[[frozenset[NodeName]], None]
+    """Asks the links to look for a path to any of these peers."""
 
 
 class RequestTable:
@@ -131,6 +133,8 @@ class RequestTable:
         idempotent = request.rule.idempotent
         for path in self._parts.mapping.choose(request.service, servers, idempotent=idempotent):
             self._send_copy(request, path, now)
+        if servers and not request.copies:
+            self._parts.seek(frozenset(servers))
         if idempotent and len({copy.path.peer for copy in request.copies}) == 1:
             heapq.heappush(self._timers, (request.hedge_at, request.id))
         request.choose_observation()

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from sidecar.core import requests as requests_module
@@ -35,6 +37,9 @@ from sidecar.core.rules import ServiceRule
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 
+if TYPE_CHECKING:
+    from protos.model import NodeName
+
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
 SERVERS = {A: WLAN_A, B: WWAN_B}
 RACE = OBSERVED_ONE_IN
@@ -49,12 +54,20 @@ class Table:
         self.routes, self.stats, self.measurements = Routes(), EngineStats(), Measurements()
         self.commands: list[LinkCommand] = []
         self.events: list[ApplicationEvent] = []
+        self.sought: list[frozenset[NodeName]] = []
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
         offers = Offers((self.rule,))
         offers.set_peers([peer(A), peer(B, session=2)])
         mapping = MappingTable(self.routes)
         parts = RequestParts(
-            offers, mapping, self.routes, self.outbox, self.measurements, self.stats, self.events.append
+            offers,
+            mapping,
+            self.routes,
+            self.outbox,
+            self.measurements,
+            self.stats,
+            self.events.append,
+            self.sought.append,
         )
         self.table = RequestTable(parts)
         for known in SERVERS.values():
@@ -452,3 +465,13 @@ def test_a_full_outbox_towards_one_server_sends_to_the_other_only_and_two_full_o
         pass
     table.submit(2, payload=bytes(8_000_000))
     assert table.only_failure().outcome == "rejected"
+
+
+def test_a_request_without_any_path_has_the_links_look_for_one() -> None:
+    table = Table()
+    table.submit(1)
+    assert not table.sought
+    for known in SERVERS.values():
+        table.routes.set_state(known, PathState.DOWN)
+    table.submit(2)
+    assert table.sought == [frozenset((A, B))]
