@@ -41,7 +41,7 @@ class Metrics:
     """All metrics of one control plane."""
 
     def __init__(self) -> None:
-        prometheus_client.disable_created_metrics()  # type: ignore[no-untyped-call]
+        prometheus_client.disable_created_metrics()  # type: ignore[no-untyped-call]  # untyped in the library
         self.registry = prometheus_client.CollectorRegistry()
         self._values = _Values()
         self.solve_duration = prometheus_client.Histogram(

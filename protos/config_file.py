@@ -74,7 +74,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
     """Return the one mapping that the text holds; raises ConfigError."""
     try:
         # The loader derives from SafeLoader: only plain values come out.
-        data = yaml.load(text, Loader=_StrictLoader)  # noqa: S506
+        data = yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - a SafeLoader underneath
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"line {mark.line + 1}" if mark else ""

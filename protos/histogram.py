@@ -66,7 +66,7 @@ class Histogram:
     __slots__ = ("_counts", "_lost")
 
     # Mutable: equal by content, hence not hashable.
-    __hash__ = None  # type: ignore[assignment]
+    __hash__ = None  # type: ignore[assignment]  # Python's own way to say so
 
     def __init__(self) -> None:
         self._counts = [0] * BUCKETS

@@ -65,7 +65,7 @@ def churn(console: Console, folder: Path, length_s: float, seed: int) -> report.
             hands.start()
         clients = {name: _start_client(hands, name, length_s) for name in CLIENTS}
         for client in clients.values():
-            hands.system.wait(f"{client.name} to call", lambda client=client: " sent " in client.log.read_text())  # type: ignore[misc]
+            _wait_until_it_calls(hands, client)
         runner = Runner(hands, schedule, length_s, console.print)
         _play(console, runner, list(clients.values()))
         with console.status("waiting for the last answers"):
@@ -97,6 +97,10 @@ def _play(console: Console, runner: Runner, clients: list[Part]) -> None:
             lines += 1
 
         runner.run(clients, list(OURS), show)
+
+
+def _wait_until_it_calls(hands: Hands, client: Part) -> None:
+    hands.system.wait(f"{client.name} to call", lambda: " sent " in client.log.read_text())
 
 
 def _start_client(hands: Hands, name: str, length_s: float) -> Part:

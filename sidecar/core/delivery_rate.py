@@ -30,8 +30,6 @@ class DeliveryRate:
         "_anchor_at",
         "_anchor_sent_at",
         "_bytes",
-        "_last_at",
-        "_last_sent_at",
         "_limited",
         "_rate",
         "_rounds",
@@ -57,8 +55,6 @@ class DeliveryRate:
         self._bytes = 0
         self._rate = 0.0
         self._limited = True
-        self._last_at = 0.0
-        self._last_sent_at = 0.0
 
     def on_sent(self, now: float) -> None:
         """Something left."""

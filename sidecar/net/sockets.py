@@ -140,7 +140,7 @@ def _set_buffer(sock: socket.socket, forced: int, polite: int, size: int) -> Non
 
 def _bind_to_device(sock: socket.socket, interface: Interface, port: int) -> None:
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.name.encode())
-    sock.bind(("::", port) if sock.family == socket.AF_INET6 else ("0.0.0.0", port))  # noqa: S104
+    sock.bind(("::", port) if sock.family == socket.AF_INET6 else ("0.0.0.0", port))  # noqa: S104 - bound to the device
 
 
 def _bind_to_address(sock: socket.socket, interface: Interface, address: tuple[str, int]) -> None:

@@ -126,7 +126,7 @@ def test_a_flood_on_one_interface_starves_neither_its_own_timers_nor_the_other(t
             looked.append(now)
             handle_timer(now)
 
-        thread.link.handle_timer = noting  # type: ignore[method-assign]
+        thread.link.handle_timer = noting  # type: ignore[method-assign]  # a spy on the running thread
         with subprocess.Popen([sys.executable, "-c", FLOOD, str(thread.port)]) as flood:
             try:
                 beside = robot.beat("/good", CALM_S * 2)

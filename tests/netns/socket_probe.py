@@ -200,7 +200,11 @@ def runs() -> dict[str, Any]:
                 source_seen_by_echo(sock, version)
                 stats = LinkStats(InterfaceName("wlan0"))
                 told: list[int] = []
-                batches = BatchSocket(sock, stats, lambda _, size, told=told: told.append(size))  # type: ignore[misc]
+
+                def note(_: object, size: int, told: list[int] = told) -> None:
+                    told.append(size)
+
+                batches = BatchSocket(sock, stats, note)
                 for segment in (longest, longest + 1):
                     batches.send(Batch(ECHO[version], bytes(9 * segment + 40), segment))
                 answered = 0

@@ -159,6 +159,6 @@ def test_hidden_from_node_lists_and_without_services_of_its_own(mesh: Mesh) -> N
     mesh.start()
     mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
-    node = mesh.robot._loop.node  # type: ignore[union-attr]
+    node = mesh.robot._loop.node  # type: ignore[union-attr]  # a started bridge has one
     assert node.get_name() == "_plr_sidecar_robot_1"
     assert set(graph.scan(node)) == {"/plan"}

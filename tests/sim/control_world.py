@@ -110,7 +110,7 @@ class World:
         """A robot that uses /plan over wlan0 and wwan0."""
         sidecar = self.join(registration(name, Role.ROBOT))
         self.say(sidecar, CandidateSet(interfaces(*(nics or ("wlan0", "wwan0")))))
-        self.say(sidecar, ServiceSet((), (use(**changes),)))  # type: ignore[arg-type]
+        self.say(sidecar, ServiceSet((), (use(**changes),)))  # type: ignore[arg-type]  # passed through
         return sidecar
 
     def cloud(self, name: str, *, capacity: int = 0) -> SimSidecar:

@@ -62,7 +62,7 @@ def play(
     clock = Clock()
     monkeypatch.setattr(module, "time", clock)
     hands = Hands(clock, slow_s)
-    runner = Runner(hands, schedule, length_s, lambda line: None)  # type: ignore[arg-type]
+    runner = Runner(hands, schedule, length_s, lambda line: None)  # type: ignore[arg-type]  # hands that only note what they do
     runner.run([], [], lambda line: None)
     return runner, hands
 

@@ -45,7 +45,7 @@ def plan(*pairs: tuple[InterfaceName, NodeName], predicted: float = 0.01, excess
 
 
 def picture(**notes: object) -> Picture:
-    return Picture(Problem(()), {KEY: BlockNotes(**notes)})  # type: ignore[arg-type]
+    return Picture(Problem(()), {KEY: BlockNotes(**notes)})  # type: ignore[arg-type]  # passed through
 
 
 def pairs(mapping: ServiceMapping) -> list[tuple[str, str]]:
