@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 
 from examples.request_log import RequestLog, RequestRecord
+from examples.stop_signal import StopSignal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -103,9 +105,13 @@ class RobotClient:
         self._find_pending: Callable[[int], Any] = self._client.get_pending_request
         self._client.get_pending_request = self._response_arrived
 
-    def wait_for_server(self, timeout_s: float) -> bool:
-        """Whether a server for the service was found in time."""
-        return bool(self._client.wait_for_service(timeout_sec=timeout_s))
+    def wait_for_server(self, timeout_s: float, stop: StopSignal) -> bool:
+        """Whether a server for the service was found in time, and before the stop."""
+        end = time.monotonic() + timeout_s
+        while not (found := bool(self._client.wait_for_service(timeout_sec=CHECK_PERIOD_S))):
+            if stop.came or time.monotonic() > end:
+                break
+        return found
 
     def send(self) -> None:
         """Send the next request."""
@@ -137,39 +143,37 @@ class RobotClient:
 
 def run(name: str, service_type: Any, service: str, workload: Workload, options: argparse.Namespace) -> int:
     """Run a robot until its time is over or it is interrupted. Returns the exit code."""
-    rclpy.init()
+    stop = StopSignal()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(name)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     robot = RobotClient(node, service_type, service, workload, options.deadline_ms, options.queue_depth)
-    interrupted = False
     try:
-        if not robot.wait_for_server(options.wait_s):
-            if not rclpy.ok():
+        if not robot.wait_for_server(options.wait_s, stop):
+            if stop.came:
                 return EXIT_INTERRUPTED
             print(f"no server for {service} within {options.wait_s:g} s")
             return EXIT_FLAWED
-        _drive(executor, robot, options)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        interrupted = True
+        _drive(executor, robot, options, stop)
     finally:
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
     _report(robot.log, options)
-    if interrupted:
+    if stop.came:
         return EXIT_INTERRUPTED
     return EXIT_OK if robot.log.flawless() else EXIT_FLAWED
 
 
-def _drive(executor: Any, robot: RobotClient, options: argparse.Namespace) -> None:
-    """Send at the rate for the duration, then wait for what is still missing."""
+def _drive(executor: Any, robot: RobotClient, options: argparse.Namespace, stop: StopSignal) -> None:
+    """Send at the rate for the duration, then wait for what is still missing; ends early when told to stop."""
     period_s = 1.0 / options.rate
     count = max(1, round(options.duration * options.rate))
     start = time.monotonic()
     end = start + options.duration + options.grace_s
     next_progress = start + PROGRESS_PERIOD_S
-    while (now := time.monotonic()) < end:
+    while (now := time.monotonic()) < end and not stop.came:
         sent = len(robot.log.records)
         if sent == count and robot.log.missing == 0:
             break
@@ -186,7 +190,7 @@ def _drive(executor: Any, robot: RobotClient, options: argparse.Namespace) -> No
             next_progress = now + PROGRESS_PERIOD_S
     # A second answer to the last requests would come about now.
     settle = time.monotonic() + period_s
-    while time.monotonic() < settle:
+    while time.monotonic() < settle and not stop.came:
         executor.spin_once(timeout_sec=CHECK_PERIOD_S)
 
 

@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from examples.stop_signal import StopSignal
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
-CHECK_PERIOD_S = 1.0
+CHECK_PERIOD_S = 0.2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,18 +80,16 @@ def run(
     options: argparse.Namespace,
 ) -> int:
     """Serve until interrupted. Returns the exit code."""
-    rclpy.init()
+    stop = StopSignal()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(options.name or name)
     server = Server(node, service_type, service, answer, options)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     print(f"serving {node.resolve_service_name(service)}", flush=True)
     try:
-        # Not rclpy.spin: about one SIGTERM in a hundred comes at a moment in which its wait, without end, misses it.
-        while rclpy.ok():
+        while not stop.came:
             executor.spin_once(timeout_sec=CHECK_PERIOD_S)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     finally:
         executor.shutdown()
         node.destroy_node()
