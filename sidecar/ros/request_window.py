@@ -5,8 +5,11 @@ one out without a trace. How many lie there cannot be asked, but follows from th
 are taken in order, so an answer tells that its request and all earlier ones have left the queue. At most `size` later
 ones are let through; the rest wait here.
 
-A server that works on many requests at once would be slowed down by that. It shows by answering out of order, or by
-answering nothing for a while although the window is full: then the window doubles, and stays so.
+A server that works on many requests at once would be slowed down by that. It shows by answering out of order: then the
+window doubles, and stays so. It doubles too when nothing was answered for a while although it is full, but only so far:
+a server that was killed is silent as well, and DDS keeps all that was sent to it until its lease ends, about 20 s, and
+for good a buffer, as long as the longest request, for each of as many as it ever held. Past MAX_SILENT_SIZE a silent
+server gets one request in STALL_S.
 
 What is late already when its turn comes must not keep the server from what is not: after an outage a backlog comes
 first and what the robot asks now right behind it, and no request can be called back from a server's queue. So only one
@@ -29,6 +32,8 @@ FIRST_SIZE = 8
 """Below rmw's default depth of 10: the server may have other clients."""
 MAX_SIZE = 1024
 """As many as the bridge's own queue of answers holds."""
+MAX_SILENT_SIZE = 32
+"""As far as silence alone opens the window."""
 STALL_S = 1.0
 """A server that takes its requests one by one and needs longer than this for one is late for any deadline."""
 LATE_ONLY_S = 2.0
@@ -95,8 +100,12 @@ class RequestWindow(Generic[T]):
 
     def release(self, now: float) -> Iterator[T]:
         """Yield waiting requests while the window is open; report each with `sent` before the next."""
-        if self._waiting and self._is_stalled(now):
-            self._grow(now)
+        if self._waiting and len(self._unseen) >= self.size and now - self._progress_at >= STALL_S:
+            self._progress_at = now
+            if self.size < MAX_SILENT_SIZE:
+                self._grow()
+            else:
+                self._unseen.popleft()  # most likely lost; an answer to whatever is sent next opens the window
         while len(self._unseen) < self.size:
             found = self._waiting.take(now, late_too=self._late_may_go(now))
             if found is None:
@@ -118,7 +127,7 @@ class RequestWindow(Generic[T]):
         self._progress_at = now
         self.given_up(number)
         if number < self._highest_answered:
-            self._grow(now)
+            self._grow()
             return
         self._highest_answered = number
         while self._unseen and self._unseen[0] <= number:
@@ -143,11 +152,5 @@ class RequestWindow(Generic[T]):
         only_late = self._only_late_since is not None and now - self._only_late_since >= LATE_ONLY_S
         return self._late_number is None or now >= self._next_late_at or only_late
 
-    def _is_stalled(self, now: float) -> bool:
-        return len(self._unseen) >= self.size and now - self._progress_at >= STALL_S
-
-    def _grow(self, now: float) -> None:
-        self._progress_at = now
-        if self.size >= MAX_SIZE and len(self._unseen) >= self.size:
-            self._unseen.clear()  # nothing is known of them; rather lose some than stop for good
+    def _grow(self) -> None:
         self.size = min(self.size * 2, MAX_SIZE)

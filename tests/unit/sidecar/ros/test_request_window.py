@@ -9,7 +9,7 @@ from itertools import count
 import pytest
 
 from sidecar.core.priority import Priority
-from sidecar.ros.request_window import FIRST_SIZE, LATE_ONLY_S, MAX_SIZE, STALL_S, RequestWindow
+from sidecar.ros.request_window import FIRST_SIZE, LATE_ONLY_S, MAX_SILENT_SIZE, STALL_S, RequestWindow
 
 _items = count()
 
@@ -67,19 +67,33 @@ def test_a_silent_server_gets_more_after_a_while(numbers: deque[int]) -> None:
     assert release(window, 5.0 + STALL_S * 0.9, numbers) == []
     assert len(release(window, 5.0 + STALL_S, numbers)) == 8
     assert len(release(window, 5.0 + 2 * STALL_S, numbers)) == 16
-    assert len(release(window, 5.0 + 3 * STALL_S, numbers)) == 28
-    assert window.next_due() is None
+    assert window.size == MAX_SILENT_SIZE
 
 
-def test_a_server_that_never_answers_does_not_stop_the_window_for_good(numbers: deque[int]) -> None:
+def test_a_server_that_never_answers_gets_one_request_at_a_time_but_is_not_given_up(numbers: deque[int]) -> None:
     window: RequestWindow[int] = RequestWindow()
-    fill(window, 5 * MAX_SIZE)
+    fill(window, 100)
     now = 0.0
-    while window.waiting:
-        release(window, now, numbers)
+    sent = len(release(window, now, numbers))
+    while sent < 100:
         due = window.next_due()
-        now = now if due is None else due
-        assert now < 100 * STALL_S
+        assert due is not None
+        now = due
+        sent += len(release(window, now, numbers))
+        assert sent <= MAX_SILENT_SIZE + now / STALL_S
+    assert now == pytest.approx((2 + 100 - MAX_SILENT_SIZE) * STALL_S)
+
+
+def test_a_server_that_comes_back_opens_the_window_by_its_first_answer(numbers: deque[int]) -> None:
+    window: RequestWindow[int] = RequestWindow()
+    fill(window, 1000)
+    now = 0.0
+    for _ in range(20):
+        release(window, now, numbers)
+        now += STALL_S
+    (number,) = release(window, now, numbers)
+    window.answered(number, now)
+    assert len(release(window, now, numbers)) == window.size == MAX_SILENT_SIZE
 
 
 def test_a_window_that_is_not_full_does_not_grow(numbers: deque[int]) -> None:
