@@ -5,11 +5,9 @@ one out without a trace. How many lie there cannot be asked, but follows from th
 are taken in order, so an answer tells that its request and all earlier ones have left the queue. At most `size` later
 ones are let through; the rest wait here.
 
-A server that works on many requests at once would be slowed down by that. It shows by answering out of order: then the
-window doubles, and stays so. It doubles too when nothing was answered for a while although it is full, but only so far:
-a server that was killed is silent as well, and DDS keeps all that was sent to it until its lease ends, about 20 s, and
-for good a buffer, as long as the longest request, for each of as many as it ever held. Past MAX_SILENT_SIZE a silent
-server gets one request in STALL_S.
+A server that works on many requests at once would be slowed down by that. It shows by answering out of order, or by
+answering nothing for a while although the window is full: then the window doubles, and stays so. At its largest, a
+silent server gets one request in STALL_S.
 
 What is late already when its turn comes must not keep the server from what is not: after an outage a backlog comes
 first and what the robot asks now right behind it, and no request can be called back from a server's queue. So only one
@@ -30,10 +28,10 @@ if TYPE_CHECKING:
 
 FIRST_SIZE = 8
 """Below rmw's default depth of 10: the server may have other clients."""
-MAX_SIZE = 1024
-"""As many as the bridge's own queue of answers holds."""
-MAX_SILENT_SIZE = 32
-"""As far as silence alone opens the window."""
+MAX_SIZE = 64
+"""Also what DDS keeps of requests and of answers, and so what a killed server costs: until its lease ends, about 20 s,
+no request counts as delivered to all, and for good DDS keeps as many buffers as it held requests, each as long as the
+longest of them."""
 STALL_S = 1.0
 """A server that takes its requests one by one and needs longer than this for one is late for any deadline."""
 LATE_ONLY_S = 2.0
@@ -102,7 +100,7 @@ class RequestWindow(Generic[T]):
         """Yield waiting requests while the window is open; report each with `sent` before the next."""
         if self._waiting and len(self._unseen) >= self.size and now - self._progress_at >= STALL_S:
             self._progress_at = now
-            if self.size < MAX_SILENT_SIZE:
+            if self.size < MAX_SIZE:
                 self._grow()
             else:
                 self._unseen.popleft()  # most likely lost; an answer to whatever is sent next opens the window

@@ -20,17 +20,15 @@ from rclpy.signals import SignalHandlerOptions
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-QUEUE_DEPTH = 1024
-"""Requests or answers that rmw keeps until the loop takes them. The default of 10 loses some of 100 sent at once."""
 LONGEST_WAIT_S = 3600.0
 _NANOSECONDS = 1_000_000_000
 
 
-def service_qos() -> Any:
-    """Return the profile of the bridge's own services and clients: the default one, but deep."""
+def service_qos(depth: int) -> Any:
+    """Return the profile of the bridge's own services and clients: the default one, but for the depth of its queues."""
     return QoSProfile(
         history=qos_profile_services_default.history,
-        depth=QUEUE_DEPTH,
+        depth=depth,
         reliability=qos_profile_services_default.reliability,
         durability=qos_profile_services_default.durability,
     )

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from protos.model import ServiceName
     from sidecar.ros.types import ServiceType
 
+QUEUE_DEPTH = 1024
+"""Requests that rmw keeps until the loop takes them. The default of 10 loses some of 100 sent at once."""
 TAKEN_AT_ONCE = 32
 """Requests taken from one service before the others have their turn."""
 
@@ -36,7 +38,9 @@ class ServiceProxy:
         self._on_request = on_request
         self._on_bad_request = on_bad_request
         try:
-            self._service = node.create_service(service_type.service, name, _unused, qos_profile=service_qos())
+            self._service = node.create_service(
+                service_type.service, name, _unused, qos_profile=service_qos(QUEUE_DEPTH)
+            )
         # rclpy validates names with exceptions of several unrelated classes.
         except Exception as error:
             raise RosBridgeError(f"rmw refuses service {name} of type {service_type.name}: {error}") from error

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.rcl import Message, send_request, take_response
-from sidecar.ros.request_window import RequestWindow
+from sidecar.ros.request_window import MAX_SIZE, RequestWindow
 from sidecar.ros.ros_loop import service_qos
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class ServiceRunner:
         self.endpoints: frozenset[bytes] = frozenset()
         """DDS ids of the server, to tell a restarted one from the old one."""
         try:
-            self._client = node.create_client(service_type.service, name, qos_profile=service_qos())
+            self._client = node.create_client(service_type.service, name, qos_profile=service_qos(MAX_SIZE))
         # rclpy validates names with exceptions of several unrelated classes.
         except Exception as error:
             raise RosBridgeError(f"rmw refuses a client of {name}, type {service_type.name}: {error}") from error

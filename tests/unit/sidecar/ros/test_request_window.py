@@ -9,7 +9,7 @@ from itertools import count
 import pytest
 
 from sidecar.core.priority import Priority
-from sidecar.ros.request_window import FIRST_SIZE, LATE_ONLY_S, MAX_SILENT_SIZE, STALL_S, RequestWindow
+from sidecar.ros.request_window import FIRST_SIZE, LATE_ONLY_S, MAX_SIZE, STALL_S, RequestWindow
 
 _items = count()
 
@@ -61,13 +61,15 @@ def test_answers_out_of_order_widen_the_window(numbers: deque[int]) -> None:
 
 def test_a_silent_server_gets_more_after_a_while(numbers: deque[int]) -> None:
     window: RequestWindow[int] = RequestWindow()
-    fill(window, 60)
+    fill(window, 200)
     assert len(release(window, 5.0, numbers)) == 8
     assert window.next_due() == 5.0 + STALL_S
     assert release(window, 5.0 + STALL_S * 0.9, numbers) == []
     assert len(release(window, 5.0 + STALL_S, numbers)) == 8
     assert len(release(window, 5.0 + 2 * STALL_S, numbers)) == 16
-    assert window.size == MAX_SILENT_SIZE
+    assert len(release(window, 5.0 + 3 * STALL_S, numbers)) == 32
+    assert window.size == MAX_SIZE
+    assert len(release(window, 5.0 + 4 * STALL_S, numbers)) == 1
 
 
 def test_a_server_that_never_answers_gets_one_request_at_a_time_but_is_not_given_up(numbers: deque[int]) -> None:
@@ -80,8 +82,8 @@ def test_a_server_that_never_answers_gets_one_request_at_a_time_but_is_not_given
         assert due is not None
         now = due
         sent += len(release(window, now, numbers))
-        assert sent <= MAX_SILENT_SIZE + now / STALL_S
-    assert now == pytest.approx((2 + 100 - MAX_SILENT_SIZE) * STALL_S)
+        assert sent <= MAX_SIZE + now / STALL_S
+    assert now == pytest.approx((3 + 100 - MAX_SIZE) * STALL_S)
 
 
 def test_a_server_that_comes_back_opens_the_window_by_its_first_answer(numbers: deque[int]) -> None:
@@ -93,7 +95,7 @@ def test_a_server_that_comes_back_opens_the_window_by_its_first_answer(numbers: 
         now += STALL_S
     (number,) = release(window, now, numbers)
     window.answered(number, now)
-    assert len(release(window, now, numbers)) == window.size == MAX_SILENT_SIZE
+    assert len(release(window, now, numbers)) == window.size == MAX_SIZE
 
 
 def test_a_window_that_is_not_full_does_not_grow(numbers: deque[int]) -> None:
