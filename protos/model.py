@@ -39,6 +39,9 @@ Address = tuple[str, int]
 TOKEN_BYTES = 16
 """Size of the stable secret of a sidecar."""
 
+MAX_CREDENTIAL_BYTES = 2048
+"""Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
+
 
 class Role(enum.Enum):
     """What a sidecar is for."""
@@ -110,6 +113,7 @@ class Peer:
     candidates: tuple[Candidate, ...] = ()
     offers: tuple[ServiceOffer, ...] = ()
     draining: bool = False
+    credential: bytes = field(default=b"", repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +174,7 @@ class Registration:
     software_version: str
     peers_version: Version = Version(0)
     mapping_version: Version = Version(0)
+    credential: bytes = field(default=b"", repr=False)
 
 
 @dataclass(frozen=True, slots=True)

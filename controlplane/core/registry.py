@@ -102,6 +102,7 @@ class Sidecar:
             candidates=self.candidates or (),
             offers=self.offers,
             draining=self.draining,
+            credential=self.registration.credential,
         )
 
 

@@ -42,7 +42,7 @@ def status_from_proto(message: admin_pb2.GetStatusResponse) -> tuple[SidecarStat
 
 
 def status_to_proto(sidecars: Iterable[SidecarStatus]) -> admin_pb2.GetStatusResponse:
-    """Encode the status of all sidecars, without their tokens."""
+    """Encode the status of all sidecars, without their tokens and credentials."""
     return admin_pb2.GetStatusResponse(sidecars=map(_sidecar_to_proto, sidecars))
 
 
@@ -62,7 +62,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
 
 def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
     return admin_pb2.SidecarStatus(
-        peer=peer_to_proto(dataclasses.replace(status.peer, token=b"")),
+        peer=peer_to_proto(dataclasses.replace(status.peer, token=b"", credential=b"")),
         connected=status.connected,
         lease_left_us=microseconds(status.lease_left_s),
         software_version=clean_text(status.software_version),

@@ -26,6 +26,7 @@ from protos.convert.reports import report_from_proto, report_to_proto
 from protos.convert.types import (
     candidate_to_proto,
     candidates_from_proto,
+    credential_from_proto,
     offer_to_proto,
     offers_from_proto,
     peer_from_proto,
@@ -199,6 +200,7 @@ def _registration_from_proto(message: control_pb2.Register) -> Registration:
         software_version=text(message.software_version, "software_version"),
         peers_version=version(message.peers_version, "peers_version"),
         mapping_version=version(message.mapping_version, "mapping_version"),
+        credential=credential_from_proto(message.credential),
     )
 
 
@@ -213,6 +215,7 @@ def _registration_to_proto(value: Registration) -> control_pb2.Register:
         software_version=clean_text(value.software_version),
         peers_version=value.peers_version,
         mapping_version=value.mapping_version,
+        credential=value.credential,
     )
 
 

@@ -27,7 +27,7 @@ MAX_USES = 1024
 """Services one robot sidecar carries."""
 
 MAX_PEERS = 4096
-"""Peers in one set: with 300 bytes each it still fits gRPC's default message of 4 MiB."""
+"""Peers in one set: with 1 kB each, most of it the credential, it still fits gRPC's default message of 4 MiB."""
 
 MAX_REMOVED = 4096
 """Removal notices in one set."""

@@ -23,6 +23,7 @@ from protos.convert.fields import (
 from protos.errors import DecodeError
 from protos.histogram import LAYOUT, Histogram
 from protos.model import (
+    MAX_CREDENTIAL_BYTES,
     TOKEN_BYTES,
     Address,
     Candidate,
@@ -161,7 +162,15 @@ def peer_from_proto(message: types_pb2.Peer, *, with_token: bool = True) -> Peer
         candidates=candidates_from_proto(message.candidates),
         offers=offers_from_proto(message.offers),
         draining=message.draining,
+        credential=credential_from_proto(message.credential),
     )
+
+
+def credential_from_proto(value: bytes) -> bytes:
+    """Check the size of a credential; what stands in it is for the peers to judge."""
+    if len(value) > MAX_CREDENTIAL_BYTES:
+        raise DecodeError(f"credential has {len(value)} bytes, more than {MAX_CREDENTIAL_BYTES}")
+    return value
 
 
 def session_from_proto(value: int) -> SessionId:
@@ -182,6 +191,7 @@ def peer_to_proto(peer: Peer) -> types_pb2.Peer:
         candidates=map(candidate_to_proto, peer.candidates),
         offers=map(offer_to_proto, peer.offers),
         draining=peer.draining,
+        credential=peer.credential,
     )
 
 

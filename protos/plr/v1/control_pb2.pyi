@@ -135,6 +135,7 @@ class Register(_message.Message):
     SOFTWARE_VERSION_FIELD_NUMBER: _builtins.int
     PEERS_VERSION_FIELD_NUMBER: _builtins.int
     MAPPING_VERSION_FIELD_NUMBER: _builtins.int
+    CREDENTIAL_FIELD_NUMBER: _builtins.int
     protocol_version: _builtins.int
     name: _builtins.str
     role: _types_pb2.Role.ValueType
@@ -145,6 +146,8 @@ class Register(_message.Message):
     peers_version: _builtins.int
     """What it holds already (from disk or an earlier stream); 0 means nothing."""
     mapping_version: _builtins.int
+    credential: _builtins.bytes
+    """What this run says of itself to its peers, signed by itself (protos/credential.py)."""
     def __init__(
         self,
         *,
@@ -157,10 +160,11 @@ class Register(_message.Message):
         software_version: _builtins.str = ...,
         peers_version: _builtins.int = ...,
         mapping_version: _builtins.int = ...,
+        credential: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["incarnation", b"incarnation", "mapping_version", b"mapping_version", "name", b"name", "peers_version", b"peers_version", "protocol_version", b"protocol_version", "role", b"role", "session", b"session", "software_version", b"software_version", "token", b"token"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["credential", b"credential", "incarnation", b"incarnation", "mapping_version", b"mapping_version", "name", b"name", "peers_version", b"peers_version", "protocol_version", b"protocol_version", "role", b"role", "session", b"session", "software_version", b"software_version", "token", b"token"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -186,6 +186,7 @@ class Peer(_message.Message):
     CANDIDATES_FIELD_NUMBER: _builtins.int
     OFFERS_FIELD_NUMBER: _builtins.int
     DRAINING_FIELD_NUMBER: _builtins.int
+    CREDENTIAL_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     role: Global___Role.ValueType
     session: _builtins.int
@@ -195,6 +196,8 @@ class Peer(_message.Message):
     incarnation: _builtins.int
     """Grows with every start of the sidecar."""
     draining: _builtins.bool
+    credential: _builtins.bytes
+    """What this run says of itself, signed by itself (protos/credential.py); opaque to the control plane, which relays it."""
     @_builtins.property
     def candidates(self) -> _containers.RepeatedCompositeFieldContainer[Global___Candidate]: ...
     @_builtins.property
@@ -210,10 +213,11 @@ class Peer(_message.Message):
         candidates: _abc.Iterable[Global___Candidate] | None = ...,
         offers: _abc.Iterable[Global___ServiceOffer] | None = ...,
         draining: _builtins.bool = ...,
+        credential: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "draining", b"draining", "incarnation", b"incarnation", "name", b"name", "offers", b"offers", "role", b"role", "session", b"session", "token", b"token"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "credential", b"credential", "draining", b"draining", "incarnation", b"incarnation", "name", b"name", "offers", b"offers", "role", b"role", "session", b"session", "token", b"token"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from protos.convert.fields import MAX_CAPACITY, MAX_DURATION_S, MAX_EVENTS, MAX_VERSION
 from protos.histogram import BUCKETS, MAX_COUNT, Histogram
 from protos.model import (
+    MAX_CREDENTIAL_BYTES,
     PROTOCOL_VERSION,
     TOKEN_BYTES,
     Ack,
@@ -63,6 +64,7 @@ uint64 = st.integers(0, (1 << 64) - 1)
 versions = st.integers(0, MAX_VERSION).map(Version)
 sessions = st.integers(1, (1 << 64) - 1).map(SessionId)
 tokens = st.binary(min_size=TOKEN_BYTES, max_size=TOKEN_BYTES)
+credentials = st.binary(max_size=MAX_CREDENTIAL_BYTES)
 durations = st.integers(1, round(MAX_DURATION_S * 1e6)).map(lambda us: us / 1_000_000)
 probabilities = st.floats(0.0, 1.0)
 events = st.integers(0, MAX_EVENTS)
@@ -120,6 +122,7 @@ peers = st.builds(
     candidate_tuples(),
     _tuples(offers, by="name"),
     st.booleans(),
+    credentials,
 )
 registrations = st.builds(
     Registration,
@@ -132,6 +135,7 @@ registrations = st.builds(
     texts,
     versions,
     versions,
+    credentials,
 )
 latencies = st.builds(LatencyReport, interface_names, node_names, service_names, histograms(), histograms())
 paths = st.builds(PathReport, interface_names, node_names, st.booleans(), histograms(), events, events)
@@ -172,7 +176,7 @@ control_messages: st.SearchStrategy[ControlMessage] = st.one_of(welcomes, peer_s
 resource_statuses = st.builds(ResourceStatus, versions, versions, st.sampled_from(SyncState), texts)
 statuses = st.builds(
     SidecarStatus,
-    peers.map(lambda peer: dataclasses.replace(peer, token=b"")),
+    peers.map(lambda peer: dataclasses.replace(peer, token=b"", credential=b"")),
     st.booleans(),
     durations | st.just(0.0),
     texts,

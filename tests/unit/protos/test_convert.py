@@ -21,6 +21,7 @@ from protos.convert import (
 from protos.convert.fields import MAX_CANDIDATES, MAX_STRING_BYTES, MAX_VERSION, clean_text
 from protos.errors import DecodeError
 from protos.model import (
+    MAX_CREDENTIAL_BYTES,
     Ack,
     Candidate,
     CandidateKind,
@@ -66,10 +67,11 @@ def test_statuses_round_trip(statuses: list[SidecarStatus]) -> None:
 
 def test_a_status_never_carries_a_token() -> None:
     secret = bytes(range(16))
-    peer = Peer(NodeName("robot"), Role.ROBOT, SessionId(1), secret, incarnation=1)
+    peer = Peer(NodeName("robot"), Role.ROBOT, SessionId(1), secret, incarnation=1, credential=b"signed")
     message = status_to_proto([SidecarStatus(peer, connected=True, lease_left_s=1.0, software_version="1")])
     assert secret not in message.SerializeToString()
     assert status_from_proto(message)[0].peer.token == b""
+    assert status_from_proto(message)[0].peer.credential == b""
 
 
 def register(**changes: Any) -> control_pb2.SidecarMessage:
@@ -136,6 +138,7 @@ def test_the_samples_that_the_next_test_breaks_are_good() -> None:
         (register(session=0), "session"),
         (register(token=b""), "token"),
         (register(token=bytes(17)), "token"),
+        (register(credential=bytes(MAX_CREDENTIAL_BYTES + 1)), "credential"),
         (register(software_version="1\x1b[2J"), "software_version"),
         (register(peers_version=MAX_VERSION + 1), "peers_version"),
         (candidates({"interface_id": 256}), "interface_id"),
