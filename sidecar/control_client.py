@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Protocol
 import grpc
 
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
-from protos.convert.fields import clean_text
 from protos.errors import DecodeError
 from protos.model import CandidateSet, PeerSet, Report, ResourceKind, ServiceSet, Welcome
+from protos.names import clean_text
 from protos.plr.v1 import control_pb2_grpc
 from sidecar.core.control_session import Apply
 from sidecar.outage_log import OutageLog

@@ -10,18 +10,17 @@ from protos.convert.fields import (
     MAX_PATHS,
     MAX_SIDECARS,
     MAX_USES,
-    clean_text,
     duration,
     each,
     known,
     microseconds,
-    text,
     version,
 )
 from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
 from protos.convert.reports import path_from_proto, path_to_proto
 from protos.convert.types import peer_from_proto, peer_to_proto, use_from_proto, use_to_proto
 from protos.model import ResourceStatus, SidecarStatus, SyncState
+from protos.names import clean_text, text
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:

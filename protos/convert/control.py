@@ -11,13 +11,10 @@ from protos.convert.fields import (
     MAX_REMOVED,
     MAX_STUN_SERVERS,
     MAX_USES,
-    clean_text,
     duration,
     each,
     known,
     microseconds,
-    node_name,
-    text,
     unique,
     version,
 )
@@ -57,6 +54,7 @@ from protos.model import (
     SidecarMessage,
     Welcome,
 )
+from protos.names import clean_text, node_name, text
 from protos.plr.v1 import control_pb2
 
 _RESOURCES = {

@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-from protos.convert.fields import (
-    MAX_EVENTS,
-    MAX_LATENCIES,
-    MAX_OUTCOMES,
-    MAX_PATHS,
-    at_most,
-    each,
-    interface_name,
-    node_name,
-    service_name,
-)
+from protos.convert.fields import MAX_EVENTS, MAX_LATENCIES, MAX_OUTCOMES, MAX_PATHS, at_most, each
 from protos.convert.types import histogram_from_proto, histogram_to_proto
 from protos.model import LatencyReport, OutcomeReport, PathReport, Report
+from protos.names import interface_name, node_name, service_name
 from protos.plr.v1 import control_pb2
 
 

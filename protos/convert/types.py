@@ -12,12 +12,8 @@ from protos.convert.fields import (
     at_most,
     duration,
     each,
-    interface_name,
     known,
     microseconds,
-    node_name,
-    service_name,
-    type_name,
     unique,
 )
 from protos.errors import DecodeError
@@ -35,6 +31,7 @@ from protos.model import (
     ServiceUse,
     SessionId,
 )
+from protos.names import interface_name, node_name, service_name, type_name
 from protos.plr.v1 import types_pb2
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from protos.convert import (
     status_from_proto,
     status_to_proto,
 )
-from protos.convert.fields import MAX_CANDIDATES, MAX_STRING_BYTES, MAX_VERSION, clean_text
+from protos.convert.fields import MAX_CANDIDATES, MAX_VERSION
 from protos.errors import DecodeError
 from protos.model import (
     MAX_CREDENTIAL_BYTES,
@@ -39,6 +39,7 @@ from protos.model import (
     SidecarStatus,
     Version,
 )
+from protos.names import MAX_STRING_BYTES, clean_text
 from protos.plr.v1 import admin_pb2, control_pb2, types_pb2
 from tests.unit.protos import message_strategies as some
 
