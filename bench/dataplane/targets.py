@@ -90,5 +90,11 @@ TARGETS = (
         "first request submitted once a path is seen to be up again after 10 s without, over the P99 before",
         at_most=1.25,
     ),
+    Target("flood_lost", "requests lost while 20000 junk datagrams a second come", at_most=0),
+    Target(
+        "flood_p99_over_allowed",
+        "P99 meanwhile, over what is allowed: 5 ms more than undisturbed, or twice as much",
+        at_most=1,
+    ),
     Target("tcp_share_ratio", "goodput of one TCP flow over ours at one bottleneck", at_least=0.25, at_most=4),
 )

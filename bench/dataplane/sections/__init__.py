@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.dataplane.sections import blackhole, goodput, loss, one_way, outage, overload, ros_calls, share
+from bench.dataplane.sections import blackhole, flood, goodput, loss, one_way, outage, overload, ros_calls, share
 
 SECTIONS = (
     one_way.SECTION,
@@ -13,5 +13,6 @@ SECTIONS = (
     overload.SECTION,
     outage.SECTION,
     share.SECTION,
+    flood.SECTION,
 )
 """In the order in which they run."""

@@ -1,0 +1,89 @@
+"""Junk for a sidecar's port: datagrams that nobody should take, of every kind that costs something else to refuse."""
+
+from __future__ import annotations
+
+import enum
+from typing import TYPE_CHECKING
+
+from sidecar.core.frame import HEADER_BYTES, MAX_DATAGRAM_BYTES
+
+if TYPE_CHECKING:
+    import random
+    from collections.abc import Sequence
+
+LONGEST_BYTES = 1400
+"""Fits every path of the lab."""
+_NUMBER = slice(HEADER_BYTES - 8, HEADER_BYTES)
+"""Where the packet number stands in the clear header."""
+
+
+class JunkKind(enum.StrEnum):
+    """What the junk looks like."""
+
+    NOISE = "noise"
+    """Random bytes."""
+    HEADED = "headed"
+    """The clear header of a datagram seen on the way, another packet number, random bytes."""
+    FLIPPED = "flipped"
+    """A datagram seen on the way, one bit of it changed."""
+    REPLAYED = "replayed"
+    """A datagram seen on the way, as it is."""
+
+
+def make_junk(kind: JunkKind, seen: Sequence[bytes], count: int, rng: random.Random) -> list[bytes]:
+    """Return `count` datagrams; `seen` are real ones, needed for all kinds but NOISE."""
+    return [_one(kind, seen, rng) for _ in range(count)]
+
+
+def _one(kind: JunkKind, seen: Sequence[bytes], rng: random.Random) -> bytes:
+    match kind:
+        case JunkKind.NOISE:
+            return noise(rng)
+        case JunkKind.HEADED:
+            return headed(rng.choice(seen), rng)
+        case JunkKind.FLIPPED:
+            return flipped(rng.choice(seen), rng)
+        case JunkKind.REPLAYED:
+            return rng.choice(seen)
+
+
+def noise(rng: random.Random) -> bytes:
+    """Return random bytes, a few or many."""
+    return rng.randbytes(rng.choice((rng.randint(1, 64), rng.randint(1, LONGEST_BYTES))))
+
+
+def headed(datagram: bytes, rng: random.Random) -> bytes:
+    """Return a live session's header with a packet number that may come next, and random bytes of any length."""
+    header = bytearray(datagram[:HEADER_BYTES])
+    number = int.from_bytes(header[_NUMBER], "big") + rng.randint(1, 1 << rng.randint(1, 40))
+    header[_NUMBER] = (number & (1 << 64) - 1).to_bytes(8, "big")
+    return bytes(header) + rng.randbytes(rng.choice((len(datagram) - HEADER_BYTES, rng.randint(0, 1000))))
+
+
+def flipped(datagram: bytes, rng: random.Random) -> bytes:
+    """Return the datagram with one bit changed."""
+    changed = bytearray(datagram)
+    bit = rng.randrange(8 * len(changed))
+    changed[bit >> 3] ^= 1 << (bit & 7)
+    return bytes(changed)
+
+
+def mangled(datagram: bytes, rng: random.Random) -> bytes:
+    """Return the datagram cut, stretched, with bytes changed, doubled or swapped: whatever a fuzzer thinks of."""
+    changed = bytearray(datagram)
+    for _ in range(rng.randint(1, 4)):
+        where = rng.randint(0, len(changed))
+        match rng.randrange(6):
+            case 0:
+                del changed[where:]
+            case 1:
+                changed[where:where] = rng.randbytes(rng.randint(1, 40))
+            case 2:
+                del changed[where : where + rng.randint(1, 40)]
+            case 3 if where < len(changed):
+                changed[where] = rng.choice((0, 1, 127, 128, 255, rng.randrange(256)))
+            case 4 if where < len(changed):
+                changed[where] ^= 1 << rng.randrange(8)
+            case _:
+                changed += changed[:where]
+    return bytes(changed[:MAX_DATAGRAM_BYTES])
