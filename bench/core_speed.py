@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.model import (
+    ALL_CALLS,
     Candidate,
     CandidateKind,
     InterfaceId,
@@ -68,7 +69,7 @@ class Side:
 
     def as_peer(self) -> Peer:
         candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, self.address)
-        return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers)
+        return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers, may_call=ALL_CALLS)
 
     def turn(self, now: float) -> list[Batch]:
         """Let engine and link talk until both are done; returns what leaves."""

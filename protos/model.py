@@ -70,6 +70,8 @@ class RemovalReason(enum.Enum):
     LEASE_EXPIRED = "lease_expired"
     LEFT = "left"
     REVOKED = "revoked"
+    FORBIDDEN = "forbidden"
+    """It is there, but the access policy leaves the two nothing to do with each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +104,25 @@ class ServiceUse:
 
 
 @dataclass(frozen=True, slots=True)
+class CallPermit:
+    """Which services a robot may call on the cloud that is told of it; `in` asks for one."""
+
+    services: frozenset[ServiceName] = frozenset()
+    everything: bool = False
+    """No policy is in force."""
+
+    def __contains__(self, service: object) -> bool:
+        return self.everything or service in self.services
+
+    def __bool__(self) -> bool:
+        return self.everything or bool(self.services)
+
+
+NO_CALLS = CallPermit()
+ALL_CALLS = CallPermit(everything=True)
+
+
+@dataclass(frozen=True, slots=True)
 class Peer:
     """A sidecar as its peers see it."""
 
@@ -114,6 +135,8 @@ class Peer:
     offers: tuple[ServiceOffer, ...] = ()
     draining: bool = False
     credential: bytes = field(default=b"", repr=False)
+    may_call: CallPermit = NO_CALLS
+    """Of a robot, told to clouds; nothing unless said otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +155,8 @@ class PeerSet:
     nonce: int
     peers: tuple[Peer, ...] = ()
     removed: tuple[RemovedPeer, ...] = ()
+    policy: int = 0
+    """Fingerprint of the access policy that this set follows; 0: none, or not yet to be judged by it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,3 +336,5 @@ class SidecarStatus:
     mapping: ResourceStatus = ResourceStatus()
     services: tuple[ServiceMapping, ...] = ()
     paths: tuple[PathReport, ...] = ()
+    refused_offers: tuple[ServiceName, ...] = ()
+    """What it offers and the policy does not let it."""

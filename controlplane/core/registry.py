@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
 from protos.model import (
+    ALL_CALLS,
     NodeName,
     Peer,
     Registration,
@@ -103,6 +104,7 @@ class Sidecar:
             offers=self.offers,
             draining=self.draining,
             credential=self.registration.credential,
+            may_call=ALL_CALLS,
         )
 
 

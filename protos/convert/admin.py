@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from protos.convert.fields import (
     MAX_MAPPED_SERVICES,
+    MAX_OFFERS,
     MAX_PATHS,
     MAX_SIDECARS,
     MAX_USES,
@@ -18,7 +19,7 @@ from protos.convert.fields import (
 )
 from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
 from protos.convert.reports import path_from_proto, path_to_proto
-from protos.convert.types import peer_from_proto, peer_to_proto, use_from_proto, use_to_proto
+from protos.convert.types import peer_from_proto, peer_to_proto, service_names, use_from_proto, use_to_proto
 from protos.model import ResourceStatus, SidecarStatus, SyncState
 from protos.names import clean_text, text
 from protos.plr.v1 import admin_pb2
@@ -56,6 +57,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         mapping=_resource_from_proto(message.mapping),
         services=each(message.services, MAX_MAPPED_SERVICES, "services", service_mapping_from_proto),
         paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
+        refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
     )
 
 
@@ -70,6 +72,7 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         mapping=_resource_to_proto(status.mapping),
         services=map(service_mapping_to_proto, status.services),
         paths=map(path_to_proto, status.paths),
+        refused_offers=status.refused_offers,
     )
 
 

@@ -66,6 +66,7 @@ _REASONS = {
     control_pb2.REMOVAL_REASON_LEASE_EXPIRED: RemovalReason.LEASE_EXPIRED,
     control_pb2.REMOVAL_REASON_LEFT: RemovalReason.LEFT,
     control_pb2.REMOVAL_REASON_REVOKED: RemovalReason.REVOKED,
+    control_pb2.REMOVAL_REASON_FORBIDDEN: RemovalReason.FORBIDDEN,
 }
 _REASON_NUMBERS = {reason: number for number, reason in _REASONS.items()}
 
@@ -231,7 +232,13 @@ def _peer_set_from_proto(message: control_pb2.PeerSet) -> PeerSet:
     peers = each(message.peers, MAX_PEERS, "peers", peer_from_proto)
     removed = each(message.removed, MAX_REMOVED, "removed", _removed_from_proto)
     unique([*(peer.name for peer in peers), *(gone.name for gone in removed)], "peers")
-    return PeerSet(version=version(message.version, "peers version"), nonce=message.nonce, peers=peers, removed=removed)
+    return PeerSet(
+        version=version(message.version, "peers version"),
+        nonce=message.nonce,
+        peers=peers,
+        removed=removed,
+        policy=message.policy,
+    )
 
 
 def _peer_set_to_proto(value: PeerSet) -> control_pb2.PeerSet:
@@ -243,6 +250,7 @@ def _peer_set_to_proto(value: PeerSet) -> control_pb2.PeerSet:
             control_pb2.RemovedPeer(name=removed.name, reason=_REASON_NUMBERS[removed.reason])
             for removed in value.removed
         ),
+        policy=value.policy,
     )
 
 

@@ -19,14 +19,17 @@ from protos.convert.fields import (
 from protos.errors import DecodeError
 from protos.histogram import LAYOUT, Histogram
 from protos.model import (
+    ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
     TOKEN_BYTES,
     Address,
+    CallPermit,
     Candidate,
     CandidateKind,
     InterfaceId,
     Peer,
     Role,
+    ServiceName,
     ServiceOffer,
     ServiceUse,
     SessionId,
@@ -160,7 +163,26 @@ def peer_from_proto(message: types_pb2.Peer, *, with_token: bool = True) -> Peer
         offers=offers_from_proto(message.offers),
         draining=message.draining,
         credential=credential_from_proto(message.credential),
+        may_call=permit_from_proto(message),
     )
+
+
+def permit_from_proto(message: types_pb2.Peer) -> CallPermit:
+    """Check what a peer may call: everything, or services by name."""
+    if not message.may_call_everything:
+        names = service_names(message.may_call, MAX_OFFERS, "may_call")
+        unique(names, "may_call")
+        return CallPermit(frozenset(names))
+    if message.may_call:
+        raise DecodeError("may_call names services beside may_call_everything")
+    return ALL_CALLS
+
+
+def service_names(values: Sequence[str], limit: int, field: str) -> tuple[ServiceName, ...]:
+    """Check a repeated field of at most `limit` names of services."""
+    if len(values) > limit:
+        raise DecodeError(f"{field} has {len(values)} elements, more than {limit}")
+    return tuple(service_name(value, field) for value in values)
 
 
 def credential_from_proto(value: bytes) -> bytes:
@@ -189,6 +211,8 @@ def peer_to_proto(peer: Peer) -> types_pb2.Peer:
         offers=map(offer_to_proto, peer.offers),
         draining=peer.draining,
         credential=peer.credential,
+        may_call=sorted(peer.may_call.services),
+        may_call_everything=peer.may_call.everything,
     )
 
 

@@ -9,6 +9,7 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 from protos.model import (
+    ALL_CALLS,
     Candidate,
     CandidateKind,
     InterfaceId,
@@ -118,7 +119,16 @@ class Node:
             Candidate(InterfaceId(number), interface, CandidateKind.HOST, self.address(interface))
             for number, interface in enumerate(self.interfaces)
         )
-        return Peer(self.name, self.role, self.session, self.token, self.incarnation, candidates, self.offers)
+        return Peer(
+            self.name,
+            self.role,
+            self.session,
+            self.token,
+            self.incarnation,
+            candidates,
+            self.offers,
+            may_call=ALL_CALLS,
+        )
 
     def submit(self, payload: bytes, service: ServiceName = SERVICE) -> RequestId:
         self.sequence += 1

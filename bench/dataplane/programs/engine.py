@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
 from protos.model import (
+    ALL_CALLS,
     Assignment,
     Candidate,
     CandidateKind,
@@ -201,7 +202,7 @@ def peer_of(fields: dict[str, Any]) -> Peer:
     )
     offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
     token = base64.b64decode(fields["token"])
-    return Peer(fields["name"], role, SessionId(fields["session"]), token, 1, candidates, offers)
+    return Peer(fields["name"], role, SessionId(fields["session"]), token, 1, candidates, offers, may_call=ALL_CALLS)
 
 
 if __name__ == "__main__":

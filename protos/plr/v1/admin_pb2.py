@@ -26,23 +26,23 @@ from protos.plr.v1 import types_pb2 as protos_dot_plr_dot_v1_dot_types__pb2
 from protos.plr.v1 import control_pb2 as protos_dot_plr_dot_v1_dot_control__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19protos/plr/v1/admin.proto\x12\x06plr.v1\x1a\x19protos/plr/v1/types.proto\x1a\x1bprotos/plr/v1/control.proto\"\x12\n\x10GetStatusRequest\"n\n\x0eResourceStatus\x12\x14\n\x0cversion_sent\x18\x01 \x01(\x04\x12\x15\n\rversion_acked\x18\x02 \x01(\x04\x12 \n\x05state\x18\x03 \x01(\x0e\x32\x11.plr.v1.SyncState\x12\r\n\x05\x65rror\x18\x04 \x01(\t\"\xae\x02\n\rSidecarStatus\x12\x1a\n\x04peer\x18\x01 \x01(\x0b\x32\x0c.plr.v1.Peer\x12\x11\n\tconnected\x18\x02 \x01(\x08\x12\x15\n\rlease_left_us\x18\x03 \x01(\x04\x12\x18\n\x10software_version\x18\x04 \x01(\t\x12 \n\x04uses\x18\x05 \x03(\x0b\x32\x12.plr.v1.ServiceUse\x12%\n\x05peers\x18\x06 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12\'\n\x07mapping\x18\x07 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12(\n\x08services\x18\x08 \x03(\x0b\x32\x16.plr.v1.ServiceMapping\x12!\n\x05paths\x18\t \x03(\x0b\x32\x12.plr.v1.PathReport\"<\n\x11GetStatusResponse\x12\'\n\x08sidecars\x18\x01 \x03(\x0b\x32\x15.plr.v1.SidecarStatus*\x86\x01\n\tSyncState\x12\x1a\n\x16SYNC_STATE_UNSPECIFIED\x10\x00\x12\x17\n\x13SYNC_STATE_NOT_SENT\x10\x01\x12\x14\n\x10SYNC_STATE_STALE\x10\x02\x12\x15\n\x11SYNC_STATE_SYNCED\x10\x03\x12\x17\n\x13SYNC_STATE_REJECTED\x10\x04\x32I\n\x05\x41\x64min\x12@\n\tGetStatus\x12\x18.plr.v1.GetStatusRequest\x1a\x19.plr.v1.GetStatusResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19protos/plr/v1/admin.proto\x12\x06plr.v1\x1a\x19protos/plr/v1/types.proto\x1a\x1bprotos/plr/v1/control.proto\"\x12\n\x10GetStatusRequest\"n\n\x0eResourceStatus\x12\x14\n\x0cversion_sent\x18\x01 \x01(\x04\x12\x15\n\rversion_acked\x18\x02 \x01(\x04\x12 \n\x05state\x18\x03 \x01(\x0e\x32\x11.plr.v1.SyncState\x12\r\n\x05\x65rror\x18\x04 \x01(\t\"\xc6\x02\n\rSidecarStatus\x12\x1a\n\x04peer\x18\x01 \x01(\x0b\x32\x0c.plr.v1.Peer\x12\x11\n\tconnected\x18\x02 \x01(\x08\x12\x15\n\rlease_left_us\x18\x03 \x01(\x04\x12\x18\n\x10software_version\x18\x04 \x01(\t\x12 \n\x04uses\x18\x05 \x03(\x0b\x32\x12.plr.v1.ServiceUse\x12%\n\x05peers\x18\x06 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12\'\n\x07mapping\x18\x07 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12(\n\x08services\x18\x08 \x03(\x0b\x32\x16.plr.v1.ServiceMapping\x12!\n\x05paths\x18\t \x03(\x0b\x32\x12.plr.v1.PathReport\x12\x16\n\x0erefused_offers\x18\n \x03(\t\"<\n\x11GetStatusResponse\x12\'\n\x08sidecars\x18\x01 \x03(\x0b\x32\x15.plr.v1.SidecarStatus*\x86\x01\n\tSyncState\x12\x1a\n\x16SYNC_STATE_UNSPECIFIED\x10\x00\x12\x17\n\x13SYNC_STATE_NOT_SENT\x10\x01\x12\x14\n\x10SYNC_STATE_STALE\x10\x02\x12\x15\n\x11SYNC_STATE_SYNCED\x10\x03\x12\x17\n\x13SYNC_STATE_REJECTED\x10\x04\x32I\n\x05\x41\x64min\x12@\n\tGetStatus\x12\x18.plr.v1.GetStatusRequest\x1a\x19.plr.v1.GetStatusResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'protos.plr.v1.admin_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_SYNCSTATE']._serialized_start=593
-  _globals['_SYNCSTATE']._serialized_end=727
+  _globals['_SYNCSTATE']._serialized_start=617
+  _globals['_SYNCSTATE']._serialized_end=751
   _globals['_GETSTATUSREQUEST']._serialized_start=93
   _globals['_GETSTATUSREQUEST']._serialized_end=111
   _globals['_RESOURCESTATUS']._serialized_start=113
   _globals['_RESOURCESTATUS']._serialized_end=223
   _globals['_SIDECARSTATUS']._serialized_start=226
-  _globals['_SIDECARSTATUS']._serialized_end=528
-  _globals['_GETSTATUSRESPONSE']._serialized_start=530
-  _globals['_GETSTATUSRESPONSE']._serialized_end=590
-  _globals['_ADMIN']._serialized_start=729
-  _globals['_ADMIN']._serialized_end=802
+  _globals['_SIDECARSTATUS']._serialized_end=552
+  _globals['_GETSTATUSRESPONSE']._serialized_start=554
+  _globals['_GETSTATUSRESPONSE']._serialized_end=614
+  _globals['_ADMIN']._serialized_start=753
+  _globals['_ADMIN']._serialized_end=826
 # @@protoc_insertion_point(module_scope)

@@ -102,6 +102,7 @@ class SidecarStatus(_message.Message):
     MAPPING_FIELD_NUMBER: _builtins.int
     SERVICES_FIELD_NUMBER: _builtins.int
     PATHS_FIELD_NUMBER: _builtins.int
+    REFUSED_OFFERS_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
@@ -119,6 +120,10 @@ class SidecarStatus(_message.Message):
 
     @_builtins.property
     def paths(self) -> _containers.RepeatedCompositeFieldContainer[_control_pb2.PathReport]: ...
+    @_builtins.property
+    def refused_offers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Clouds: services it offers and the policy does not let it; no robot hears of them."""
+
     def __init__(
         self,
         *,
@@ -131,10 +136,11 @@ class SidecarStatus(_message.Message):
         mapping: Global___ResourceStatus | None = ...,
         services: _abc.Iterable[_control_pb2.ServiceMapping] | None = ...,
         paths: _abc.Iterable[_control_pb2.PathReport] | None = ...,
+        refused_offers: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "services", b"services", "software_version", b"software_version", "uses", b"uses"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "services", b"services", "software_version", b"software_version", "uses", b"uses"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

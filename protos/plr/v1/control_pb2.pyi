@@ -50,6 +50,8 @@ class _RemovalReasonEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Removal
     """It said goodbye."""
     REMOVAL_REASON_REVOKED: _RemovalReason.ValueType  # 3
     """It must not be talked to any more."""
+    REMOVAL_REASON_FORBIDDEN: _RemovalReason.ValueType  # 4
+    """It is there, but the access policy leaves the two nothing to do with each other."""
 
 class RemovalReason(_RemovalReason, metaclass=_RemovalReasonEnumTypeWrapper): ...
 
@@ -60,6 +62,8 @@ REMOVAL_REASON_LEFT: RemovalReason.ValueType  # 2
 """It said goodbye."""
 REMOVAL_REASON_REVOKED: RemovalReason.ValueType  # 3
 """It must not be talked to any more."""
+REMOVAL_REASON_FORBIDDEN: RemovalReason.ValueType  # 4
+"""It is there, but the access policy leaves the two nothing to do with each other."""
 Global___RemovalReason: _TypeAlias = RemovalReason  # noqa: Y015
 
 @_typing.final
@@ -521,8 +525,14 @@ class PeerSet(_message.Message):
     NONCE_FIELD_NUMBER: _builtins.int
     PEERS_FIELD_NUMBER: _builtins.int
     REMOVED_FIELD_NUMBER: _builtins.int
+    POLICY_FIELD_NUMBER: _builtins.int
     version: _builtins.int
     nonce: _builtins.int
+    policy: _builtins.int
+    """Fingerprint of the access policy that this set follows. When it differs from the last one that was not 0, a peer
+    that is not listed goes at once, whatever its paths prove: nobody said what it may do under the new policy.
+    0: no policy, or not yet to be judged by it (right after a start, while peers are still coming back).
+    """
     @_builtins.property
     def peers(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.Peer]: ...
     @_builtins.property
@@ -536,10 +546,11 @@ class PeerSet(_message.Message):
         nonce: _builtins.int = ...,
         peers: _abc.Iterable[_types_pb2.Peer] | None = ...,
         removed: _abc.Iterable[Global___RemovedPeer] | None = ...,
+        policy: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["nonce", b"nonce", "peers", b"peers", "removed", b"removed", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["nonce", b"nonce", "peers", b"peers", "policy", b"policy", "removed", b"removed", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

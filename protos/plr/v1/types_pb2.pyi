@@ -187,6 +187,8 @@ class Peer(_message.Message):
     OFFERS_FIELD_NUMBER: _builtins.int
     DRAINING_FIELD_NUMBER: _builtins.int
     CREDENTIAL_FIELD_NUMBER: _builtins.int
+    MAY_CALL_FIELD_NUMBER: _builtins.int
+    MAY_CALL_EVERYTHING_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     role: Global___Role.ValueType
     session: _builtins.int
@@ -198,10 +200,18 @@ class Peer(_message.Message):
     draining: _builtins.bool
     credential: _builtins.bytes
     """What this run says of itself, signed by itself (protos/credential.py); opaque to the control plane, which relays it."""
+    may_call_everything: _builtins.bool
+    """No policy is in force: it may call everything."""
     @_builtins.property
     def candidates(self) -> _containers.RepeatedCompositeFieldContainer[Global___Candidate]: ...
     @_builtins.property
     def offers(self) -> _containers.RepeatedCompositeFieldContainer[Global___ServiceOffer]: ...
+    @_builtins.property
+    def may_call(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Told of robots to clouds: services that the robot may call on the cloud that this is sent to, of those that the
+        cloud offers or offered. Requests for others are refused there.
+        """
+
     def __init__(
         self,
         *,
@@ -214,10 +224,12 @@ class Peer(_message.Message):
         offers: _abc.Iterable[Global___ServiceOffer] | None = ...,
         draining: _builtins.bool = ...,
         credential: _builtins.bytes = ...,
+        may_call: _abc.Iterable[_builtins.str] | None = ...,
+        may_call_everything: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "credential", b"credential", "draining", b"draining", "incarnation", b"incarnation", "name", b"name", "offers", b"offers", "role", b"role", "session", b"session", "token", b"token"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "credential", b"credential", "draining", b"draining", "incarnation", b"incarnation", "may_call", b"may_call", "may_call_everything", b"may_call_everything", "name", b"name", "offers", b"offers", "role", b"role", "session", b"session", "token", b"token"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 from protos.convert.fields import MAX_CAPACITY, MAX_DURATION_S, MAX_EVENTS, MAX_VERSION
 from protos.histogram import BUCKETS, MAX_COUNT, Histogram
 from protos.model import (
+    ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
     PROTOCOL_VERSION,
     TOKEN_BYTES,
     Ack,
     Address,
     Assignment,
+    CallPermit,
     Candidate,
     CandidateKind,
     CandidateSet,
@@ -112,6 +114,7 @@ def _tuples(
 
 offers = st.builds(ServiceOffer, service_names, type_names, st.integers(0, MAX_CAPACITY))
 uses = st.builds(ServiceUse, service_names, type_names, durations, st.booleans())
+permits = st.just(ALL_CALLS) | st.builds(CallPermit, st.frozensets(service_names, max_size=3))
 peers = st.builds(
     Peer,
     node_names,
@@ -123,6 +126,7 @@ peers = st.builds(
     _tuples(offers, by="name"),
     st.booleans(),
     credentials,
+    permits,
 )
 registrations = st.builds(
     Registration,
@@ -159,7 +163,7 @@ def peer_sets(draw: st.DrawFn) -> PeerSet:
     gone = draw(_tuples(st.builds(RemovedPeer, node_names, st.sampled_from(RemovalReason)), by="name"))
     names = {peer.name for peer in present}
     removed = tuple(peer for peer in gone if peer.name not in names)
-    return PeerSet(draw(versions), draw(uint64), present, removed)
+    return PeerSet(draw(versions), draw(uint64), present, removed, draw(uint64))
 
 
 sidecar_messages: st.SearchStrategy[SidecarMessage] = st.one_of(
@@ -185,4 +189,5 @@ statuses = st.builds(
     resource_statuses,
     _tuples(service_mappings),
     _tuples(paths),
+    _tuples(service_names),
 )

@@ -13,16 +13,20 @@ from protos.convert import (
     control_message_to_proto,
     parse_control_message,
     parse_sidecar_message,
+    peer_from_proto,
     sidecar_message_from_proto,
     sidecar_message_to_proto,
     status_from_proto,
     status_to_proto,
 )
-from protos.convert.fields import MAX_CANDIDATES, MAX_VERSION
+from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_VERSION
 from protos.errors import DecodeError
 from protos.model import (
+    ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
+    NO_CALLS,
     Ack,
+    CallPermit,
     Candidate,
     CandidateKind,
     CandidateSet,
@@ -97,6 +101,22 @@ def candidates(*changes: dict[str, Any]) -> control_pb2.SidecarMessage:
     }
     made = [types_pb2.Candidate(**(fields | change)) for change in changes]
     return control_pb2.SidecarMessage(candidates=control_pb2.Candidates(candidates=made))
+
+
+def test_a_permit_is_all_or_names() -> None:
+    def parse(**fields: Any) -> CallPermit:
+        peer = types_pb2.Peer(name="robot", role=types_pb2.ROLE_ROBOT, session=1, **fields)
+        return peer_from_proto(peer, with_token=False).may_call
+
+    assert parse() == NO_CALLS
+    assert parse(may_call_everything=True) == ALL_CALLS
+    assert "/a" in parse(may_call=["/a", "/b"])
+    assert "/c" not in parse(may_call=["/a", "/b"])
+    for wrong in (["a"], ["/a", "/a"], [f"/s{number}" for number in range(MAX_OFFERS + 1)]):
+        with pytest.raises(DecodeError, match="may_call"):
+            parse(may_call=wrong)
+    with pytest.raises(DecodeError, match="beside may_call_everything"):
+        parse(may_call=["/a"], may_call_everything=True)
 
 
 def at(ip: bytes, port: int = 4000) -> dict[str, Any]:

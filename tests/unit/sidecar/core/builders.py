@@ -6,6 +6,7 @@ import random
 from dataclasses import dataclass, field
 
 from protos.model import (
+    ALL_CALLS,
     Address,
     Candidate,
     CandidateKind,
@@ -93,7 +94,17 @@ def peer(
 ) -> Peer:
     candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, PEER_ADDRESS)
     token = NodeName(name).encode().ljust(16)[:16]
-    return Peer(NodeName(name), Role.CLOUD, SessionId(session), token, incarnation, (candidate,), offers, draining)
+    return Peer(
+        NodeName(name),
+        Role.CLOUD,
+        SessionId(session),
+        token,
+        incarnation,
+        (candidate,),
+        offers,
+        draining,
+        may_call=ALL_CALLS,
+    )
 
 
 @dataclass

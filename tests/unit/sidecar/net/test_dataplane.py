@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import (
+    ALL_CALLS,
     Candidate,
     CandidateKind,
     InterfaceId,
@@ -78,7 +79,7 @@ class Node:
 
     def as_peer(self) -> Peer:
         candidate = Candidate(InterfaceId(0), InterfaceName("lo"), CandidateKind.HOST, ("127.0.0.1", self.thread.port))
-        return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers)
+        return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers, may_call=ALL_CALLS)
 
     def start(self, other: Node) -> None:
         self.plane.start()
