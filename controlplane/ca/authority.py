@@ -1,0 +1,168 @@
+"""A CA in memory: issues, renews and revokes; remembers what it has issued."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import TYPE_CHECKING
+
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from controlplane.ca.certificates import (
+    Issued,
+    Validity,
+    build_authority,
+    build_leaf,
+    build_revocation_list,
+    generate_key,
+)
+from controlplane.ca.files import write_tls_files
+from controlplane.ca.index import Entry
+from protos.names import node_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from pathlib import Path
+
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    from protos.identity import IdentityRole
+
+DAY_S = 86_400.0
+
+DEFAULT_CA_DAYS = 3650.0
+DEFAULT_DAYS = 90.0
+"""Short enough that what was lost unnoticed ends by age, long enough to renew by hand."""
+
+BACKDATE_S = 300.0
+"""How far a certificate's beginning lies back: clocks of robots that are this slow still find it valid."""
+
+
+class AuthorityError(ValueError):
+    """The CA refuses; the text is one line that tells what to do."""
+
+
+class Authority:
+    """A CA with its key. Times come from `clock` (seconds since 1970)."""
+
+    def __init__(
+        self,
+        own: Issued,
+        entries: Iterable[Entry] = (),
+        crl_number: int = 0,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self.own = own
+        self.entries = list(entries)
+        self.crl_number = crl_number
+        self._clock = clock
+
+    @classmethod
+    def create(
+        cls, name: str = "fleet", *, days: float = DEFAULT_CA_DAYS, clock: Callable[[], float] = time.time
+    ) -> Authority:
+        """Make a new CA; `name` is for people."""
+        key = generate_key()
+        now = clock()
+        validity = Validity(now - BACKDATE_S, now + days * DAY_S)
+        return cls(Issued(build_authority(name, key, validity), key), clock=clock)
+
+    @property
+    def ca_pem(self) -> bytes:
+        """The CA's certificate."""
+        return self.own.certificate_pem
+
+    @property
+    def not_after(self) -> float:
+        """When the CA's certificate ends."""
+        return self.own.certificate.not_valid_after_utc.timestamp()
+
+    def issue(
+        self, name: str, role: IdentityRole, *, days: float = DEFAULT_DAYS, validity: Validity | None = None
+    ) -> Issued:
+        """Make a key and certificate for a new name; raises AuthorityError, or DecodeError for a bad name.
+
+        `validity` in place of `days` is for tests: it may lie in the past, but not beyond the CA's own end.
+        """
+        node_name(name, "the name")
+        now = self._clock()
+        if any(entry.name == name and entry.in_force(now) for entry in self.entries):
+            raise AuthorityError(f"{name} has a certificate; do: plr ca renew {name}")
+        return self._issue(name, role, validity or self._validity(days), generate_key())
+
+    def renew(self, name: str, *, days: float = DEFAULT_DAYS, key: ec.EllipticCurvePrivateKey | None = None) -> Issued:
+        """Make a further certificate for a name, and a new key unless one is given; raises AuthorityError.
+
+        The certificate before it stays good until its end, so that the node can change over without a gap.
+        """
+        last = self.latest(name)
+        if last.revoked_at is not None:
+            raise AuthorityError(f"{name} is revoked; to let it in again, do: plr ca issue {name} --role ...")
+        return self._issue(name, last.role, self._validity(days), key or generate_key())
+
+    def revoke(self, name: str, reason: x509.ReasonFlags = x509.ReasonFlags.unspecified) -> list[Entry]:
+        """Revoke every certificate of a name that is in force; returns them. Raises AuthorityError if there is none."""
+        now = self._clock()
+        self.latest(name)
+        revoked = []
+        for place, entry in enumerate(self.entries):
+            if entry.name == name and entry.in_force(now):
+                self.entries[place] = dataclasses.replace(entry, revoked_at=now, reason=reason.value)
+                revoked.append(self.entries[place])
+        if not revoked:
+            raise AuthorityError(f"{name} has no certificate in force")
+        self.crl_number += 1
+        return revoked
+
+    def latest(self, name: str) -> Entry:
+        """Return the entry of the name's newest certificate; raises AuthorityError for an unknown name."""
+        for entry in reversed(self.entries):
+            if entry.name == name:
+                return entry
+        raise AuthorityError(f"{name} has no certificate of this CA; do: plr ca issue {name} --role ...")
+
+    def crl_pem(self) -> bytes:
+        """Return the revocation list; it stands as long as the CA."""
+        revoked = [
+            (entry.serial, entry.revoked_at, entry.reason) for entry in self.entries if entry.revoked_at is not None
+        ]
+        validity = Validity(self._clock(), self.not_after)
+        return build_revocation_list(self.own, self.crl_number, revoked, validity).public_bytes(Encoding.PEM)
+
+    def write_tls_dir(
+        self,
+        folder: Path,
+        name: str,
+        role: IdentityRole,
+        *,
+        days: float = DEFAULT_DAYS,
+        validity: Validity | None = None,
+    ) -> Issued:
+        """Issue to a new name and write a folder ready to be a `tls_dir`; raises as `issue`, and OSError."""
+        issued = self.issue(name, role, days=days, validity=validity)
+        write_tls_files(folder, issued, self.ca_pem, self.crl_pem())
+        return issued
+
+    def _validity(self, days: float) -> Validity:
+        now = self._clock()
+        end = now + days * DAY_S
+        if not days > 0:
+            raise AuthorityError("expected a positive number of days")
+        if end > self.not_after:
+            left = max(0, int((self.not_after - now) // DAY_S))
+            raise AuthorityError(f"the CA itself ends in {left} days; ask for fewer, or change the CA")
+        return Validity(now - BACKDATE_S, end)
+
+    def _issue(self, name: str, role: IdentityRole, validity: Validity, key: ec.EllipticCurvePrivateKey) -> Issued:
+        certificate = build_leaf(self.own, name, role, key.public_key(), validity)
+        self.entries.append(
+            Entry(
+                name=node_name(name, "the name"),
+                role=role,
+                serial=certificate.serial_number,
+                not_before=certificate.not_valid_before_utc.timestamp(),
+                not_after=certificate.not_valid_after_utc.timestamp(),
+            )
+        )
+        return Issued(certificate, key)

@@ -1,0 +1,49 @@
+"""Writing files so that a reader finds the old or the new one whole, and keys so that only their owner reads them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from typing import TYPE_CHECKING
+
+from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from controlplane.ca.certificates import Issued
+
+PRIVATE_FOLDER = 0o700
+PRIVATE_FILE = 0o600
+PUBLIC_FILE = 0o644
+
+
+def write_atomically(path: Path, data: bytes, mode: int) -> None:
+    """Put the file in place whole, with this mode, and on the disk before it returns; raises OSError."""
+    descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fchmod(file.fileno(), mode)
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def write_tls_files(folder: Path, issued: Issued, ca_pem: bytes, crl_pem: bytes) -> None:
+    """Write a node's TLS files; a folder that is missing is made, readable for its owner alone. Raises OSError."""
+    folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+    write_atomically(folder / CA_FILE, ca_pem, PUBLIC_FILE)
+    write_atomically(folder / CRL_FILE, crl_pem, PUBLIC_FILE)
+    write_atomically(folder / KEY_FILE, issued.key_pem, PRIVATE_FILE)
+    write_atomically(folder / CERTIFICATE_FILE, issued.certificate_pem, PUBLIC_FILE)

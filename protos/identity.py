@@ -1,0 +1,256 @@
+"""Who a node is: X.509 certificates of the fleet's CA, and whether to believe one.
+
+The CA issues leaf certificates directly. Name and role stand in the one URI among the alternative names:
+
+    subjectAltName = URI:plr://robot/robot-1                                        a node, or an operator
+    subjectAltName = URI:plr://controlplane/cp-1, DNS:controlplane.plr.internal     the control plane
+
+Keys are ECDSA on P-256, since gRPC's TLS takes no Ed25519. What is demanded of a certificate is RFC 5280's profile of
+an end entity, narrowed to what the CA issues: one that says more than a node's does is refused. Pure: the time is
+given, nothing is read.
+"""
+
+from __future__ import annotations
+
+import enum
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, SignatureAlgorithmOID
+
+from protos.errors import DecodeError
+from protos.names import node_name
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+
+CONTROL_PLANE_DNS = "controlplane.plr.internal"
+"""The name that every client demands of the control plane's certificate, at whatever address it was reached."""
+
+URI_SCHEME = "plr"
+
+MAX_CERTIFICATE_BYTES = 1536
+"""Longest certificate, DER: one that the CA issues has some 500 bytes."""
+
+MAX_CA_CERTIFICATES = 16
+"""CAs trusted at once; a rotation needs two."""
+
+MALFORMED = "malformed"
+UNTRUSTED = "untrusted"
+EXPIRED = "expired"
+NOT_YET_VALID = "not_yet_valid"
+WRONG_ROLE = "wrong_role"
+REVOKED = "revoked"
+
+_SIGNATURES = frozenset(
+    {
+        SignatureAlgorithmOID.ECDSA_WITH_SHA256,
+        SignatureAlgorithmOID.ECDSA_WITH_SHA384,
+        SignatureAlgorithmOID.ECDSA_WITH_SHA512,
+    }
+)
+_PEM_CRL = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", re.DOTALL)
+
+
+class IdentityRole(enum.Enum):
+    """What a certificate entitles to."""
+
+    ROBOT = "robot"
+    CLOUD = "cloud"
+    CONTROL_PLANE = "controlplane"
+    OPERATOR = "operator"
+
+
+_ROLES = {role.value: role for role in IdentityRole}
+
+
+class CertificateError(DecodeError):
+    """A certificate is refused; `reason` is one of the words above (malformed, untrusted, ...)."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Whom a certificate names, and for how long (seconds since 1970, both ends included)."""
+
+    name: NodeName
+    role: IdentityRole
+    serial: int
+    not_before: float
+    not_after: float
+
+
+def identity_uri(name: str, role: IdentityRole) -> str:
+    """Return the alternative name that stands for a name and role."""
+    return f"{URI_SCHEME}://{role.value}/{name}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Authority:
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePublicKey
+    revoked: set[int] = field(default_factory=set)
+
+
+class Trust:
+    """The CAs to believe and what they have revoked.
+
+    `ca_certificates` is PEM, one CA or several (while one takes over from the other); `crl` is PEM, one list or
+    several, each signed by one of these CAs. A list does not age: the last one stands until there is a newer. Raises
+    CertificateError where either is not what it should be.
+    """
+
+    def __init__(self, ca_certificates: bytes, crl: bytes | None = None) -> None:
+        self._authorities = _load_authorities(ca_certificates)
+        if crl is not None:
+            _load_revocations(crl, self._authorities)
+
+    def identify(self, certificate_der: bytes) -> Identity:
+        """Return whom a certificate of these CAs names, whatever its age and revocation; raises CertificateError."""
+        return self._identify(certificate_der)[0]
+
+    def check(self, certificate_der: bytes, now_wall: float) -> Identity:
+        """Return whom a certificate names that is good at `now_wall` (seconds since 1970); raises CertificateError."""
+        identity, issuer = self._identify(certificate_der)
+        if identity.serial in issuer.revoked:
+            raise CertificateError(REVOKED, f"the certificate of {identity.name} is revoked")
+        _check_time(identity.not_before, identity.not_after, now_wall, f"the certificate of {identity.name}")
+        _check_time(*_validity(issuer.certificate), now_wall, "the CA's certificate")
+        return identity
+
+    def _identify(self, certificate_der: bytes) -> tuple[Identity, _Authority]:
+        if len(certificate_der) > MAX_CERTIFICATE_BYTES:
+            raise CertificateError(MALFORMED, f"the certificate is longer than {MAX_CERTIFICATE_BYTES} bytes")
+        try:
+            certificate = x509.load_der_x509_certificate(certificate_der)
+            _check_leaf(certificate)
+            name, role = _name_and_role(certificate)
+            identity = Identity(name, role, certificate.serial_number, *_validity(certificate))
+        except CertificateError:
+            raise
+        except Exception as error:
+            # What is wrong inside DER shows as a dozen kinds of errors, some only when a field is first looked at.
+            raise CertificateError(MALFORMED, f"the certificate is malformed: {type(error).__name__}") from error
+        return identity, self._issuer(certificate)
+
+    def _issuer(self, certificate: x509.Certificate) -> _Authority:
+        for authority in self._authorities:
+            # CAs of the same name are told apart by their signature.
+            try:
+                certificate.verify_directly_issued_by(authority.certificate)
+            except (ValueError, TypeError, InvalidSignature):
+                continue
+            return authority
+        raise CertificateError(UNTRUSTED, "the certificate is of another CA")
+
+
+def _load_authorities(pem: bytes) -> tuple[_Authority, ...]:
+    try:
+        certificates = x509.load_pem_x509_certificates(pem)
+        if len(certificates) > MAX_CA_CERTIFICATES:
+            raise CertificateError(MALFORMED, f"more than {MAX_CA_CERTIFICATES} CAs")
+        return tuple(_authority(certificate) for certificate in certificates)
+    except CertificateError:
+        raise
+    except Exception as error:
+        raise CertificateError(MALFORMED, f"the CA's certificate is malformed: {type(error).__name__}") from error
+
+
+def _authority(certificate: x509.Certificate) -> _Authority:
+    extensions = certificate.extensions
+    key = certificate.public_key()
+    if not extensions.get_extension_for_class(x509.BasicConstraints).value.ca:
+        raise CertificateError(MALFORMED, "the CA's certificate is not one of a CA")
+    usage = extensions.get_extension_for_class(x509.KeyUsage).value
+    if not (usage.key_cert_sign and usage.crl_sign):
+        raise CertificateError(MALFORMED, "the CA's key may not sign certificates and revocation lists")
+    if not isinstance(key, ec.EllipticCurvePublicKey):
+        raise CertificateError(MALFORMED, "the CA's key is not an ECDSA key")
+    return _Authority(certificate, key)
+
+
+def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
+    """Note with each CA the serial numbers that it has revoked."""
+    blocks: list[bytes] = _PEM_CRL.findall(pem)
+    if not blocks:
+        raise CertificateError(MALFORMED, "the revocation list is not PEM")
+    for block in blocks:
+        try:
+            crl = x509.load_pem_x509_crl(block)
+            partial = any(extension.critical for extension in crl.extensions)
+            serials = {entry.serial_number for entry in crl}
+            issuers = [
+                authority
+                for authority in authorities
+                if crl.issuer == authority.certificate.subject and crl.is_signature_valid(authority.key)
+            ]
+        except Exception as error:
+            raise CertificateError(MALFORMED, f"the revocation list is malformed: {type(error).__name__}") from error
+        if not issuers:
+            raise CertificateError(UNTRUSTED, "the revocation list is of another CA")
+        if partial:
+            # RFC 5280 section 5.2: a list that is a delta, or about some certificates only, says so critically.
+            raise CertificateError(MALFORMED, "the revocation list is not a complete one")
+        for issuer in issuers:
+            issuer.revoked.update(serials)
+
+
+def _check_leaf(certificate: x509.Certificate) -> None:
+    """Check what stands in a certificate beside names and times."""
+    key = certificate.public_key()
+    if not (isinstance(key, ec.EllipticCurvePublicKey) and isinstance(key.curve, ec.SECP256R1)):
+        raise CertificateError(MALFORMED, "the certificate's key is not an ECDSA key on P-256")
+    if certificate.signature_algorithm_oid not in _SIGNATURES:
+        raise CertificateError(MALFORMED, "the certificate is not signed with ECDSA and SHA-2")
+    extensions = certificate.extensions
+    known = (x509.BasicConstraints, x509.KeyUsage, x509.ExtendedKeyUsage, x509.SubjectAlternativeName)
+    if any(extension.critical and not isinstance(extension.value, known) for extension in extensions):
+        raise CertificateError(MALFORMED, "the certificate has a critical extension of unknown meaning")
+    if extensions.get_extension_for_class(x509.BasicConstraints).value.ca:
+        raise CertificateError(MALFORMED, "the certificate is one of a CA, not of a node")
+    usage = extensions.get_extension_for_class(x509.KeyUsage).value
+    if not usage.digital_signature or usage.key_cert_sign or usage.crl_sign:
+        raise CertificateError(MALFORMED, "the certificate's key usage is not a node's")
+    if ExtendedKeyUsageOID.CLIENT_AUTH not in extensions.get_extension_for_class(x509.ExtendedKeyUsage).value:
+        raise CertificateError(MALFORMED, "the certificate is not for TLS clients")
+
+
+def _name_and_role(certificate: x509.Certificate) -> tuple[NodeName, IdentityRole]:
+    names = list(certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value)
+    uris = [name.value for name in names if isinstance(name, x509.UniformResourceIdentifier)]
+    others = [name for name in names if not isinstance(name, x509.UniformResourceIdentifier)]
+    if len(uris) != 1:
+        raise CertificateError(MALFORMED, f"the certificate has {len(uris)} URIs, expected one")
+    scheme, _, rest = uris[0].partition("://")
+    role_text, _, name_text = rest.partition("/")
+    if scheme != URI_SCHEME:
+        raise CertificateError(MALFORMED, f"the certificate's URI is not {URI_SCHEME}://role/name")
+    role = _ROLES.get(role_text)
+    if role is None:
+        raise CertificateError(WRONG_ROLE, f"the certificate's role {role_text!a} is unknown")
+    try:
+        name = node_name(name_text, "the certificate's name")
+    except DecodeError as error:
+        raise CertificateError(MALFORMED, str(error)) from error
+    expected = [x509.DNSName(CONTROL_PLANE_DNS)] if role is IdentityRole.CONTROL_PLANE else []
+    if others != expected:
+        raise CertificateError(MALFORMED, f"the certificate has alternative names that a {role.value} has not")
+    return name, role
+
+
+def _validity(certificate: x509.Certificate) -> tuple[float, float]:
+    return certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp()
+
+
+def _check_time(not_before: float, not_after: float, now_wall: float, what: str) -> None:
+    if now_wall < not_before:
+        raise CertificateError(NOT_YET_VALID, f"{what} is not valid yet, for {not_before - now_wall:.0f} s")
+    if now_wall > not_after:
+        raise CertificateError(EXPIRED, f"{what} expired {now_wall - not_after:.0f} s ago")

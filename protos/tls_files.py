@@ -1,0 +1,189 @@
+"""A node's folder of TLS files (`tls_dir`): read strictly, and read anew when they change.
+
+    cert.pem   the node's certificate
+    key.pem    its private key; nobody but the owner may write it, nobody but owner and group may read it
+    ca.pem     the CA, or several while one takes over from the other
+    crl.pem    what the CAs have revoked; may be missing
+
+Both planes read their identity with it; no core does.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
+
+from protos.errors import ConfigError
+from protos.identity import CertificateError, Identity, Trust
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CERTIFICATE_FILE = "cert.pem"
+KEY_FILE = "key.pem"
+CA_FILE = "ca.pem"
+CRL_FILE = "crl.pem"
+
+POLL_INTERVAL_S = 0.25
+"""How often to look for changes: a revocation has to have its effect within a second."""
+
+MAX_FILE_BYTES = 4 << 20
+"""A revocation list of 100,000 certificates; a larger file is some other file."""
+
+_KEY_FORBIDDEN = stat.S_IRWXO | stat.S_IWGRP
+_FORBIDDEN = stat.S_IWOTH
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """What a node's TLS files hold. Whether the certificate is in force now is for who uses it to ask `trust`."""
+
+    directory: Path
+    certificate_pem: bytes
+    certificate_der: bytes
+    key_pem: bytes = field(repr=False)
+    private_key: ec.EllipticCurvePrivateKey = field(repr=False, compare=False)
+    ca_pem: bytes
+    crl_pem: bytes | None
+    identity: Identity
+    trust: Trust = field(repr=False, compare=False)
+
+
+def load_tls_files(directory: Path) -> TlsFiles:
+    """Return the node's identity; raises ConfigError with one line that tells what to do."""
+    if not directory.is_dir():
+        raise ConfigError(str(directory), "", "expected a folder with cert.pem, key.pem and ca.pem; see: plr ca issue")
+    _refuse_permissions(directory, directory.stat(), _FORBIDDEN)
+    ca_path, crl_path = directory / CA_FILE, directory / CRL_FILE
+    ca_pem = _read(ca_path, _FORBIDDEN)
+    crl_pem = _read(crl_path, _FORBIDDEN) if crl_path.exists() else None
+    try:
+        trust = Trust(ca_pem)
+    except CertificateError as error:
+        raise ConfigError(str(ca_path), "", f"{error}; copy the ca.pem of the CA's folder there") from error
+    if crl_pem is not None:
+        try:
+            trust = Trust(ca_pem, crl_pem)
+        except CertificateError as error:
+            raise ConfigError(str(crl_path), "", f"{error}; copy the crl.pem of the CA's folder there") from error
+    return _node(directory, trust, ca_pem, crl_pem)
+
+
+def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -> TlsFiles:
+    path = directory / CERTIFICATE_FILE
+    certificate_pem = _read(path, _FORBIDDEN)
+    try:
+        (certificate,) = x509.load_pem_x509_certificates(certificate_pem)
+    except ValueError as error:
+        raise ConfigError(str(path), "", "expected one certificate in PEM; copy the one of plr ca issue") from error
+    certificate_der = certificate.public_bytes(Encoding.DER)
+    try:
+        identity = trust.identify(certificate_der)
+    except CertificateError as error:
+        raise ConfigError(str(path), "", f"{error}; issue one with the CA of {CA_FILE}: plr ca issue") from error
+    key_path = directory / KEY_FILE
+    key_pem = _read(key_path, _KEY_FORBIDDEN)
+    key = _private_key(key_pem, key_path)
+    if key.public_key() != certificate.public_key():
+        raise ConfigError(str(key_path), "", f"expected the key of {CERTIFICATE_FILE}; copy both from one plr ca issue")
+    return TlsFiles(
+        directory=directory,
+        certificate_pem=certificate_pem,
+        certificate_der=certificate_der,
+        key_pem=key_pem,
+        private_key=key,
+        ca_pem=ca_pem,
+        crl_pem=crl_pem,
+        identity=identity,
+        trust=trust,
+    )
+
+
+def _private_key(pem: bytes, path: Path) -> ec.EllipticCurvePrivateKey:
+    try:
+        key = load_pem_private_key(pem, password=None)
+    except TypeError as error:
+        raise ConfigError(str(path), "", "expected a key without a passphrase; issue it anew: plr ca renew") from error
+    except Exception as error:
+        raise ConfigError(str(path), "", "expected a private key in PEM; issue it anew: plr ca renew") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise ConfigError(str(path), "", "expected an ECDSA key; issue it anew: plr ca renew")
+    return key
+
+
+def _read(path: Path, forbidden: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            # What was opened is checked, not what stands under the name a moment before.
+            _refuse_permissions(path, os.fstat(file.fileno()), forbidden)
+            data = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(str(path), "", f"cannot be read: {error.strerror or error}; see: plr ca issue") from error
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(str(path), "", f"expected at most {MAX_FILE_BYTES} bytes of PEM")
+    return data
+
+
+def _refuse_permissions(path: Path, status: os.stat_result, forbidden: int) -> None:
+    if status.st_mode & forbidden & _KEY_FORBIDDEN & ~_FORBIDDEN:
+        raise ConfigError(str(path), "", f"others may read or change the private key; do: chmod o=,g-w {path}")
+    if status.st_mode & forbidden:
+        raise ConfigError(str(path), "", f"everybody may change it; do: chmod o-w {path}")
+
+
+class TlsWatch:
+    """Holds a node's TLS files and loads them anew when they have changed on disk.
+
+    Call `poll` every `POLL_INTERVAL_S`. Files that do not fit together keep the old ones in force: while they are being
+    replaced one by one that is nothing unusual, so it is logged only, and once, when they still do not fit at the next
+    look.
+    """
+
+    def __init__(self, files: TlsFiles) -> None:
+        self.current = files
+        # Unknown, hence different from whatever is there: a change between loading and now is not missed.
+        self._seen: _Fingerprint | None = None
+        self._broken: _Fingerprint | None = None
+
+    def poll(self) -> TlsFiles | None:
+        """Look once; return the new files if they have changed and are good, else None."""
+        fingerprint = _fingerprint(self.current.directory)
+        if fingerprint == self._seen:
+            return None
+        try:
+            files = load_tls_files(self.current.directory)
+        except ConfigError as error:
+            if fingerprint == self._broken:
+                _log.error("new TLS files are not used, the old ones stay: %s", error)
+                self._seen = fingerprint
+            self._broken = fingerprint
+            return None
+        self._seen, self._broken = fingerprint, None
+        changed = files != self.current
+        self.current = files
+        return files if changed else None
+
+
+_Fingerprint = tuple[tuple[int, int, int, int] | None, ...]
+"""What tells each file from a later one of the same name; None for one that is not there."""
+
+
+def _fingerprint(directory: Path) -> _Fingerprint:
+    return tuple(_file_fingerprint(directory / name) for name in (CERTIFICATE_FILE, KEY_FILE, CA_FILE, CRL_FILE))
+
+
+def _file_fingerprint(path: Path) -> tuple[int, int, int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)

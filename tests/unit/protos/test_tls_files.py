@@ -1,0 +1,203 @@
+"""A node's folder of TLS files: refused with a line that tells what to do, and loaded anew when it changes."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, NoEncryption, PrivateFormat
+
+from controlplane.ca import Authority
+from controlplane.ca.files import write_tls_files
+from protos.errors import ConfigError
+from protos.identity import IdentityRole
+from protos.tls_files import MAX_FILE_BYTES, TlsWatch, load_tls_files
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+@pytest.fixture
+def ca() -> Authority:
+    return Authority.create()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, ca: Authority) -> Path:
+    ca.write_tls_dir(tmp_path / "robot-1", "robot-1", IdentityRole.ROBOT)
+    return tmp_path / "robot-1"
+
+
+def test_the_folder_that_the_ca_writes_is_an_identity(folder: Path, ca: Authority) -> None:
+    files = load_tls_files(folder)
+    assert (files.identity.name, files.identity.role) == ("robot-1", IdentityRole.ROBOT)
+    assert files.ca_pem == ca.ca_pem
+    assert files.trust.check(files.certificate_der, ca.entries[0].not_before).name == "robot-1"
+    assert "PRIVATE" not in repr(files)
+
+
+def test_the_revocation_list_may_be_missing(folder: Path) -> None:
+    (folder / "crl.pem").unlink()
+    assert load_tls_files(folder).crl_pem is None
+
+
+def pkcs8(key: ec.EllipticCurvePrivateKey, passphrase: bytes | None = None) -> bytes:
+    encryption = BestAvailableEncryption(passphrase) if passphrase else NoEncryption()
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption)
+
+
+def other_ca() -> Authority:
+    return Authority.create("other")
+
+
+Breakage = tuple[str, "Callable[[Path], object]", str]
+BREAKAGES: list[Breakage] = [
+    ("key.pem", lambda path: path.unlink(), "cannot be read: No such file or directory; see: plr ca issue"),
+    ("key.pem", lambda path: path.chmod(0o604), "do: chmod o=,g-w "),
+    ("key.pem", lambda path: path.chmod(0o601), "do: chmod o=,g-w "),
+    ("key.pem", lambda path: path.chmod(0o602), "everybody may change it"),
+    ("key.pem", lambda path: path.chmod(0o620), "do: chmod o=,g-w "),
+    ("key.pem", lambda path: path.write_bytes(b"nothing"), "expected a private key in PEM"),
+    (
+        "key.pem",
+        lambda path: path.write_bytes(pkcs8(ec.generate_private_key(ec.SECP256R1()), b"secret")),
+        "expected a key without a passphrase",
+    ),
+    (
+        "key.pem",
+        lambda path: path.write_bytes(pkcs8(ec.generate_private_key(ec.SECP256R1()))),
+        "expected the key of cert.pem",
+    ),
+    ("cert.pem", lambda path: path.chmod(0o646), "do: chmod o-w "),
+    ("cert.pem", lambda path: path.unlink(), "cannot be read"),
+    ("cert.pem", lambda path: path.write_bytes(b""), "expected one certificate in PEM"),
+    ("cert.pem", lambda path: path.write_bytes(path.read_bytes() * 2), "expected one certificate in PEM"),
+    ("cert.pem", lambda path: path.write_bytes(bytes(MAX_FILE_BYTES + 1)), "expected at most"),
+    (
+        "cert.pem",
+        lambda path: path.write_bytes(other_ca().issue("robot-1", IdentityRole.ROBOT).certificate_pem),
+        "of another CA; issue one with the CA of ca.pem",
+    ),
+    ("ca.pem", lambda path: path.unlink(), "cannot be read"),
+    ("ca.pem", lambda path: path.chmod(0o666), "everybody may change it"),
+    ("ca.pem", lambda path: path.write_bytes(b""), "copy the ca.pem of the CA's folder there"),
+    ("crl.pem", lambda path: path.chmod(0o666), "everybody may change it"),
+    ("crl.pem", lambda path: path.write_bytes(b""), "copy the crl.pem of the CA's folder there"),
+    ("crl.pem", lambda path: path.write_bytes(other_ca().crl_pem()), "of another CA; copy the crl.pem"),
+    ("", lambda path: path.chmod(0o777), "everybody may change it"),
+    ("", lambda path: path.rename(path.with_name("elsewhere")), "expected a folder with cert.pem, key.pem and ca.pem"),
+]
+
+
+@pytest.mark.parametrize(("file", "breakage", "problem"), BREAKAGES, ids=lambda value: str(value)[:30])
+def test_a_folder_that_is_not_in_order_is_refused(
+    folder: Path, file: str, breakage: Callable[[Path], object], problem: str
+) -> None:
+    path = folder / file if file else folder
+    breakage(path)
+    with pytest.raises(ConfigError) as caught:
+        load_tls_files(folder)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert problem in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mode", [0o400, 0o600, 0o440, 0o640])
+def test_owner_and_group_may_read_the_key(folder: Path, mode: int) -> None:
+    (folder / "key.pem").chmod(mode)
+    load_tls_files(folder)
+
+
+def test_an_expired_or_revoked_node_can_read_its_files_still(tmp_path: Path) -> None:
+    ca = Authority.create(clock=lambda: 1_000_000_000.0)
+    issued = ca.issue("robot-1", IdentityRole.ROBOT)
+    ca.revoke("robot-1")
+    write_tls_files(tmp_path, issued, ca.ca_pem, ca.crl_pem())
+    assert load_tls_files(tmp_path).identity.name == "robot-1"
+
+
+# -- watching ------------------------------------------------------------------------------------------------------
+
+
+def test_no_change_is_no_news(folder: Path) -> None:
+    watch = TlsWatch(load_tls_files(folder))
+    assert [watch.poll() for _ in range(3)] == [None] * 3
+
+
+def test_a_renewed_certificate_is_loaded(folder: Path, ca: Authority) -> None:
+    watch = TlsWatch(load_tls_files(folder))
+    issued = ca.renew("robot-1")
+    write_tls_files(folder, issued, ca.ca_pem, ca.crl_pem())
+    new = watch.poll()
+    assert new is not None
+    assert new.certificate_der == issued.certificate_der
+    assert watch.current is new
+    assert watch.poll() is None
+
+
+def test_a_change_before_the_first_look_is_seen(folder: Path, ca: Authority) -> None:
+    files = load_tls_files(folder)
+    ca.revoke("robot-1")
+    (folder / "crl.pem").write_bytes(ca.crl_pem())
+    new = TlsWatch(files).poll()
+    assert new is not None
+    assert new.crl_pem != files.crl_pem
+
+
+def test_files_written_anew_with_the_same_content_are_no_news(folder: Path) -> None:
+    watch = TlsWatch(load_tls_files(folder))
+    watch.poll()
+    (folder / "cert.pem").write_bytes((folder / "cert.pem").read_bytes())
+    assert watch.poll() is None
+
+
+def test_broken_files_keep_the_old_ones_and_are_logged_once(
+    folder: Path, ca: Authority, caplog: pytest.LogCaptureFixture
+) -> None:
+    files = load_tls_files(folder)
+    watch = TlsWatch(files)
+    issued = ca.renew("robot-1")
+    (folder / "cert.pem").write_bytes(issued.certificate_pem)
+    with caplog.at_level(logging.ERROR):
+        assert watch.poll() is None
+        assert not caplog.records, "the key may be on its way"
+        assert [watch.poll() for _ in range(5)] == [None] * 5
+    assert len(caplog.records) == 1
+    assert "expected the key of cert.pem" in caplog.text
+    assert watch.current is files
+
+    (folder / "key.pem").write_bytes(issued.key_pem)
+    assert watch.poll() is not None
+
+
+def test_files_replaced_one_by_one_are_not_logged(
+    folder: Path, ca: Authority, caplog: pytest.LogCaptureFixture
+) -> None:
+    watch = TlsWatch(load_tls_files(folder))
+    issued = ca.renew("robot-1")
+    (folder / "cert.pem").write_bytes(issued.certificate_pem)
+    assert watch.poll() is None
+    (folder / "key.pem").write_bytes(issued.key_pem)
+    assert watch.poll() is not None
+    assert not caplog.records
+
+
+def test_permissions_set_right_are_noticed(folder: Path, ca: Authority) -> None:
+    watch = TlsWatch(load_tls_files(folder))
+    key = folder / "key.pem"
+    write_tls_files(folder, ca.renew("robot-1"), ca.ca_pem, ca.crl_pem())
+    key.chmod(0o644)
+    assert [watch.poll() for _ in range(3)] == [None] * 3
+    key.chmod(0o600)
+    assert watch.poll() is not None
+
+
+def test_a_folder_that_vanishes_keeps_the_old_files(folder: Path) -> None:
+    files = load_tls_files(folder)
+    watch = TlsWatch(files)
+    folder.rename(folder.with_name("elsewhere"))
+    assert [watch.poll() for _ in range(3)] == [None] * 3
+    assert watch.current is files
