@@ -39,6 +39,12 @@ Address = tuple[str, int]
 TOKEN_BYTES = 16
 """Size of the stable secret of a sidecar."""
 
+POLICY_PENDING = 0
+"""In place of a policy's fingerprint: nothing is to be judged by it yet, as peers may still be coming back."""
+
+NO_POLICY = 1
+"""In place of a policy's fingerprint: everything is allowed."""
+
 MAX_CREDENTIAL_BYTES = 2048
 """Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
 
@@ -155,8 +161,8 @@ class PeerSet:
     nonce: int
     peers: tuple[Peer, ...] = ()
     removed: tuple[RemovedPeer, ...] = ()
-    policy: int = 0
-    """Fingerprint of the access policy that this set follows; 0: none, or not yet to be judged by it."""
+    policy: int = POLICY_PENDING
+    """Fingerprint of the access policy that this set follows, or POLICY_PENDING, or NO_POLICY."""
 
 
 @dataclass(frozen=True, slots=True)

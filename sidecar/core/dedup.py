@@ -220,9 +220,11 @@ class ExecutionTable:
         self, waiter: Waiter, message: RequestMessage, reason: RejectReason, text: str, now: float
     ) -> Reply:
         """Refuse a copy without remembering it: the request has not run, and may run later."""
+        # These not by name, which is whatever a peer wrote: it would make as many counters as it likes.
         if reason is RejectReason.NOT_OFFERED:
-            # Not by name, which is whatever a peer wrote: it would make as many counters as it likes.
             self._stats.dropped["request_for_unknown_service"] += 1
+        elif reason is RejectReason.FORBIDDEN:
+            self._stats.dropped["request_forbidden"] += 1
         else:
             self._stats.executions[message.service, "refused"] += 1
         rejection = RejectionMessage(message.request_id, message.copy, reason, text)

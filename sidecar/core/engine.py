@@ -91,7 +91,9 @@ class Engine:
         self._offers = Offers(config.rules)
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
         self._measurements = Measurements()
-        self._serving = Serving(ServingParts(config.rules, self.routes, self._outbox, self.stats, self._events.append))
+        self._serving = Serving(
+            ServingParts(config.rules, self.routes, self._outbox, self.stats, self._events.append, self.peers.may_call)
+        )
         self._requests = RequestTable(
             RequestParts(
                 self._offers,

@@ -38,6 +38,8 @@ class RejectReason(enum.IntEnum):
     """It ran, but its answer is larger than a message may be."""
     CANCELLED = 9
     """The robot called it off before the local server got it."""
+    FORBIDDEN = 10
+    """The access policy does not let this robot call this service here."""
 
     @property
     def certainly_not_run(self) -> bool:
@@ -127,6 +129,16 @@ class CancelExecution:
     execution: ExecutionId
 
 
+@dataclass(frozen=True, slots=True)
+class CallsForbidden:
+    """A robot asked for what it may not call, `count` times since this was told last; `service` is the latest."""
+
+    robot: NodeName
+    service: ServiceName
+    """As the robot wrote it: any text."""
+    count: int
+
+
 ApplicationEvent = (
     OfferService
     | WithdrawService
@@ -136,4 +148,5 @@ ApplicationEvent = (
     | ExecuteRequest
     | AbandonExecution
     | CancelExecution
+    | CallsForbidden
 )

@@ -1,8 +1,9 @@
 """The peers this sidecar may talk to: the control plane's view, corrected by what the paths themselves prove.
 
 A peer that merely vanished from the view (its lease ran out, or the control plane restarted with an empty registry)
-is kept while a path to it lives: a dead control plane must not cost a request. One that left or was revoked goes at
-once.
+is kept while a path to it lives: a dead control plane must not cost a request. One that left, was revoked or is kept
+away by the access policy goes at once; so does every one that vanished when the policy changes, since nobody said what
+it may do under the new one.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from protos.model import PeerSet, RemovalReason, Version
+from protos.model import NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
 from sidecar.core.link_events import LinkPeer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address, InterfaceId, NodeName, Peer, SessionId
+    from protos.model import Address, InterfaceId, NodeName, Peer, ServiceName, SessionId
     from sidecar.core.link_events import PeerRestarted
 
 MAX_PEERS = 4096
@@ -32,6 +33,8 @@ class Peers:
         self._known: dict[NodeName, Peer] = {}
         self._unlisted: set[NodeName] = set()
         self._restarted_at: dict[NodeName, float] = {}
+        self._policy = NO_POLICY
+        """Fingerprint of the access policy that was judged by last."""
         self.version = Version(0)
 
     def __contains__(self, name: object) -> bool:
@@ -59,8 +62,9 @@ class Peers:
         sessions = {peer.session for peer in peer_set.peers}
         known = {peer.name: self._newer(peer, sessions) for peer in peer_set.peers}
         unlisted = set()
+        new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)
         for name, peer in self._known.items():
-            if name in known or name in gone or peer.session in sessions or len(known) >= MAX_PEERS:
+            if new_policy or name in known or name in gone or peer.session in sessions or len(known) >= MAX_PEERS:
                 continue
             if reaches(name):
                 known[name] = peer
@@ -68,6 +72,8 @@ class Peers:
         self._known = known
         self._restarted_at = {name: at for name, at in self._restarted_at.items() if name in known}
         self._unlisted = unlisted
+        if peer_set.policy != POLICY_PENDING:
+            self._policy = peer_set.policy
         self.version = peer_set.version
         return None
 
@@ -102,6 +108,11 @@ class Peers:
         self._restarted_at.pop(name, None)
         del self._known[name]
         return True
+
+    def may_call(self, name: NodeName, service: ServiceName) -> bool:
+        """Cloud: whether the control plane lets this robot call the service here; not if it is unknown."""
+        peer = self._known.get(name)
+        return peer is not None and service in peer.may_call
 
     def session(self, name: NodeName) -> SessionId | None:
         """Return a peer's session."""

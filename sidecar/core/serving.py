@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.dedup import ExecutionTable, Reply, Waiter
 from sidecar.core.events import ExecuteRequest, RejectReason
+from sidecar.core.forbidden import ForbiddenCalls
 from sidecar.core.messages import encode_message
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
@@ -32,6 +33,8 @@ class ServingParts:
     outbox: Outbox
     stats: EngineStats
     emit: Callable[[ApplicationEvent], None]
+    may_call: Callable[[NodeName, ServiceName], bool]
+    """Whether the access policy lets a robot call a service here."""
 
 
 class Serving:
@@ -41,6 +44,7 @@ class Serving:
         self._parts = parts
         self._offers: dict[ServiceName, ServiceOffer] = {}
         self._draining = False
+        self._forbidden = ForbiddenCalls()
         self.executions = ExecutionTable(parts.stats)
 
     @property
@@ -69,7 +73,7 @@ class Serving:
 
     def on_request(self, path: PathId, message: RequestMessage, now: float) -> None:
         """A copy of a request arrived."""
-        refusal = self._refusal(message)
+        refusal = self._refusal(path.peer, message, now)
         if refusal and not self.executions.knows(message.request_id):
             self._reply([self.executions.refuse_unseen(Waiter(path, message.copy), message, *refusal, now)])
             return
@@ -81,7 +85,13 @@ class Serving:
         elif isinstance(outcome, Reply):
             self._reply([outcome])
 
-    def _refusal(self, message: RequestMessage) -> tuple[RejectReason, str] | None:
+    def _refusal(self, robot: NodeName, message: RequestMessage, now: float) -> tuple[RejectReason, str] | None:
+        if not self._parts.may_call(robot, message.service):
+            notice = self._forbidden.note(robot, message.service, now)
+            if notice is not None:
+                self._parts.emit(notice)
+            # Before all else: who may not call a service does not learn either whether it is offered here.
+            return RejectReason.FORBIDDEN, f"the access policy does not let {robot} call {message.service} here"
         offer = self._offers.get(message.service)
         if offer is None:
             return RejectReason.NOT_OFFERED, f"no server for {message.service}"

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceOffer
-from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest, RejectReason
+from sidecar.core.events import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest, RejectReason
 from sidecar.core.rules import find_rule
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
@@ -71,6 +71,13 @@ class CloudSide:
                 self._abandon(event)
             case CancelExecution():
                 self._cancel(event)
+            case CallsForbidden():
+                log.warning(
+                    "%s asks for %a, which the access policy does not let it call here: refused (%d times lately)",
+                    event.robot,
+                    event.service,
+                    event.count,
+                )
             case _:
                 self._stats.dropped["event_for_other_role"] += 1
 

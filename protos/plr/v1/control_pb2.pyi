@@ -531,7 +531,8 @@ class PeerSet(_message.Message):
     policy: _builtins.int
     """Fingerprint of the access policy that this set follows. When it differs from the last one that was not 0, a peer
     that is not listed goes at once, whatever its paths prove: nobody said what it may do under the new policy.
-    0: no policy, or not yet to be judged by it (right after a start, while peers are still coming back).
+    0: not yet to be judged by it (right after a start, while peers are still coming back). 1: there is no policy;
+    then nothing need go.
     """
     @_builtins.property
     def peers(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.Peer]: ...

@@ -1,6 +1,11 @@
 from __future__ import annotations
 
+import dataclasses
+
 from protos.model import (
+    NO_POLICY,
+    POLICY_PENDING,
+    CallPermit,
     Candidate,
     CandidateKind,
     InterfaceId,
@@ -10,18 +15,19 @@ from protos.model import (
     PeerSet,
     RemovalReason,
     RemovedPeer,
+    ServiceName,
     SessionId,
     Version,
 )
 from sidecar.core.link_events import PeerRestarted
 from sidecar.core.peers import MAX_PEERS, RESTART_GAP_S, Peers
-from tests.unit.sidecar.core.builders import A, B, peer
+from tests.unit.sidecar.core.builders import ECHO, A, B, peer
 
 HELD = peer(A, session=1), peer(B, session=2)
 
 
-def view(*listed: Peer, removed: tuple[RemovedPeer, ...] = ()) -> PeerSet:
-    return PeerSet(Version(1), 1, listed, removed)
+def view(*listed: Peer, removed: tuple[RemovedPeer, ...] = (), policy: int = POLICY_PENDING) -> PeerSet:
+    return PeerSet(Version(1), 1, listed, removed, policy)
 
 
 def known(*listed: Peer) -> Peers:
@@ -64,11 +70,48 @@ def test_one_whose_lease_expired_is_kept_one_that_left_or_was_revoked_goes_at_on
         (RemovalReason.LEASE_EXPIRED, True),
         (RemovalReason.LEFT, False),
         (RemovalReason.REVOKED, False),
+        (RemovalReason.FORBIDDEN, False),
     ):
         peers = known(*HELD)
         peers.apply(view(removed=(RemovedPeer(A, reason),)), everybody)
         assert (A in peers) is kept
         assert B in peers
+
+
+def test_one_that_vanished_goes_when_the_policy_changes() -> None:
+    """Nobody said what it may do under the new policy, and its own say-so is worth nothing."""
+    for before, after, kept in (
+        (7, 7, True),
+        (7, 8, False),
+        (7, POLICY_PENDING, True),
+        (7, NO_POLICY, True),
+        (NO_POLICY, 7, False),
+        (POLICY_PENDING, 7, False),
+    ):
+        peers = Peers()
+        peers.apply(view(*HELD, policy=before), nobody)
+        peers.apply(view(HELD[1], policy=after), everybody)
+        assert (A in peers) is kept, (before, after)
+        assert B in peers
+
+
+def test_a_policy_that_was_away_for_a_while_is_a_change() -> None:
+    """Without a policy a peer was allowed everything, which must not outlive the policy's return."""
+    peers = Peers()
+    for policy in (7, NO_POLICY):
+        peers.apply(view(HELD[0], policy=policy), everybody)
+    peers.apply(view(policy=POLICY_PENDING), everybody)
+    assert A in peers
+    peers.apply(view(policy=7), everybody)
+    assert A not in peers
+
+
+def test_only_a_known_robot_may_call_and_only_what_it_was_permitted() -> None:
+    peers = known(dataclasses.replace(HELD[0], may_call=CallPermit(frozenset({ECHO}))), HELD[1])
+    assert peers.may_call(A, ECHO)
+    assert not peers.may_call(A, ServiceName("/other"))
+    assert peers.may_call(B, ServiceName("/other"))
+    assert not peers.may_call(NodeName("stranger"), ECHO)
 
 
 def restart(name: NodeName = A, session: int = 9, incarnation: int = 2) -> PeerRestarted:

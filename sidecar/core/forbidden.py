@@ -1,0 +1,44 @@
+"""Cloud side: what is told of robots that ask for services they may not call; seldom enough for a log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sidecar.core.events import CallsForbidden
+
+if TYPE_CHECKING:
+    from protos.model import NodeName, ServiceName
+
+TELL_EVERY_S = 10.0
+"""Between two notices on one robot."""
+MAX_ROBOTS = 1024
+"""Robots noted; then the one noted first goes, and the next call of it is told at once."""
+
+
+@dataclass(slots=True)
+class _Noted:
+    told_at: float
+    untold: int = 0
+
+
+class ForbiddenCalls:
+    """Counts the calls of each robot between notices."""
+
+    def __init__(self) -> None:
+        self._robots: dict[NodeName, _Noted] = {}
+
+    def note(self, robot: NodeName, service: ServiceName, now: float) -> CallsForbidden | None:
+        """One more call was refused; returns what to tell of it now, if anything."""
+        noted = self._robots.get(robot)
+        if noted is None:
+            if len(self._robots) >= MAX_ROBOTS:
+                del self._robots[next(iter(self._robots))]
+            self._robots[robot] = _Noted(now)
+            return CallsForbidden(robot, service, 1)
+        noted.untold += 1
+        if now < noted.told_at + TELL_EVERY_S:
+            return None
+        notice = CallsForbidden(robot, service, noted.untold)
+        self._robots[robot] = _Noted(now)
+        return notice
