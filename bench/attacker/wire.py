@@ -20,16 +20,18 @@ if TYPE_CHECKING:
 ETHERNET_BYTES = 14
 _ETH_P_ALL = 3
 _ETHERTYPE_IPV4 = b"\x08\x00"
+_ETHERTYPE_IPV6 = b"\x86\xdd"
 _UDP = 17
 _LONGEST = 1 << 17
 _RECEIVE_BUFFER_BYTES = 16 << 20
 _SO_RCVBUFFORCE = 33
-_IP = struct.Struct(">BBHHHBBH4s4s")
+_IPV4 = struct.Struct(">BBHHHBBH4s4s")
+_IPV6 = struct.Struct(">IHBB16s16s")
 _UDP_HEADER = struct.Struct(">HHHH")
 
 
 class Captured(NamedTuple):
-    """A UDP datagram as it was on the wire (IPv4)."""
+    """A UDP datagram as it was on the wire."""
 
     interface: str
     ethernet: bytes
@@ -42,26 +44,27 @@ class Captured(NamedTuple):
 
     def frame(self) -> bytes:
         """The whole frame anew, with good checksums."""
+        family = socket.AF_INET6 if ":" in self.source[0] else socket.AF_INET
+        source, destination = (socket.inet_pton(family, host) for host, _ in (self.source, self.destination))
         length = _UDP_HEADER.size + len(self.payload)
-        header = _IP.pack(
-            0x45,
-            0,
-            _IP.size + length,
-            0,
-            0,
-            64,
-            _UDP,
-            0,
-            socket.inet_aton(self.source[0]),
-            socket.inet_aton(self.destination[0]),
-        )
+        unchecked = _UDP_HEADER.pack(self.source[1], self.destination[1], length, 0) + self.payload
+        pseudo = source + destination + struct.pack(">II", length, _UDP)
+        # RFC 768, RFC 8200 section 8.1: 0 would say that there is none.
+        checksum = _checksum(pseudo + unchecked) or 0xFFFF
+        udp = unchecked[:6] + checksum.to_bytes(2, "big") + unchecked[8:]
+        if family == socket.AF_INET6:
+            return (
+                self.ethernet[:12] + _ETHERTYPE_IPV6 + _IPV6.pack(6 << 28, length, _UDP, 64, source, destination) + udp
+            )
+        header = _IPV4.pack(0x45, 0, _IPV4.size + length, 0, 0, 64, _UDP, 0, source, destination)
         checked = header[:10] + _checksum(header).to_bytes(2, "big") + header[12:]
-        # A checksum of 0 says that there is none (RFC 768).
-        return self.ethernet + checked + _UDP_HEADER.pack(self.source[1], self.destination[1], length, 0) + self.payload
+        return self.ethernet[:12] + _ETHERTYPE_IPV4 + checked + udp
 
 
-def _checksum(header: bytes) -> int:
-    total: int = sum(struct.unpack(">10H", header))
+def _checksum(data: bytes) -> int:
+    """The Internet checksum (RFC 1071)."""
+    data += bytes(len(data) & 1)
+    total: int = sum(struct.unpack(f">{len(data) // 2}H", data))
     while total >> 16:
         total = (total & 0xFFFF) + (total >> 16)
     return ~total & 0xFFFF
@@ -69,22 +72,29 @@ def _checksum(header: bytes) -> int:
 
 def parse(interface: str, frame: bytes, *, outgoing: bool) -> Captured | None:
     """Return the UDP datagram in an Ethernet frame, or None if there is none (or a fragment of one)."""
-    if len(frame) < ETHERNET_BYTES + _IP.size + _UDP_HEADER.size or frame[12:14] != _ETHERTYPE_IPV4:
+    ethernet, packet = frame[:ETHERNET_BYTES], frame[ETHERNET_BYTES:]
+    if ethernet[12:] == _ETHERTYPE_IPV4 and len(packet) >= _IPV4.size:
+        first, _, total, _, fragment, _, protocol, _, source, destination = _IPV4.unpack_from(packet)
+        head = 4 * (first & 15)
+        if fragment & 0x3FFF:
+            return None
+    elif ethernet[12:] == _ETHERTYPE_IPV6 and len(packet) >= _IPV6.size:
+        _, length, protocol, _, source, destination = _IPV6.unpack_from(packet)
+        head = _IPV6.size
+        total = length and head + length
+    else:
         return None
-    packet = frame[ETHERNET_BYTES:]
-    first, _, total, _, fragment, _, protocol, _, source, destination = _IP.unpack_from(packet)
-    head = 4 * (first & 15)
-    if protocol != _UDP or fragment & 0x3FFF or len(packet) < head + _UDP_HEADER.size:
+    if protocol != _UDP or len(packet) < head + _UDP_HEADER.size:
         return None
+    family = socket.AF_INET if len(source) == 4 else socket.AF_INET6
     from_port, to_port, _, _ = _UDP_HEADER.unpack_from(packet, head)
-    # Runs that the kernel has not cut yet have a length of 0 or that of the first.
-    payload = packet[head + _UDP_HEADER.size : total or None]
+    # A run that the kernel has not cut yet may have a length of 0.
     return Captured(
         interface,
-        frame[:ETHERNET_BYTES],
-        (socket.inet_ntoa(source), from_port),
-        (socket.inet_ntoa(destination), to_port),
-        payload,
+        ethernet,
+        (socket.inet_ntop(family, source), from_port),
+        (socket.inet_ntop(family, destination), to_port),
+        packet[head + _UDP_HEADER.size : total or None],
         outgoing,
     )
 

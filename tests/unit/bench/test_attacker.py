@@ -60,8 +60,10 @@ def test_a_flipped_datagram_differs_in_one_bit_and_a_headed_one_keeps_its_sessio
         assert len(mangled(REAL[1], rng)) <= MAX_DATAGRAM_BYTES
 
 
-def test_a_captured_datagram_is_the_same_when_it_is_sent_again() -> None:
-    datagram = Captured("eth0", bytes(12) + b"\x08\x00", ("192.0.2.1", 5), ("192.0.2.2", 6), b"payload", False)
+@pytest.mark.parametrize(("one", "other"), [("192.0.2.1", "192.0.2.2"), ("2001:db8::1", "2001:db8::2")])
+def test_a_captured_datagram_is_the_same_when_it_is_sent_again(one: str, other: str) -> None:
+    kind = b"\x86\xdd" if ":" in one else b"\x08\x00"
+    datagram = Captured("eth0", bytes(12) + kind, (one, 5), (other, 6), b"payload", False)
     assert parse("eth0", datagram.frame(), outgoing=False) == datagram
     assert parse("eth0", datagram.frame() + bytes(10), outgoing=False) == datagram, "Ethernet pads short frames"
     for size in range(len(datagram.frame())):

@@ -1,0 +1,25 @@
+"""One running system for each file of attacks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bench.system import System
+from tests.attacks.world import World, attack_lab
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """The stage, with everything started."""
+    with attack_lab() as lab:
+        stage = World(System(lab, tmp_path_factory.mktemp("attacks")))
+        try:
+            stage.start()
+            yield stage
+        finally:
+            stage.close()

@@ -1,0 +1,162 @@
+"""The stage of the attacks: a running system, requests that go on meanwhile, and an attacker on the way.
+
+    robot  wlan0, wwan0 behind NAT ──┐                ┌── cloud_a, cloud_b
+                                     ├── internet ────┤
+    control ─────────────────────────┘    (taps)      └── attacker: a host like any other
+
+The attacker sees what passes the internet and puts what it likes on any cable there. Nothing else is a stand-in.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from bench.attacker.wire import Tap
+from bench.netlab import Lab, LabConfig, LinkProfile, robot, server
+from tests.netns.calling import Call, assert_flawless
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from bench.attacker.wire import Captured
+    from bench.system import Part, System
+
+CLOUDS = ("cloud_a", "cloud_b")
+ATTACKER = "attacker"
+ATTACKERS_PORT = 4444
+SERVICES = [{"name": "/echo", "deadline_ms": 500, "lifetime_ms": 30_000, "idempotent": True}]
+OFFERS = [{"name": "/echo"}]
+WLAN = LinkProfile(delay_ms=5, jitter_ms=2)
+WWAN = LinkProfile(delay_ms=15, jitter_ms=5)
+OURS = 0xD0
+"""The upper half of the first byte of our datagrams."""
+COUNTED_S = 20.0
+"""A sidecar on a busy machine has taken what came in this time."""
+NOT_AN_ATTACK = ("send_buffer", "unsendable", "receive_", "expired", "unsent", "finished_unwatched", "stun_")
+"""Reasons, by their beginnings, that tell of something else than a datagram refused."""
+
+
+def attack_lab() -> Lab:
+    """The lab with its attacker."""
+    config = LabConfig(
+        robots=(robot("robot"), robot("robot_2", ("eth9",))),
+        clouds=(*(server(name) for name in CLOUDS), server(ATTACKER)),
+    )
+    return Lab(config, seed=1)
+
+
+@dataclass(slots=True)
+class World:
+    """A running system under attack."""
+
+    system: System
+    taps: dict[str, Tap] = field(default_factory=dict)
+
+    @property
+    def lab(self) -> Lab:
+        return self.system.lab
+
+    def start(self) -> None:
+        """Everything a user would start."""
+        for name, profile in (("wlan0", WLAN), ("wwan0", WWAN)):
+            self.lab.link(name, host="robot").set(profile)
+        self.system.start_control_plane()
+        for cloud in CLOUDS:
+            self.start_cloud(cloud)
+        self.system.wait_for_offer(self.start_robot())
+
+    def start_cloud(self, cloud: str) -> None:
+        self.system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
+        self.system.start_cloud(cloud, OFFERS)
+
+    def start_robot(self) -> Part:
+        return self.system.start_robot(SERVICES)
+
+    # -- the wire -------------------------------------------------------------------------------------------------
+
+    def tap(self, host: str, interface: str | None = None) -> Tap:
+        """A tap on the cable to a host's interface; what is sent on it goes to the host.
+
+        A robot's is behind its NAT, as if the attacker were in the same wireless network: the NAT would let little
+        through.
+        """
+        name = interface or self.lab.host(host).interfaces[0]
+        key = f"{host} {name}"
+        if key not in self.taps:
+            if host.startswith("robot"):
+                self.taps[key] = Tap(self.lab.nat(name, host=host).router, "lan0")
+            else:
+                # The internet's interface carries the number of the network it leads to.
+                number = self.lab.host(host).address(name).split(".")[2]
+                self.taps[key] = Tap(self.lab.host("internet"), f"to{number}")
+        tap = self.taps[key]
+        tap.frames()
+        return tap
+
+    def from_attacker(self, one: Captured) -> Captured:
+        """The same datagram with the attacker's own address as its source."""
+        family = 6 if ":" in one.source[0] else 4
+        return one._replace(source=(self.lab.host(ATTACKER).address(family=family), ATTACKERS_PORT))
+
+    def answers_to_attacker(self) -> list[Captured]:
+        """What anybody sent to the attacker's port since the last look at its tap."""
+        return [one for one in self.taps[f"{ATTACKER} eth0"].take() if one.destination[1] == ATTACKERS_PORT]
+
+    def towards(self, tap: Tap, count: int) -> list[Captured]:
+        """Wait for so many datagrams of ours on their way to the host of a tap."""
+        return tap.wait_for(lambda one: one.outgoing and is_ours(one), count)
+
+    # -- counters -------------------------------------------------------------------------------------------------
+
+    def refusals(self, host: str) -> dict[str, float]:
+        """Datagrams that a sidecar refused, by reason."""
+        found: dict[str, float] = {}
+        for series, value in self.system.metrics(host).items():
+            name, _, labels = series.partition("{")
+            if name == "plr_datagrams_dropped_total":
+                reason = labels.partition('reason="')[2].partition('"')[0]
+                if not reason.startswith(NOT_AN_ATTACK):
+                    found[reason] = found.get(reason, 0.0) + value
+        return found
+
+    def wait_until_refused(self, host: str, before: dict[str, float], count: int, *reasons: str) -> None:
+        """Wait until a sidecar counted so many refusals more than `before`, for one of these reasons."""
+        end = time.monotonic() + COUNTED_S
+        while True:
+            now = self.refusals(host)
+            more = {reason: value - before.get(reason, 0.0) for reason, value in now.items()}
+            if sum(more.get(reason, 0.0) for reason in reasons or more) >= count:
+                return
+            assert time.monotonic() < end, f"{host}: {count} refusals as {reasons} expected, more than before: {more}"
+            time.sleep(0.1)
+
+    # -- legitimate traffic ---------------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def calls(self, seconds: float = 4.0, *options: str) -> Iterator[None]:
+        """Requests at 20 Hz beside the attack: at the end, each has been answered once and rightly."""
+        call = Call(self.system, "--duration", f"{seconds:g}", "--rate", "20", *options)
+        call.wait_until_sending()
+        yield
+        assert_flawless(call.result())
+
+    def close(self) -> None:
+        for tap in self.taps.values():
+            tap.__exit__(None, None, None)
+        self.system.close()
+
+
+def is_ours(one: Captured) -> bool:
+    """Whether it is a datagram of the data plane that an attacker can put on the wire whole."""
+    return len(one.payload) <= 1400 and bool(one.payload) and one.payload[0] & 0xF0 == OURS
+
+
+def send_all(tap: Tap, datagrams: Sequence[Captured]) -> None:
+    """Put them on the wire, not all at once."""
+    for number, one in enumerate(datagrams):
+        tap.send(one)
+        if number % 50 == 49:
+            time.sleep(0.01)
