@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 FIRST_SIZE = 8
 """Below rmw's default depth of 10: the server may have other clients."""
-MAX_SIZE = 64
+MAX_SIZE = 32
 """Also what DDS keeps of requests and of answers, and so what a killed server costs: until its lease ends, about 20 s,
 no request counts as delivered to all, and for good DDS keeps as many buffers as it held requests, each as long as the
 longest of them."""
