@@ -1,8 +1,10 @@
-"""plr: ask a running control plane, and look up configuration keys.
+"""plr: ask a running control plane, certify the fleet's nodes, and look up configuration keys.
 
 examples:
   plr status
   plr status --address control.example.org:50051 --json
+  plr ca init
+  plr ca issue robot-1 --role robot
   plr config schema controlplane
   plr config schema sidecar
 
@@ -21,6 +23,7 @@ import grpc
 from google.protobuf import json_format
 
 from controlplane import status_table, version
+from controlplane.ca import commands as ca_commands
 from controlplane.config import ControlPlaneConfig
 from protos.config_fields import check_remote
 from protos.convert import status_from_proto
@@ -66,6 +69,8 @@ def _parser() -> argparse.ArgumentParser:
     status.add_argument("--timeout-s", type=float, default=5.0, metavar="SECONDS")
     status.add_argument("--json", action="store_true", help="print the answer as JSON")
     status.set_defaults(run=_status)
+
+    ca_commands.add_to(commands)
 
     config = commands.add_parser("config", help="about configuration files")
     about = config.add_subparsers(required=True, metavar="COMMAND")

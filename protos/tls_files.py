@@ -37,8 +37,13 @@ POLL_INTERVAL_S = 0.25
 MAX_FILE_BYTES = 4 << 20
 """A revocation list of 100,000 certificates; a larger file is some other file."""
 
-_KEY_FORBIDDEN = stat.S_IRWXO | stat.S_IWGRP
-_FORBIDDEN = stat.S_IWOTH
+KEY_FORBIDDEN = stat.S_IRWXO | stat.S_IWGRP
+"""Permissions that a node's key must not have; its group may read it, so that it need not belong to the service."""
+
+FORBIDDEN = stat.S_IWOTH
+"""Permissions that everything else must not have."""
+
+_READABLE = stat.S_IRGRP | stat.S_IROTH
 
 _log = logging.getLogger(__name__)
 
@@ -62,10 +67,10 @@ def load_tls_files(directory: Path) -> TlsFiles:
     """Return the node's identity; raises ConfigError with one line that tells what to do."""
     if not directory.is_dir():
         raise ConfigError(str(directory), "", "expected a folder with cert.pem, key.pem and ca.pem; see: plr ca issue")
-    _refuse_permissions(directory, directory.stat(), _FORBIDDEN)
+    _refuse_permissions(directory, directory.stat(), FORBIDDEN)
     ca_path, crl_path = directory / CA_FILE, directory / CRL_FILE
-    ca_pem = _read(ca_path, _FORBIDDEN)
-    crl_pem = _read(crl_path, _FORBIDDEN) if crl_path.exists() else None
+    ca_pem = read_guarded(ca_path, FORBIDDEN)
+    crl_pem = read_guarded(crl_path, FORBIDDEN) if crl_path.exists() else None
     try:
         trust = Trust(ca_pem)
     except CertificateError as error:
@@ -80,7 +85,7 @@ def load_tls_files(directory: Path) -> TlsFiles:
 
 def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -> TlsFiles:
     path = directory / CERTIFICATE_FILE
-    certificate_pem = _read(path, _FORBIDDEN)
+    certificate_pem = read_guarded(path, FORBIDDEN)
     try:
         (certificate,) = x509.load_pem_x509_certificates(certificate_pem)
     except ValueError as error:
@@ -91,8 +96,8 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
     except CertificateError as error:
         raise ConfigError(str(path), "", f"{error}; issue one with the CA of {CA_FILE}: plr ca issue") from error
     key_path = directory / KEY_FILE
-    key_pem = _read(key_path, _KEY_FORBIDDEN)
-    key = _private_key(key_pem, key_path)
+    key_pem = read_guarded(key_path, KEY_FORBIDDEN)
+    key = load_private_key(key_pem, None, key_path)
     if key.public_key() != certificate.public_key():
         raise ConfigError(str(key_path), "", f"expected the key of {CERTIFICATE_FILE}; copy both from one plr ca issue")
     return TlsFiles(
@@ -108,36 +113,40 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
     )
 
 
-def _private_key(pem: bytes, path: Path) -> ec.EllipticCurvePrivateKey:
-    try:
-        key = load_pem_private_key(pem, password=None)
-    except TypeError as error:
-        raise ConfigError(str(path), "", "expected a key without a passphrase; issue it anew: plr ca renew") from error
-    except Exception as error:
-        raise ConfigError(str(path), "", "expected a private key in PEM; issue it anew: plr ca renew") from error
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise ConfigError(str(path), "", "expected an ECDSA key; issue it anew: plr ca renew")
-    return key
-
-
-def _read(path: Path, forbidden: int) -> bytes:
+def read_guarded(path: Path, forbidden: int) -> bytes:
+    """Return what the file holds; raises ConfigError, also if it has any of the `forbidden` permissions."""
     try:
         with path.open("rb") as file:
-            # What was opened is checked, not what stands under the name a moment before.
+            # What was opened is checked, not what stood under the name a moment before.
             _refuse_permissions(path, os.fstat(file.fileno()), forbidden)
             data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise ConfigError(str(path), "", f"cannot be read: {error.strerror or error}; see: plr ca issue") from error
+        raise ConfigError(str(path), "", f"cannot be read: {error.strerror or error}") from error
     if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(str(path), "", f"expected at most {MAX_FILE_BYTES} bytes of PEM")
+        raise ConfigError(str(path), "", f"expected at most {MAX_FILE_BYTES} bytes")
     return data
 
 
+def load_private_key(pem: bytes, passphrase: bytes | None, path: Path) -> ec.EllipticCurvePrivateKey:
+    """Return the ECDSA key; raises ConfigError, which names `path`."""
+    try:
+        key = load_pem_private_key(pem, password=passphrase)
+    except TypeError as error:
+        problem = "a key without a passphrase" if passphrase is None else "a key with a passphrase"
+        raise ConfigError(str(path), "", f"expected {problem}") from error
+    except Exception as error:
+        other = "" if passphrase is None else ", or another passphrase"
+        raise ConfigError(str(path), "", f"expected a private key in PEM{other}") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise ConfigError(str(path), "", "expected an ECDSA key")
+    return key
+
+
 def _refuse_permissions(path: Path, status: os.stat_result, forbidden: int) -> None:
-    if status.st_mode & forbidden & _KEY_FORBIDDEN & ~_FORBIDDEN:
-        raise ConfigError(str(path), "", f"others may read or change the private key; do: chmod o=,g-w {path}")
-    if status.st_mode & forbidden:
-        raise ConfigError(str(path), "", f"everybody may change it; do: chmod o-w {path}")
+    mode = stat.S_IMODE(status.st_mode)
+    if mode & forbidden:
+        problem = "others may read or change it" if forbidden & _READABLE else "everybody may change it"
+        raise ConfigError(str(path), "", f"{problem}; do: chmod {mode & ~forbidden:o} {path}")
 
 
 class TlsWatch:

@@ -18,7 +18,7 @@ from controlplane.ca.certificates import (
     generate_key,
 )
 from controlplane.ca.files import write_tls_files
-from controlplane.ca.index import Entry
+from controlplane.ca.index import Entry, Record
 from protos.names import node_name
 
 if TYPE_CHECKING:
@@ -44,18 +44,20 @@ class AuthorityError(ValueError):
 
 
 class Authority:
-    """A CA with its key. Times come from `clock` (seconds since 1970)."""
+    """A CA with its key, and those before it that nodes still believe. Times come from `clock` (seconds since 1970)."""
 
     def __init__(
         self,
         own: Issued,
         entries: Iterable[Entry] = (),
         crl_number: int = 0,
+        former: Iterable[Authority] = (),
         clock: Callable[[], float] = time.time,
     ) -> None:
         self.own = own
         self.entries = list(entries)
         self.crl_number = crl_number
+        self.former = list(former)
         self._clock = clock
 
     @classmethod
@@ -63,20 +65,25 @@ class Authority:
         cls, name: str = "fleet", *, days: float = DEFAULT_CA_DAYS, clock: Callable[[], float] = time.time
     ) -> Authority:
         """Make a new CA; `name` is for people."""
-        key = generate_key()
-        now = clock()
-        validity = Validity(now - BACKDATE_S, now + days * DAY_S)
-        return cls(Issued(build_authority(name, key, validity), key), clock=clock)
+        return cls(_own(name, days, clock()), clock=clock)
 
     @property
     def ca_pem(self) -> bytes:
-        """The CA's certificate."""
-        return self.own.certificate_pem
+        """The CA's certificate, and those of the former CAs after it."""
+        return b"".join(authority.own.certificate_pem for authority in (self, *self.former))
 
     @property
     def not_after(self) -> float:
         """When the CA's certificate ends."""
         return self.own.certificate.not_valid_after_utc.timestamp()
+
+    def record(self) -> Record:
+        """Return what is to be remembered of this CA beside its key and certificate."""
+        return Record(self.own.certificate.serial_number, self.crl_number, tuple(self.entries))
+
+    def all_entries(self) -> list[Entry]:
+        """Return what the former CAs and this one have issued, oldest first."""
+        return [entry for authority in (*reversed(self.former), self) for entry in authority.entries]
 
     def issue(
         self, name: str, role: IdentityRole, *, days: float = DEFAULT_DAYS, validity: Validity | None = None
@@ -87,7 +94,7 @@ class Authority:
         """
         node_name(name, "the name")
         now = self._clock()
-        if any(entry.name == name and entry.in_force(now) for entry in self.entries):
+        if any(entry.name == name and entry.in_force(now) for entry in self.all_entries()):
             raise AuthorityError(f"{name} has a certificate; do: plr ca renew {name}")
         return self._issue(name, role, validity or self._validity(days), generate_key())
 
@@ -103,27 +110,56 @@ class Authority:
 
     def revoke(self, name: str, reason: x509.ReasonFlags = x509.ReasonFlags.unspecified) -> list[Entry]:
         """Revoke every certificate of a name that is in force; returns them. Raises AuthorityError if there is none."""
-        now = self._clock()
         self.latest(name)
+        revoked = [entry for authority in (self, *self.former) for entry in authority._revoke(name, reason)]
+        if not revoked:
+            raise AuthorityError(f"{name} has no certificate in force")
+        return revoked
+
+    def _revoke(self, name: str, reason: x509.ReasonFlags) -> list[Entry]:
+        now = self._clock()
         revoked = []
         for place, entry in enumerate(self.entries):
             if entry.name == name and entry.in_force(now):
                 self.entries[place] = dataclasses.replace(entry, revoked_at=now, reason=reason.value)
                 revoked.append(self.entries[place])
-        if not revoked:
-            raise AuthorityError(f"{name} has no certificate in force")
-        self.crl_number += 1
+        if revoked:
+            self.crl_number += 1
         return revoked
+
+    def rotate(self, name: str, *, days: float = DEFAULT_CA_DAYS) -> None:
+        """Make a new CA that issues from now on; the one before it stays believed until `retire`.
+
+        No node can show a certificate of the new CA before the others have its `ca_pem`.
+        """
+        before = Authority(self.own, self.entries, self.crl_number, clock=self._clock)
+        self.own, self.entries, self.crl_number = _own(name, days, self._clock()), [], 0
+        self.former.insert(0, before)
+
+    def retire(self) -> None:
+        """Forget the former CAs; raises AuthorityError while a node has a certificate of theirs only."""
+        now = self._clock()
+        renewed = {entry.name for entry in self.entries if entry.in_force(now)}
+        waiting = sorted({entry.name for entry in self.all_entries() if entry.in_force(now)} - renewed)
+        if waiting:
+            raise AuthorityError(
+                f"{len(waiting)} nodes have a certificate of the former CA only; renew or revoke first: "
+                + ", ".join(waiting[:5])
+            )
+        self.former.clear()
 
     def latest(self, name: str) -> Entry:
         """Return the entry of the name's newest certificate; raises AuthorityError for an unknown name."""
-        for entry in reversed(self.entries):
+        for entry in reversed(self.all_entries()):
             if entry.name == name:
                 return entry
         raise AuthorityError(f"{name} has no certificate of this CA; do: plr ca issue {name} --role ...")
 
     def crl_pem(self) -> bytes:
-        """Return the revocation list; it stands as long as the CA."""
+        """Return the revocation lists of this CA and the former ones; each stands as long as its CA."""
+        return b"".join(authority._own_crl_pem() for authority in (self, *self.former))
+
+    def _own_crl_pem(self) -> bytes:
         revoked = [
             (entry.serial, entry.revoked_at, entry.reason) for entry in self.entries if entry.revoked_at is not None
         ]
@@ -147,8 +183,6 @@ class Authority:
     def _validity(self, days: float) -> Validity:
         now = self._clock()
         end = now + days * DAY_S
-        if not days > 0:
-            raise AuthorityError("expected a positive number of days")
         if end > self.not_after:
             left = max(0, int((self.not_after - now) // DAY_S))
             raise AuthorityError(f"the CA itself ends in {left} days; ask for fewer, or change the CA")
@@ -166,3 +200,8 @@ class Authority:
             )
         )
         return Issued(certificate, key)
+
+
+def _own(name: str, days: float, now: float) -> Issued:
+    key = generate_key()
+    return Issued(build_authority(name, key, Validity(now - BACKDATE_S, now + days * DAY_S)), key)

@@ -20,12 +20,18 @@ PUBLIC_FILE = 0o644
 
 
 def write_atomically(path: Path, data: bytes, mode: int) -> None:
-    """Put the file in place whole, with this mode, and on the disk before it returns; raises OSError."""
+    """Put the file in place whole, with this mode, and on the disk before it returns; raises OSError.
+
+    It belongs to whom its folder belongs, so that root can renew what a service reads.
+    """
+    owner = path.parent.stat()
     descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
             file.flush()
+            if os.geteuid() == 0:
+                os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
             os.fchmod(file.fileno(), mode)
             os.fsync(file.fileno())
         os.replace(temporary, path)

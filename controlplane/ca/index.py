@@ -1,12 +1,22 @@
-"""What a CA has issued and revoked."""
+"""What a CA has issued and revoked, and how that is written down (index.json)."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from protos.config_file import key_path
+from protos.errors import ConfigError
+from protos.identity import IdentityRole  # noqa: TC001 - pydantic reads the annotation
+from protos.names import node_name
 
 if TYPE_CHECKING:
-    from protos.identity import IdentityRole
+    from collections.abc import Iterable
+    from pathlib import Path
+
     from protos.model import NodeName
 
 
@@ -25,3 +35,91 @@ class Entry:
     def in_force(self, now_wall: float) -> bool:
         """Whether the certificate is neither revoked nor past its time."""
         return self.revoked_at is None and now_wall <= self.not_after
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What one CA has done: its certificate's serial number, its last revocation list's number, what it issued."""
+
+    serial: int
+    crl_number: int
+    entries: tuple[Entry, ...]
+
+
+def _number(text: object) -> int:
+    if not isinstance(text, str):
+        raise ValueError("expected a hexadecimal number in quotes")
+    return int(text, 16)
+
+
+_Serial = Annotated[int, BeforeValidator(_number)]
+"""Written as hexadecimal text: its 160 bits are more than other JSON readers keep of a number."""
+
+_Name = Annotated[str, AfterValidator(lambda text: node_name(text, "the name"))]
+
+
+class _EntryRow(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: _Name
+    role: IdentityRole
+    serial: _Serial
+    not_before: float
+    not_after: float
+    revoked_at: float | None = None
+    reason: str = ""
+
+    def entry(self) -> Entry:
+        name = node_name(self.name, "the name")
+        return Entry(name, self.role, self.serial, self.not_before, self.not_after, self.revoked_at, self.reason)
+
+
+class _RecordRow(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    serial: _Serial
+    crl_number: int = Field(ge=0)
+    entries: tuple[_EntryRow, ...]
+
+
+class _Index(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    authorities: tuple[_RecordRow, ...] = Field(min_length=1)
+    """The CA that issues, then the former ones, newest first."""
+
+
+def encode_index(records: Iterable[Record]) -> bytes:
+    """Return the file's content."""
+    rows = [
+        {
+            "serial": f"{record.serial:x}",
+            "crl_number": record.crl_number,
+            "entries": [
+                {
+                    "name": entry.name,
+                    "role": entry.role.value,
+                    "serial": f"{entry.serial:x}",
+                    "not_before": entry.not_before,
+                    "not_after": entry.not_after,
+                    "revoked_at": entry.revoked_at,
+                    "reason": entry.reason,
+                }
+                for entry in record.entries
+            ],
+        }
+        for record in records
+    ]
+    return json.dumps({"authorities": rows}, indent=1).encode() + b"\n"
+
+
+def decode_index(data: bytes, path: Path) -> tuple[Record, ...]:
+    """Return what the CAs have done, the one that issues first; raises ConfigError, which names `path`."""
+    try:
+        index = _Index.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ConfigError(str(path), key_path(first["loc"]), f"not what plr ca wrote: {first['msg']}") from error
+    return tuple(
+        Record(row.serial, row.crl_number, tuple(entry.entry() for entry in row.entries)) for row in index.authorities
+    )

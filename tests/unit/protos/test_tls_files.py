@@ -55,11 +55,11 @@ def other_ca() -> Authority:
 
 Breakage = tuple[str, "Callable[[Path], object]", str]
 BREAKAGES: list[Breakage] = [
-    ("key.pem", lambda path: path.unlink(), "cannot be read: No such file or directory; see: plr ca issue"),
-    ("key.pem", lambda path: path.chmod(0o604), "do: chmod o=,g-w "),
-    ("key.pem", lambda path: path.chmod(0o601), "do: chmod o=,g-w "),
-    ("key.pem", lambda path: path.chmod(0o602), "everybody may change it"),
-    ("key.pem", lambda path: path.chmod(0o620), "do: chmod o=,g-w "),
+    ("key.pem", lambda path: path.unlink(), "cannot be read: No such file or directory"),
+    ("key.pem", lambda path: path.chmod(0o604), "others may read or change it; do: chmod 600 "),
+    ("key.pem", lambda path: path.chmod(0o641), "others may read or change it; do: chmod 640 "),
+    ("key.pem", lambda path: path.chmod(0o602), "others may read or change it; do: chmod 600 "),
+    ("key.pem", lambda path: path.chmod(0o660), "others may read or change it; do: chmod 640 "),
     ("key.pem", lambda path: path.write_bytes(b"nothing"), "expected a private key in PEM"),
     (
         "key.pem",
@@ -71,7 +71,7 @@ BREAKAGES: list[Breakage] = [
         lambda path: path.write_bytes(pkcs8(ec.generate_private_key(ec.SECP256R1()))),
         "expected the key of cert.pem",
     ),
-    ("cert.pem", lambda path: path.chmod(0o646), "do: chmod o-w "),
+    ("cert.pem", lambda path: path.chmod(0o646), "everybody may change it; do: chmod 644 "),
     ("cert.pem", lambda path: path.unlink(), "cannot be read"),
     ("cert.pem", lambda path: path.write_bytes(b""), "expected one certificate in PEM"),
     ("cert.pem", lambda path: path.write_bytes(path.read_bytes() * 2), "expected one certificate in PEM"),

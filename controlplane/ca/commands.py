@@ -1,0 +1,273 @@
+"""`plr ca`: the fleet's CA on the command line."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+
+from controlplane.ca import listing
+from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, Authority, AuthorityError
+from controlplane.ca.files import write_tls_files
+from controlplane.ca.folder import NOT_THE_OWNER, AuthorityFolder
+from protos.errors import ConfigError, DecodeError
+from protos.identity import IdentityRole
+from protos.names import node_name, text
+from protos.tls_files import (
+    CA_FILE,
+    CERTIFICATE_FILE,
+    CRL_FILE,
+    KEY_FILE,
+    KEY_FORBIDDEN,
+    load_private_key,
+    read_guarded,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+
+_EXAMPLES = """examples:
+  plr ca init --name warehouse
+  plr ca issue cp --role controlplane
+  plr ca issue robot-1 --role robot --days 30
+  plr ca issue alice --role operator --out ~/.plr-tls
+  plr ca list
+  plr ca renew robot-1
+  plr ca revoke robot-1 --reason keyCompromise
+
+exit codes: 0 ok, 1 refused or not done, 2 bad usage or a CA folder that is not in order
+"""
+
+_REASONS = {
+    reason.value: reason
+    for reason in (
+        x509.ReasonFlags.unspecified,
+        x509.ReasonFlags.key_compromise,
+        x509.ReasonFlags.superseded,
+        x509.ReasonFlags.cessation_of_operation,
+        x509.ReasonFlags.privilege_withdrawn,
+    )
+}
+_MAX_DAYS = 36_500.0
+_MAX_COMMON_NAME = 64
+
+
+def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `ca` to the commands of plr."""
+    ca = commands.add_parser(
+        "ca",
+        help="issue and revoke the fleet's certificates",
+        description="Issue, renew and revoke the certificates that name every node of the fleet.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    about = ca.add_subparsers(required=True, metavar="COMMAND")
+    for name, command, summary, details in (
+        ("init", _init, "make the CA", "Make the CA's key and certificate in a folder of its own."),
+        ("issue", _issue, "make a node's key and certificate", "Write a folder ready to be the node's tls_dir."),
+        ("renew", _renew, "make a further certificate for a node", "The one before it stays good until its end."),
+        ("revoke", _revoke, "refuse a node from now on", "Revoke all certificates of a name and write crl.pem."),
+        ("list", _list, "show what was issued", "Show every certificate and how long it is good."),
+        ("rotate", _rotate, "make a new CA beside the one in use", "Both are believed until: plr ca retire."),
+        ("retire", _retire, "stop believing former CAs", "Refused while a node depends on one of them."),
+    ):
+        parser = about.add_parser(name, help=summary, description=details)
+        parser.add_argument("--dir", type=Path, default=Path("plr-ca"), help="the CA's folder (default: ./plr-ca)")
+        _ARGUMENTS[name](parser)
+        parser.set_defaults(run=_reported(command))
+
+
+def _signing(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--passphrase-file", type=Path, metavar="FILE", help="what the CA's key is encrypted with")
+
+
+def _init_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--name", type=_common_name, default="fleet", help="what people call the CA (default: fleet)")
+    parser.add_argument("--days", type=_days, default=DEFAULT_CA_DAYS, help="how long it lasts (default: 3650)")
+    _signing(parser)
+
+
+def _out_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", type=_node_name, metavar="NAME")
+    parser.add_argument("--days", type=_days, default=DEFAULT_DAYS, help="how long it lasts (default: 90)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where to write it (default: nodes/NAME in the CA's)")
+    _signing(parser)
+
+
+def _issue_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--role", required=True, choices=[role.value for role in IdentityRole])
+    _out_arguments(parser)
+
+
+def _renew_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--keep-key", action="store_true", help="certify the key that is there, make no new one")
+    _out_arguments(parser)
+
+
+def _revoke_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", type=_node_name, metavar="NAME")
+    parser.add_argument("--reason", choices=[*_REASONS], default=x509.ReasonFlags.unspecified.value)
+    _signing(parser)
+
+
+_ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
+    "init": _init_arguments,
+    "issue": _issue_arguments,
+    "renew": _renew_arguments,
+    "revoke": _revoke_arguments,
+    "list": lambda parser: None,
+    "rotate": _init_arguments,
+    "retire": _signing,
+}
+
+
+def _reported(command: Callable[[argparse.Namespace], None]) -> Callable[[argparse.Namespace], int]:
+    def run(arguments: argparse.Namespace) -> int:
+        try:
+            command(arguments)
+        except AuthorityError as error:
+            sys.stderr.write(f"plr: {error}\n")
+            return EXIT_FAILED
+        except ConfigError as error:
+            sys.stderr.write(f"plr: {error}\n")
+            return EXIT_USAGE
+        except OSError as error:
+            sys.stderr.write(f"plr: {error.filename or arguments.dir}: {error.strerror or error}\n")
+            return EXIT_FAILED
+        return EXIT_OK
+
+    return run
+
+
+def _init(arguments: argparse.Namespace) -> None:
+    folder = _folder(arguments)
+    authority = Authority.create(arguments.name, days=arguments.days)
+    folder.create(authority)
+    _say(f"made the CA {arguments.name}, good until {listing.day(authority.not_after)}: {folder.path}")
+
+
+def _issue(arguments: argparse.Namespace) -> None:
+    folder = _folder(arguments)
+    role = IdentityRole(arguments.role)
+    with folder.locked() as authority:
+        out = arguments.out or folder.node_folder(arguments.name)
+        _refuse_taken(out, arguments.name)
+        issued = authority.issue(arguments.name, role, days=arguments.days)
+        folder.save(authority)
+        write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
+    until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
+    _say(f"issued {arguments.name} ({role.value}), good until {until}: {out}")
+
+
+def _renew(arguments: argparse.Namespace) -> None:
+    folder = _folder(arguments)
+    with folder.locked() as authority:
+        out = arguments.out or folder.node_folder(arguments.name)
+        last = authority.latest(arguments.name)
+        _refuse_taken(out, arguments.name)
+        key = _kept_key(out) if arguments.keep_key else None
+        issued = authority.renew(arguments.name, days=arguments.days, key=key)
+        folder.save(authority)
+        write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
+    until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
+    _say(f"renewed {arguments.name} ({last.role.value}), good until {until}: {out}")
+
+
+def _revoke(arguments: argparse.Namespace) -> None:
+    folder = _folder(arguments)
+    with folder.locked() as authority:
+        revoked = authority.revoke(arguments.name, _REASONS[arguments.reason])
+        folder.save(authority)
+    _say(f"revoked {len(revoked)} of {arguments.name}; copy to the control plane's tls_dir: {folder.path / CRL_FILE}")
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    folder = _folder(arguments)
+    records = folder.records()
+    _say(listing.render(records, [folder.certificate(record) for record in records], time.time()))
+
+
+def _rotate(arguments: argparse.Namespace) -> None:
+    folder = _folder(arguments)
+    with folder.locked() as authority:
+        authority.rotate(arguments.name, days=arguments.days)
+        folder.save(authority)
+    _say(f"made the CA {arguments.name}; before renewing any node, copy to every tls_dir: {folder.path / CA_FILE}")
+
+
+def _retire(arguments: argparse.Namespace) -> None:
+    folder = _folder(arguments)
+    with folder.locked() as authority:
+        authority.retire()
+        folder.save(authority)
+    _say(f"retired; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}")
+
+
+def _folder(arguments: argparse.Namespace) -> AuthorityFolder:
+    path: Path | None = getattr(arguments, "passphrase_file", None)
+    if path is None:
+        return AuthorityFolder(arguments.dir)
+    passphrase = read_guarded(path, NOT_THE_OWNER).strip(b"\r\n")
+    if not passphrase:
+        raise ConfigError(str(path), "", "expected a passphrase")
+    return AuthorityFolder(arguments.dir, passphrase)
+
+
+def _refuse_taken(out: Path, name: str) -> None:
+    """Raise AuthorityError if the folder holds the key of a node with another name."""
+    if not (out / KEY_FILE).exists():
+        return
+    try:
+        certificate = x509.load_pem_x509_certificate((out / CERTIFICATE_FILE).read_bytes())
+        owners = [each.value for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
+    except (OSError, ValueError):
+        owners = []
+    if owners != [name]:
+        raise AuthorityError(f"{out}: holds another node's key; give another --out")
+
+
+def _kept_key(out: Path) -> ec.EllipticCurvePrivateKey:
+    path = out / KEY_FILE
+    return load_private_key(read_guarded(path, KEY_FORBIDDEN), None, path)
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+
+
+def _node_name(value: str) -> str:
+    try:
+        return node_name(value, "the name")
+    except DecodeError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _common_name(value: str) -> str:
+    try:
+        text(value, "the name")
+    except DecodeError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    if not 1 <= len(value) <= _MAX_COMMON_NAME:
+        raise argparse.ArgumentTypeError(f"expected 1 to {_MAX_COMMON_NAME} characters")
+    return value
+
+
+def _days(value: str) -> float:
+    try:
+        days = float(value)
+    except ValueError:
+        days = 0.0
+    if not 0 < days <= _MAX_DAYS:
+        raise argparse.ArgumentTypeError(f"expected a number of days, more than 0, at most {_MAX_DAYS:.0f}")
+    return days

@@ -1,0 +1,146 @@
+"""A CA on disk.
+
+    index.json               the CAs, the one that issues first, and what each has issued and revoked
+    authorities/SERIAL/      cert.pem and key.pem of each; the key perhaps under a passphrase
+    ca.pem, crl.pem          what every node needs, written from the above
+    nodes/NAME/              a folder for each node, ready to be its `tls_dir`
+
+The folder is its owner's alone, every file is replaced whole, and one command at a time changes anything. index.json
+alone says what is: a command cut short before it has written that has not happened.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+from typing import TYPE_CHECKING
+
+from cryptography import x509
+
+from controlplane.ca.authority import Authority
+from controlplane.ca.certificates import Issued, private_key_pem
+from controlplane.ca.files import PRIVATE_FILE, PRIVATE_FOLDER, PUBLIC_FILE, write_atomically
+from controlplane.ca.index import decode_index, encode_index
+from protos.errors import ConfigError
+from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from controlplane.ca.index import Record
+
+INDEX_FILE = "index.json"
+AUTHORITIES = "authorities"
+NODES = "nodes"
+_LOCK_FILE = ".lock"
+
+NOT_THE_OWNER = 0o077
+"""Permissions that nothing of a CA's has to have."""
+
+
+class AuthorityFolder:
+    """Where a CA is kept; `passphrase` is for its private keys."""
+
+    def __init__(self, path: Path, passphrase: bytes | None = None) -> None:
+        self.path = path
+        self._passphrase = passphrase
+
+    def node_folder(self, name: str) -> Path:
+        """Where a node's files go unless told otherwise."""
+        return self.path / NODES / name
+
+    def create(self, authority: Authority) -> None:
+        """Keep a new CA; raises ConfigError if there is one, and OSError."""
+        self.path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+        self.path.chmod(PRIVATE_FOLDER)
+        with self._lock():
+            if (self.path / INDEX_FILE).exists():
+                raise ConfigError(str(self.path), "", "there is a CA already; another one needs another --dir")
+            self.save(authority)
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[Authority]:
+        """Load the CA and keep other commands from changing it meanwhile; raises ConfigError."""
+        self._check()
+        with self._lock():
+            first, *former = (self._load(record) for record in self.records())
+            first.former = former
+            yield first
+
+    def records(self) -> tuple[Record, ...]:
+        """Return what the CAs have done, the one that issues first; needs no passphrase. Raises ConfigError."""
+        self._check()
+        path = self.path / INDEX_FILE
+        return decode_index(read_guarded(path, NOT_THE_OWNER), path)
+
+    def certificate(self, record: Record) -> x509.Certificate:
+        """Return the certificate of a CA that is kept here; raises ConfigError."""
+        path = self._own_folder(record) / CERTIFICATE_FILE
+        try:
+            return x509.load_pem_x509_certificate(read_guarded(path, NOT_THE_OWNER))
+        except ValueError as error:
+            raise ConfigError(str(path), "", "expected a certificate in PEM") from error
+
+    def save(self, authority: Authority) -> None:
+        """Keep the CA as it is now; raises OSError.
+
+        The revocation list is written before the index: cut short in between, revoking again completes it. The other
+        way round the certificate would count as revoked, and no node would hear of it.
+        """
+        records = [each.record() for each in (authority, *authority.former)]
+        for each, record in zip((authority, *authority.former), records, strict=True):
+            self._keep_key(each, self._own_folder(record))
+        write_atomically(self.path / CRL_FILE, authority.crl_pem(), PUBLIC_FILE)
+        write_atomically(self.path / INDEX_FILE, encode_index(records), PRIVATE_FILE)
+        write_atomically(self.path / CA_FILE, authority.ca_pem, PUBLIC_FILE)
+        self._refresh_nodes()
+        kept = {self._own_folder(record) for record in records}
+        for path in (self.path / AUTHORITIES).iterdir():
+            if path not in kept:
+                shutil.rmtree(path)
+
+    def _refresh_nodes(self) -> None:
+        """Give every node's folder the CAs and revocations of now: whoever copies it again takes nothing back."""
+        for name in (CA_FILE, CRL_FILE):
+            data = (self.path / name).read_bytes()
+            for path in (self.path / NODES).glob(f"*/{name}"):
+                if path.read_bytes() != data:
+                    write_atomically(path, data, PUBLIC_FILE)
+
+    def _keep_key(self, authority: Authority, folder: Path) -> None:
+        if (folder / KEY_FILE).exists():
+            return
+        folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+        write_atomically(folder / CERTIFICATE_FILE, authority.own.certificate_pem, PRIVATE_FILE)
+        write_atomically(folder / KEY_FILE, private_key_pem(authority.own.key, self._passphrase), PRIVATE_FILE)
+
+    def _load(self, record: Record) -> Authority:
+        path = self._own_folder(record) / KEY_FILE
+        pem = read_guarded(path, NOT_THE_OWNER)
+        if (b"ENCRYPTED" in pem) != (self._passphrase is not None):
+            problem = "has a passphrase; give" if self._passphrase is None else "has no passphrase; leave out"
+            raise ConfigError(str(path), "", f"the CA's key {problem} --passphrase-file")
+        key = load_private_key(pem, self._passphrase, path)
+        return Authority(Issued(self.certificate(record), key), record.entries, record.crl_number)
+
+    def _own_folder(self, record: Record) -> Path:
+        return self.path / AUTHORITIES / f"{record.serial:x}"
+
+    def _check(self) -> None:
+        if not (self.path / INDEX_FILE).is_file():
+            raise ConfigError(str(self.path), "", "expected the folder of a CA; see: plr ca init --help")
+        mode = self.path.stat().st_mode
+        if mode & NOT_THE_OWNER:
+            raise ConfigError(str(self.path), "", f"others may enter it; do: chmod 700 {self.path}")
+
+    @contextlib.contextmanager
+    def _lock(self) -> Iterator[None]:
+        descriptor = os.open(self.path / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, PRIVATE_FILE)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(descriptor)

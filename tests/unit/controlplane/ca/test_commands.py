@@ -1,0 +1,172 @@
+"""`plr ca` as a user meets it: what it writes is a node's tls_dir, and every error is one line with its exit code."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from controlplane import cli
+from protos.identity import CertificateError, IdentityRole
+from protos.tls_files import load_tls_files
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class Shell:
+    """Runs `plr ca` in a folder of its own."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def __call__(self, *arguments: str, code: int = 0) -> str:
+        """Return what it prints, or what it complains of."""
+        assert cli.main(["ca", *arguments]) == code
+        printed = self._capsys.readouterr()
+        if code:
+            assert printed.out == ""
+            assert printed.err.startswith("plr: ")
+            assert printed.err.count("\n") == 1
+        return printed.err if code else printed.out
+
+    def usage(self, *arguments: str) -> str:
+        with pytest.raises(SystemExit) as caught:
+            cli.main(["ca", *arguments])
+        assert caught.value.code == 2
+        return self._capsys.readouterr().err
+
+
+@pytest.fixture
+def shell(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Shell:
+    monkeypatch.chdir(tmp_path)
+    return Shell(capsys)
+
+
+@pytest.mark.parametrize("role", [role.value for role in IdentityRole])
+def test_what_is_issued_is_a_tls_dir(shell: Shell, tmp_path: Path, role: str) -> None:
+    shell("init", "--name", "warehouse")
+    assert "plr-ca/nodes/node-1" in shell("issue", "node-1", "--role", role)
+    identity = load_tls_files(tmp_path / "plr-ca" / "nodes" / "node-1").identity
+    assert (identity.name, identity.role.value) == ("node-1", role)
+
+
+def test_a_certificate_is_renewed_in_its_place(shell: Shell, tmp_path: Path) -> None:
+    out = tmp_path / "tls"
+    shell("init")
+    shell("issue", "robot-1", "--role", "robot", "--days", "1", "--out", str(out))
+    first = load_tls_files(out)
+    shell("renew", "robot-1", "--out", str(out))
+    second = load_tls_files(out)
+    assert second.identity.not_after > first.identity.not_after
+    assert second.key_pem != first.key_pem
+    shell("renew", "robot-1", "--keep-key", "--out", str(out))
+    third = load_tls_files(out)
+    assert third.key_pem == second.key_pem
+    assert third.identity.serial != second.identity.serial
+
+
+def test_a_revoked_node_is_in_the_list_that_is_to_be_copied(shell: Shell, tmp_path: Path) -> None:
+    shell("init")
+    shell("issue", "cp", "--role", "controlplane")
+    shell("issue", "robot-1", "--role", "robot")
+    robot = load_tls_files(tmp_path / "plr-ca/nodes/robot-1")
+    assert "plr-ca/crl.pem" in shell("revoke", "robot-1", "--reason", "keyCompromise")
+    control_plane = load_tls_files(tmp_path / "plr-ca/nodes/cp")
+    with pytest.raises(CertificateError, match="revoked"):
+        control_plane.trust.check(robot.certificate_der, robot.identity.not_before)
+
+
+def test_the_list_shows_everything(shell: Shell) -> None:
+    shell("init", "--name", "warehouse")
+    shell("issue", "robot-2", "--role", "robot", "--days", "30")
+    shell("issue", "robot-1", "--role", "robot")
+    shell("renew", "robot-2", "--days", "60")
+    shell("revoke", "robot-1", "--reason", "superseded")
+    header, *rows = (line.split() for line in shell("list").splitlines())
+    assert header == ["NAME", "ROLE", "SERIAL", "VALID", "UNTIL", "DAYS", "LEFT", "STATE"]
+    shown = [(row[0], row[1], row[4], " ".join(row[5:])) for row in rows]
+    assert shown[0] == ("warehouse", "CA", "3650.0", "in use")
+    assert shown[1][:3] == ("robot-1", "robot", "-")
+    assert shown[1][3].startswith("revoked ")
+    assert shown[1][3].endswith("(superseded)")
+    assert shown[2:] == [("robot-2", "robot", "30.0", "valid, renewed"), ("robot-2", "robot", "60.0", "valid")]
+
+
+def test_a_ca_is_rotated(shell: Shell, tmp_path: Path) -> None:
+    shell("init")
+    shell("issue", "cp", "--role", "controlplane")
+    old = load_tls_files(tmp_path / "plr-ca/nodes/cp")
+    shell("rotate", "--name", "next")
+    assert "renew or revoke first: cp" in shell("retire", code=1)
+    between = load_tls_files(tmp_path / "plr-ca/nodes/cp")
+    assert between.ca_pem == (tmp_path / "plr-ca/ca.pem").read_bytes() != old.ca_pem
+    shell("renew", "cp")
+    shell("retire")
+    new = load_tls_files(tmp_path / "plr-ca/nodes/cp")
+    between.trust.check(new.certificate_der, new.identity.not_before)
+    with pytest.raises(CertificateError, match="another CA"):
+        new.trust.identify(old.certificate_der)
+
+
+def test_the_key_may_have_a_passphrase(shell: Shell, tmp_path: Path) -> None:
+    secret = tmp_path / "passphrase"
+    secret.write_text("correct horse\n")
+    secret.chmod(0o600)
+    shell("init", "--passphrase-file", str(secret))
+    assert "give --passphrase-file" in shell("issue", "robot-1", "--role", "robot", code=2)
+    shell("issue", "robot-1", "--role", "robot", "--passphrase-file", str(secret))
+    assert "robot-1" in shell("list")
+    secret.write_text("wrong\n")
+    assert "another passphrase" in shell("renew", "robot-1", "--passphrase-file", str(secret), code=2)
+    secret.write_text("\n")
+    assert "expected a passphrase" in shell("renew", "robot-1", "--passphrase-file", str(secret), code=2)
+    secret.chmod(0o644)
+    assert "others may read" in shell("renew", "robot-1", "--passphrase-file", str(secret), code=2)
+
+
+def test_what_is_refused_says_what_to_do(shell: Shell, tmp_path: Path) -> None:
+    assert "see: plr ca init" in shell("list", code=2)
+    assert "see: plr ca init" in shell("issue", "robot-1", "--role", "robot", code=2)
+    shell("init", "--days", "10")
+    assert "there is a CA already" in shell("init", code=2)
+    assert "the CA itself ends" in shell("issue", "robot-1", "--role", "robot", code=1)
+    assert "plr ca issue robot-1" in shell("renew", "robot-1", "--days", "1", code=1)
+    shell("issue", "robot-1", "--role", "robot", "--days", "1")
+    assert "plr ca renew robot-1" in shell("issue", "robot-1", "--role", "cloud", "--days", "1", code=1)
+    other = str(tmp_path / "plr-ca/nodes/robot-1")
+    assert "another --out" in shell("issue", "robot-2", "--role", "robot", "--days", "1", "--out", other, code=1)
+    shell("revoke", "robot-1")
+    assert "no certificate in force" in shell("revoke", "robot-1", code=1)
+
+
+def test_a_folder_that_can_not_be_written_is_one_line(shell: Shell, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "file" in shell("init", "--dir", str(tmp_path / "file" / "ca"), code=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        ([], "required"),
+        (["issue", "robot-1"], "--role"),
+        (["issue", "robot-1", "--role", "admin"], "invalid choice"),
+        (["issue", "robot 1", "--role", "robot"], "is not a name of 1 to 63"),
+        (["issue", "../x", "--role", "robot"], "is not a name of 1 to 63"),
+        (["issue", "robot-1", "--role", "robot", "--days", "0"], "a number of days"),
+        (["issue", "robot-1", "--role", "robot", "--days", "nan"], "a number of days"),
+        (["revoke", "robot-1", "--reason", "because"], "invalid choice"),
+        (["init", "--name", "n" * 65], "1 to 64 characters"),
+        (["init", "--name", "a\nb"], "not printable"),
+    ],
+)
+def test_bad_usage_is_told(shell: Shell, arguments: list[str], problem: str) -> None:
+    assert problem in shell.usage(*arguments)
+
+
+@pytest.mark.parametrize("command", ["init", "issue", "renew", "revoke", "list", "rotate", "retire"])
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["ca", command, "--help"])
+    assert caught.value.code == 0
+    assert "--dir" in capsys.readouterr().out
