@@ -35,7 +35,7 @@ POLL_INTERVAL_S = 0.25
 """How often to look for changes: a revocation has to have its effect within a second."""
 
 MAX_FILE_BYTES = 4 << 20
-"""A revocation list of 100,000 certificates; a larger file is some other file."""
+"""A revocation list of some 50,000 certificates; a larger file is some other file."""
 
 KEY_FORBIDDEN = stat.S_IRWXO | stat.S_IWGRP
 """Permissions that a node's key must not have; its group may read it, so that it need not belong to the service."""

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+from pathlib import Path
 
 import pytest
 
 from controlplane import cli
 from protos.identity import CertificateError, IdentityRole
 from protos.tls_files import load_tls_files
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 class Shell:
@@ -170,3 +168,13 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
         cli.main(["ca", command, "--help"])
     assert caught.value.code == 0
     assert "--dir" in capsys.readouterr().out
+
+
+def test_the_commands_of_the_page_work_in_their_order(shell: Shell) -> None:
+    page = Path(__file__).parents[4] / "docs" / "certificates.md"
+    commands = re.findall(r"^ *plr ca (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert {command.split()[0] for command in commands} == {
+        *("init", "issue", "list", "renew", "revoke", "rotate", "retire")
+    }
+    for command in commands:
+        shell(*command.split())
