@@ -88,7 +88,8 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
     certificate_pem = read_guarded(path, FORBIDDEN)
     try:
         (certificate,) = x509.load_pem_x509_certificates(certificate_pem)
-    except ValueError as error:
+    except Exception as error:
+        # Not ValueError alone: a version that does not exist, for one, is another kind.
         raise ConfigError(str(path), "", "expected one certificate in PEM; copy the one of plr ca issue") from error
     certificate_der = certificate.public_bytes(Encoding.DER)
     try:
