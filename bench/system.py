@@ -71,13 +71,15 @@ class System:
         """Start plr-controlplane on the host `control`."""
         host = self.lab.host("control")
         config = {
+            "insecure": True,
             "listen": f"0.0.0.0:{CONTROL_PORT}",
             "stun_listen": [f"0.0.0.0:{STUN_PORT}"],
             "stun_servers": [f"{host.address()}:{STUN_PORT}"],
             "metrics_listen": f"127.0.0.1:{CONTROL_METRICS_PORT}",
             **changes,
         }
-        return self._start("controlplane", host, "controlplane", self._write("controlplane", config))
+        argv = ["-m", "controlplane", "--config", str(self._write("controlplane", config)), "--insecure-i-know"]
+        return self._popen("controlplane", host, [sys.executable, *argv], 0)
 
     def start_cloud(self, name: str, services: Sequence[dict[str, Any]], **changes: Any) -> Part:
         """Start a cloud's sidecar; `services` as in its configuration."""

@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING
 import sdnotify
 
 from controlplane import version
-from controlplane.config import load_config
+from controlplane.certificates import load_own_files
+from controlplane.config import load_config, refuse_exposed
 from protos.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from controlplane.config import ControlPlaneConfig
     from controlplane.server import Addresses
+    from protos.tls_files import TlsFiles
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -42,6 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         config = load_config(arguments.config)
+        if not arguments.insecure_i_know:
+            refuse_exposed(config, str(arguments.config))
+        files = load_own_files(config.tls_dir) if config.tls_dir is not None else None
     except ConfigError as error:
         sys.stderr.write(f"plr-controlplane: {error}\n")
         return EXIT_USAGE
@@ -49,15 +54,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"{arguments.config}: ok\n")
         return EXIT_OK
     _start_logging(config.log_level)
-    return _serve(arguments.config, config)
+    return _serve(arguments.config, config, files)
 
 
-def _serve(source: Path, config: ControlPlaneConfig) -> int:
+def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> int:
     # gRPC takes half a second to import, which checking a configuration need not wait for.
     from controlplane.server import StartError
 
     try:
-        asyncio.run(_run(config))
+        asyncio.run(_run(config, files))
     except StartError as error:
         log.critical("%s: %s", source, error)
         return EXIT_FAILED
@@ -78,6 +83,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="YAML configuration")
     parser.add_argument("--check-config", action="store_true", help="check the configuration, then exit")
+    parser.add_argument(
+        "--insecure-i-know",
+        action="store_true",
+        help="allow insecure: true on an address that other machines reach: anybody there may read and change all",
+    )
     parser.add_argument("--version", action="version", version=version.describe("plr-controlplane"))
     return parser
 
@@ -90,9 +100,15 @@ def _start_logging(level: str) -> None:
         format="%(asctime)s.%(msecs)03dZ %(levelname)s %(name)s: %(message)s",
         datefmt="%Y-%m-%dT%H:%M:%S",
     )
+    logging.getLogger("grpc._cython.cygrpc").addFilter(_is_not_a_lost_stream)
 
 
-async def _run(config: ControlPlaneConfig) -> None:
+def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
+    """gRPC writes a traceback when a client goes while its call is being ended, which anybody can make happen."""
+    return not record.getMessage().startswith("ExecuteBatchError raised in core")
+
+
+async def _run(config: ControlPlaneConfig, files: TlsFiles | None) -> None:
     from controlplane.server import serve
 
     stop = asyncio.Event()
@@ -120,7 +136,12 @@ async def _run(config: ControlPlaneConfig) -> None:
         log.info("stopping")
         systemd.notify("STOPPING=1")
 
-    await serve(config, stop, ready, stopping)
+    if files is None:
+        log.warning(
+            "insecure: true: no encryption towards sidecars and operators, and everybody who reaches %s is believed",
+            config.listen,
+        )
+    await serve(config, files, stop, ready, stopping)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from controlplane.core.control_events import Settings
-from protos.config_fields import ListenAddress, RemoteAddress, refuse_duplicates
+from protos.config_fields import (
+    ListenAddress,
+    RemoteAddress,
+    TlsDir,
+    check_security,
+    is_loopback,
+    refuse_duplicates,
+)
 from protos.config_file import parse_yaml, read_text, validate
+from protos.errors import ConfigError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,6 +36,16 @@ class ControlPlaneConfig(BaseModel):
 
     listen: ListenAddress = Field(
         default="[::]:50051", description="address:port of the gRPC server; port 0 takes a free one."
+    )
+    tls_dir: TlsDir | None = Field(
+        default=None,
+        description="Absolute path of the folder with cert.pem, key.pem, ca.pem and perhaps crl.pem, as plr ca issue "
+        "writes it; read anew when they change. Required unless insecure.",
+    )
+    insecure: bool = Field(
+        default=False,
+        description="true: no TLS, everybody is who they say. For trying out on one machine; refused with a listen "
+        "address that others reach, unless --insecure-i-know is on the command line.",
     )
     stun_listen: Annotated[
         tuple[ListenAddress, ...], BeforeValidator(_as_list), AfterValidator(refuse_duplicates), Field(max_length=16)
@@ -79,6 +97,11 @@ class ControlPlaneConfig(BaseModel):
     log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="Least level logged.")
 
     @model_validator(mode="after")
+    def _secured_or_not(self) -> Self:
+        check_security(self.tls_dir, self.insecure)
+        return self
+
+    @model_validator(mode="after")
     def _leases_outlast_reports(self) -> Self:
         if self.lease_ms < 3 * self.report_interval_ms:
             raise ValueError(
@@ -97,6 +120,16 @@ class ControlPlaneConfig(BaseModel):
             default_capacity_interfaces=self.default_capacity_interfaces,
             stun_servers=self.stun_servers,
         )
+
+
+def refuse_exposed(config: ControlPlaneConfig, source: str) -> None:
+    """Refuse to serve others without TLS; raises ConfigError."""
+    if config.insecure and not is_loopback(config.listen):
+        problem = (
+            f"expected a loopback address with insecure: true, got '{config.listen}'; use tls_dir, or start with "
+            "--insecure-i-know"
+        )
+        raise ConfigError(source, "listen", problem)
 
 
 def load_config(path: Path) -> ControlPlaneConfig:

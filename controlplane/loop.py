@@ -9,10 +9,12 @@ import time
 from typing import TYPE_CHECKING
 
 from controlplane.core.assignment import Plan, Problem
+from controlplane.core.claims import check_claims
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Close, CloseReason, DepartureNotice, NackNotice, Send
 from controlplane.core.registry import Refusal
 from controlplane.mailbox import Mailbox
+from protos.identity import REVOKED, CertificateError
 
 if TYPE_CHECKING:
     from controlplane.config import ControlPlaneConfig
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
     from controlplane.core.registry import StreamId
     from controlplane.metrics import Metrics
     from controlplane.stun_server import StunServer
-    from protos.model import Registration, SidecarMessage, SidecarStatus
+    from controlplane.tls_gate import Caller
+    from protos.identity import Trust
+    from protos.model import NodeName, Registration, SidecarMessage, SidecarStatus
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +56,7 @@ class ControlLoop:
         self._metrics = metrics
         self._core = ControlCore(config.settings(), version_epoch=wall_clock_epoch(), now=self._loop.time())
         self._mailboxes: dict[StreamId, Mailbox] = {}
+        self._callers: dict[NodeName, Caller] = {}
         self._superseded = 0
         self._wake = asyncio.Event()
         self._stopping = False
@@ -60,11 +65,16 @@ class ControlLoop:
 
     # ── for the streams ──
 
-    def register(self, registration: Registration) -> tuple[StreamId, Mailbox] | Refusal:
-        """Begin a stream; returns what to write to it, or why it is refused."""
+    def register(self, registration: Registration, caller: Caller | None) -> tuple[StreamId, Mailbox] | Refusal:
+        """Begin a stream; returns what to write to it, or why it is refused. `caller` is None in insecure mode."""
+        refusal = None if caller is None else check_claims(registration, caller.identity)
+        if refusal is not None:
+            return self._core.refuse(refusal)
         result = self._core.register(registration, self._loop.time())
         if isinstance(result, Refusal):
             return result
+        if caller is not None:
+            self._callers[registration.name] = caller
         log.info(
             "%s (%s, incarnation %d, software %s) connected",
             registration.name,
@@ -112,7 +122,36 @@ class ControlLoop:
                     )
                 case DepartureNotice(sidecar=name, reason=reason):
                     log.info("%s is gone: %s", name, reason.value)
+                    self._callers.pop(name, None)
         self._wake.set()
+
+    # ── for who watches the certificates ──
+
+    def review(self, trust: Trust, now_wall: float) -> None:
+        """Part with the sidecars whose certificates are not good any more; `now_wall` is seconds since 1970."""
+        for name, caller in list(self._callers.items()):
+            try:
+                trust.check(caller.certificate, now_wall)
+            except CertificateError as error:
+                self._part_with(name, error)
+        self._dispatch()
+
+    def end_expired(self, trust: Trust, now_wall: float) -> None:
+        """The same for those whose time is over, at next to no cost while there are none."""
+        if any(caller.identity.not_after < now_wall for caller in self._callers.values()):
+            self.review(trust, now_wall)
+
+    def _part_with(self, name: NodeName, error: CertificateError) -> None:
+        del self._callers[name]
+        log.warning("%s: %s", name, error)
+        if error.reason == REVOKED:
+            self._core.revoke(name, self._loop.time())
+        else:
+            self._core.end_stream(name, CloseReason.CERTIFICATE_ENDED)
+
+    def refused(self, reason: str) -> None:
+        """Count a connection or call that was refused or ended, by one of metrics.REFUSAL_REASONS."""
+        self._metrics.refused_connection(reason)
 
     def stream_ended(self, peer: str, code: str, details: str) -> None:
         """A stream was ended by us; `peer` is where it came from."""

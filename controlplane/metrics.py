@@ -7,12 +7,15 @@ and which `promtool check metrics` complains of.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from typing import TYPE_CHECKING
 
 import prometheus_client
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
+from controlplane import handshakes, limits, tls_gate
+from protos import identity
 from protos.model import ResourceKind, Role, SyncState
 
 if TYPE_CHECKING:
@@ -22,9 +25,34 @@ if TYPE_CHECKING:
 
     from controlplane.core.control import ControlCore
     from controlplane.stun_server import StunServer
+    from protos.identity import Identity
 
 SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 """A robot alone takes milliseconds, a hundred a quarter of a second, a thousand some seconds."""
+
+
+SECONDS_PER_DAY = 86_400.0
+
+REFUSAL_REASONS = (
+    identity.MALFORMED,
+    identity.UNTRUSTED,
+    identity.EXPIRED,
+    identity.NOT_YET_VALID,
+    identity.WRONG_ROLE,
+    identity.REVOKED,
+    handshakes.NO_CERTIFICATE,
+    handshakes.OLD_TLS,
+    handshakes.NOT_TLS,
+    handshakes.CLIENT_REFUSED,
+    handshakes.HANDSHAKE_TIMEOUT,
+    handshakes.HANDSHAKE_ABORTED,
+    handshakes.HANDSHAKE_FAILED,
+    tls_gate.TOO_MANY_HANDSHAKES,
+    tls_gate.TOO_MANY_CONNECTIONS,
+    limits.TOO_MANY_STREAMS,
+    limits.TOO_FAST,
+)
+"""Labels of plr_refused_connections_total, there from the start."""
 
 
 class _Values:
@@ -56,7 +84,24 @@ class Metrics:
             ["code"],
             registry=self.registry,
         )
+        self._refused_connections = prometheus_client.Counter(
+            "plr_refused_connections_total",
+            "Connections and calls refused or ended because of who makes them or how, by reason.",
+            ["reason"],
+            registry=self.registry,
+        )
+        for reason in REFUSAL_REASONS:
+            self._refused_connections.labels(reason)
+        self._own_certificate: Identity | None = None
         self.registry.register(self._values)
+
+    def refused_connection(self, reason: str) -> None:
+        """A connection or call was refused or ended; `reason` is one of REFUSAL_REASONS."""
+        self._refused_connections.labels(reason).inc()
+
+    def own_certificate(self, identity: Identity) -> None:
+        """This is the certificate shown from now on."""
+        self._own_certificate = identity
 
     def start(self, host: str, port: int) -> tuple[str, int]:
         """Serve them over HTTP; returns where. Raises OSError if the address cannot be had."""
@@ -71,6 +116,7 @@ class Metrics:
             *_plan(core, now),
             *_drops(core, superseded),
             *_stun(stun_servers),
+            *_certificate(self._own_certificate),
         )
 
 
@@ -107,7 +153,7 @@ def _members(core: ControlCore) -> Iterable[Metric]:
         "plr_departures_total",
         "Sidecars that left the registry, by reason.",
         ["reason"],
-        {("lease_expired",): counters.expired, ("left",): counters.left},
+        {("lease_expired",): counters.expired, ("left",): counters.left, ("revoked",): counters.revoked},
     )
 
 
@@ -180,6 +226,23 @@ def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
             ("report_of_cloud",): core.counters.reports_ignored,
             ("superseded_before_sent",): superseded,
         },
+    )
+
+
+def _certificate(own: Identity | None) -> Iterable[Metric]:
+    if own is None:
+        return
+    yield _gauge(
+        "plr_certificate_expiry_timestamp_seconds",
+        "When the certificate in use ends, in seconds since 1970.",
+        [],
+        {(): own.not_after},
+    )
+    yield _gauge(
+        "plr_certificate_days_left",
+        "Days until the certificate in use ends; negative when it has.",
+        [],
+        {(): (own.not_after - time.time()) / SECONDS_PER_DAY},
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import tempfile
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,10 +14,14 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from controlplane import admin, service
+from controlplane.access import AccessGuard
+from controlplane.certificates import CertificateKeeper
 from controlplane.core.registry import MAX_SIDECARS
+from controlplane.limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
 from controlplane.stun_server import start_stun_server
+from controlplane.tls_gate import TlsGate
 from protos.config_fields import split_host_port
 from protos.plr.v1 import admin_pb2_grpc
 
@@ -24,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from controlplane.config import ControlPlaneConfig
+    from protos.tls_files import TlsFiles
 
 log = logging.getLogger(__name__)
 
@@ -37,12 +43,20 @@ GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
     # Ours find connections that died silently; the lease has removed their sidecar by then.
     ("grpc.keepalive_time_ms", 20_000),
     ("grpc.keepalive_timeout_ms", 10_000),
+    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+    ("grpc.max_concurrent_streams", MAX_STREAMS_PER_CONNECTION),
+    # A connection without a call is not worth its place for longer than somebody reads the answer to the one before.
+    ("grpc.max_connection_idle_ms", 60_000),
     # A second control plane on the same port is a mistake to be told, not to be shared the streams with.
     ("grpc.so_reuseport", 0),
 )
 
 MAX_CALLS = 2 * MAX_SIDECARS
 """Calls served at once: a stream for each sidecar, and room for those that replace one and for the operator."""
+
+
+_SERVICES = ("", service.SERVICE_NAME, admin.SERVICE_NAME)
+"""What health is told of; the first is the server as a whole."""
 
 
 class StartError(Exception):
@@ -59,30 +73,40 @@ class Addresses:
 
 
 async def serve(
-    config: ControlPlaneConfig, stop: asyncio.Event, ready: Callable[[Addresses], None], stopping: Callable[[], None]
+    config: ControlPlaneConfig,
+    files: TlsFiles | None,
+    stop: asyncio.Event,
+    ready: Callable[[Addresses], None],
+    stopping: Callable[[], None],
 ) -> None:
     """Serve until `stop`; calls `ready` when everything listens, `stopping` when the end begins.
 
-    Raises StartError if an address cannot be had.
+    `files` is None in insecure mode. Raises StartError if an address cannot be had.
     """
     metrics = Metrics()
     loop = ControlLoop(config, metrics)
-    server = grpc.aio.server(options=GRPC_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
-    health_service = health.aio.HealthServicer()
-    names = (service.SERVICE_NAME, admin.SERVICE_NAME)
-    service.ControlPlaneService(loop).add_to(server)
-    admin_pb2_grpc.add_AdminServicer_to_server(admin.AdminService(loop), server)
-    health_pb2_grpc.add_HealthServicer_to_server(health_service, server)
-    reflection.enable_server_reflection((*names, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
     async with contextlib.AsyncExitStack() as cleanup:
+        # Nobody but this user gets at the socket behind the gate.
+        folder = cleanup.enter_context(tempfile.TemporaryDirectory(prefix="plr-controlplane-"))
+        upstream = f"{folder}/grpc"
+        gate = TlsGate(files, upstream, metrics.refused_connection) if files is not None else None
+        server, health_service = _make_server(config, loop, metrics, gate)
         stun = await _start_stun(config, loop, cleanup)
         metrics_address = _start_metrics(config, metrics)
-        grpc_address = _add_port(config, server)
+        if gate is None:
+            grpc_address = _add_port(config, server)
+        else:
+            server.add_insecure_port(f"unix:{upstream}")
+            grpc_address = _open_gate(config, gate)
+            cleanup.push_async_callback(gate.close)
         await server.start()
         cleanup.push_async_callback(server.stop, 0.0)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(loop.run())
-            for name in ("", *names):
+            keeper = None
+            if files is not None and gate is not None:
+                keeper = tasks.create_task(CertificateKeeper(files, gate, loop, metrics).run())
+            for name in _SERVICES:
                 await health_service.set(name, health_pb2.HealthCheckResponse.SERVING)
             ready(Addresses(grpc_address, stun, metrics_address))
             await stop.wait()
@@ -91,6 +115,31 @@ async def serve(
             loop.close_streams()
             await server.stop(STOP_GRACE_S)
             loop.stop()
+            if keeper is not None:
+                keeper.cancel()
+
+
+def _make_server(
+    config: ControlPlaneConfig, loop: ControlLoop, metrics: Metrics, gate: TlsGate | None
+) -> tuple[grpc.aio.Server, health.aio.HealthServicer]:
+    guards = () if gate is None else (AccessGuard(gate.caller, metrics.refused_connection),)
+    server = grpc.aio.server(interceptors=guards, options=GRPC_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
+    caller = None if gate is None else gate.caller
+    service.ControlPlaneService(loop, config.report_interval_ms / 1000, caller).add_to(server)
+    admin_pb2_grpc.add_AdminServicer_to_server(admin.AdminService(loop), server)
+    health_service = health.aio.HealthServicer()
+    health_pb2_grpc.add_HealthServicer_to_server(health_service, server)
+    reflected = (service.SERVICE_NAME, admin.SERVICE_NAME, health.SERVICE_NAME, reflection.SERVICE_NAME)
+    reflection.enable_server_reflection(reflected, server)
+    return server, health_service
+
+
+def _open_gate(config: ControlPlaneConfig, gate: TlsGate) -> str:
+    host, port = split_host_port(config.listen)
+    try:
+        return _join(host, gate.listen(host, port))
+    except OSError as error:
+        raise StartError(f"listen: cannot listen on {config.listen}: {error.strerror or error}") from error
 
 
 async def _start_stun(

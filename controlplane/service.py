@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, NoReturn
 
 import grpc
@@ -10,15 +11,19 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from controlplane.core.control_events import CloseReason
 from controlplane.core.registry import Refusal
+from controlplane.limits import MAX_STREAMS_PER_NAME, TOO_FAST, TOO_MANY_STREAMS, StreamCount, StreamRate
 from protos.convert import control_message_to_proto, parse_sidecar_message
 from protos.errors import DecodeError
 from protos.model import PROTOCOL_VERSION, Registration
 from protos.plr.v1 import control_pb2
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from controlplane.core.registry import StreamId
     from controlplane.loop import ControlLoop
     from controlplane.mailbox import Mailbox
+    from controlplane.tls_gate import Caller
     from protos.model import SidecarMessage
 
     Context = grpc.aio.ServicerContext[bytes, control_pb2.ControlMessage]
@@ -33,12 +38,16 @@ _REFUSAL_CODES = {
     Refusal.NAME_TAKEN: grpc.StatusCode.ALREADY_EXISTS,
     Refusal.SESSION_TAKEN: grpc.StatusCode.ALREADY_EXISTS,
     Refusal.FULL: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Refusal.NAME_MISMATCH: grpc.StatusCode.PERMISSION_DENIED,
+    Refusal.WRONG_ROLE: grpc.StatusCode.PERMISSION_DENIED,
 }
 
 _CLOSE_CODES = {
     CloseReason.REPLACED: grpc.StatusCode.ABORTED,
     CloseReason.LEASE_EXPIRED: grpc.StatusCode.DEADLINE_EXCEEDED,
     CloseReason.STOPPING: grpc.StatusCode.UNAVAILABLE,
+    CloseReason.REVOKED: grpc.StatusCode.UNAUTHENTICATED,
+    CloseReason.CERTIFICATE_ENDED: grpc.StatusCode.UNAUTHENTICATED,
 }
 
 
@@ -52,10 +61,19 @@ class _StreamEndError(Exception):
 
 
 class ControlPlaneService:
-    """Serves `Connect`. Bytes are parsed here, not by gRPC, so that bad ones get a clear status."""
+    """Serves `Connect`. Bytes are parsed here, not by gRPC, so that bad ones get a clear status.
 
-    def __init__(self, loop: ControlLoop) -> None:
+    `report_interval_s` is what the sidecars are told.
+    `caller` tells who is behind a peer of gRPC's; None in insecure mode, where a sidecar is who it says.
+    """
+
+    def __init__(
+        self, loop: ControlLoop, report_interval_s: float, caller: Callable[[str], Caller | None] | None
+    ) -> None:
         self._loop = loop
+        self._report_interval_s = report_interval_s
+        self._caller = caller
+        self._streams = StreamCount()
 
     def add_to(self, server: grpc.aio.Server) -> None:
         """Serve on this server."""
@@ -68,14 +86,24 @@ class ControlPlaneService:
     async def connect(self, _: object, context: Context) -> None:
         """Serve one stream until either side ends it."""
         try:
-            await self._serve(context)
+            caller = self._caller_of(context)
+            who = context.peer() if caller is None else caller.identity.name
+            if not self._streams.enter(who):
+                self._loop.refused(TOO_MANY_STREAMS)
+                raise _StreamEndError(
+                    grpc.StatusCode.RESOURCE_EXHAUSTED, f"{who} has {MAX_STREAMS_PER_NAME} streams open"
+                )
+            try:
+                await self._serve(context, caller)
+            finally:
+                self._streams.leave(who)
         except _StreamEndError as end:
             if end.code is not None:
                 self._loop.stream_ended(context.peer(), end.code.name.lower(), end.details)
                 await context.abort(end.code, end.details)
 
-    async def _serve(self, context: Context) -> NoReturn:
-        stream, mailbox = await self._register(context)
+    async def _serve(self, context: Context, caller: Caller | None) -> NoReturn:
+        stream, mailbox = await self._register(context, caller)
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._write(mailbox, context))
@@ -89,7 +117,7 @@ class ControlPlaneService:
             self._loop.disconnected(stream)
         raise AssertionError("neither task ends but by an exception")
 
-    async def _register(self, context: Context) -> tuple[StreamId, Mailbox]:
+    async def _register(self, context: Context, caller: Caller | None) -> tuple[StreamId, Mailbox]:
         try:
             async with asyncio.timeout(REGISTER_TIMEOUT_S):
                 data = await self._receive(context)
@@ -99,10 +127,19 @@ class ControlPlaneService:
         registration = _parse(data)
         if not isinstance(registration, Registration):
             raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
-        result = self._loop.register(registration)
+        result = self._loop.register(registration, caller)
         if isinstance(result, Refusal):
             raise _StreamEndError(_REFUSAL_CODES[result], f"{registration.name}: {result.value}")
         return result
+
+    def _caller_of(self, context: Context) -> Caller | None:
+        if self._caller is None:
+            return None
+        caller = self._caller(context.peer())
+        # The guard saw one a moment ago; a connection that has ended since must not count as insecure mode.
+        if caller is None or caller.refusal is not None:
+            raise _StreamEndError(grpc.StatusCode.UNAUTHENTICATED, "the connection has ended")
+        return caller
 
     @staticmethod
     async def _receive(context: Context) -> bytes:
@@ -112,8 +149,13 @@ class ControlPlaneService:
         return data
 
     async def _read(self, stream: StreamId, context: Context) -> NoReturn:
+        rate = StreamRate(report_interval_s=self._report_interval_s, now=time.monotonic())
         while True:
-            message = _parse(await self._receive(context))
+            data = await self._receive(context)
+            if not rate.take(len(data), time.monotonic()):
+                self._loop.refused(TOO_FAST)
+                raise _StreamEndError(grpc.StatusCode.RESOURCE_EXHAUSTED, "messages come too fast")
+            message = _parse(data)
             try:
                 self._loop.receive(stream, message)
             except DecodeError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import AfterValidator
@@ -63,6 +64,32 @@ def _check_listen(text: str) -> str:
     canonical_ip(host)
     return text
 
+
+def is_loopback(host_port: str) -> bool:
+    """Whether host:port, already checked, stays on this machine; a name other than localhost may lead anywhere."""
+    host, _ = split_host_port(host_port)
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def check_security(tls_dir: Path | None, insecure: bool) -> None:
+    """Check the two keys against each other; raises ValueError that says what was expected."""
+    if tls_dir is None and not insecure:
+        raise ValueError("tls_dir: expected the folder with this node's certificate (see: plr ca issue), but missing")
+    if tls_dir is not None and insecure:
+        raise ValueError("insecure: expected without tls_dir: it is one or the other")
+
+
+def _check_absolute(path: Path) -> Path:
+    if not path.is_absolute():
+        raise ValueError(f"expected an absolute path, got '{path}'")
+    return path
+
+
+TlsDir = Annotated[Path, AfterValidator(_check_absolute)]
+"""Folder of a node's certificate files."""
 
 RemoteAddress = Annotated[str, AfterValidator(check_remote)]
 """host:port to talk to."""

@@ -174,6 +174,32 @@ class ControlCore:
         else:
             self.counters.stale_answers += 1
 
+    def refuse(self, refusal: Refusal) -> Refusal:
+        """Count a registration that the driver does not let in; returns its reason."""
+        self.registry.counters.refused[refusal] += 1
+        return refusal
+
+    def revoke(self, name: NodeName, now: float) -> None:
+        """This sidecar must not be talked to any more: it goes at once, and its peers are told so at once."""
+        sidecar = self.registry.revoke(name)
+        if sidecar is None:
+            return
+        self._end_stream(sidecar, CloseReason.REVOKED)
+        self._forget(name, RemovalReason.REVOKED)
+        self._debounce.note(Change.MEMBERS, now)
+        self._publish()
+
+    def end_stream(self, name: NodeName, reason: CloseReason) -> None:
+        """End a sidecar's stream; it stays registered until its lease ends."""
+        sidecar = self.registry.get(name)
+        if sidecar is not None:
+            self._end_stream(sidecar, reason)
+
+    def _end_stream(self, sidecar: Sidecar, reason: CloseReason) -> None:
+        if sidecar.stream is not None:
+            self._streams.pop(sidecar.stream, None)
+            self._events.append(Close(sidecar.stream, reason))
+
     def disconnected(self, stream: StreamId, now: float) -> None:
         """A stream ended, whoever ended it."""
         name = self._streams.pop(stream, None)
@@ -192,9 +218,7 @@ class ControlCore:
     def handle_timer(self, now: float) -> None:
         """Let leases end, and publish what changed."""
         for sidecar in self.registry.expire(now):
-            if sidecar.stream is not None:
-                self._streams.pop(sidecar.stream, None)
-                self._events.append(Close(sidecar.stream, CloseReason.LEASE_EXPIRED))
+            self._end_stream(sidecar, CloseReason.LEASE_EXPIRED)
             self._forget(sidecar.name, RemovalReason.LEASE_EXPIRED)
             self._members_changed(now)
         if self._held_back and now >= self._warm_until:

@@ -30,6 +30,8 @@ class CloseReason(enum.Enum):
     REPLACED = "replaced by a newer stream of this sidecar"
     LEASE_EXPIRED = "silent for longer than the lease"
     STOPPING = "the control plane is stopping"
+    REVOKED = "the certificate is revoked"
+    CERTIFICATE_ENDED = "the certificate is not good any more"
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,6 +43,8 @@ class Refusal(enum.Enum):
     NAME_TAKEN = "another sidecar holds this name, and its lease has not ended"
     SESSION_TAKEN = "another sidecar has this session number: draw a new one"
     FULL = f"{MAX_SIDECARS} sidecars are registered, which is the limit"
+    NAME_MISMATCH = "the certificate is another name's: set name to the certificate's, or leave it out"
+    WRONG_ROLE = "the certificate is for another role: set role to the certificate's, or leave it out"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +117,7 @@ class RegistryCounters:
     refused: dict[Refusal, int] = field(default_factory=lambda: dict.fromkeys(Refusal, 0))
     expired: int = 0
     left: int = 0
+    revoked: int = 0
     removals_forgotten: int = 0
 
 
@@ -173,6 +176,14 @@ class Registry:
         self._sessions[registration.session] = name
         self._renew(name, now)
         return Admission(replaced=known.stream, new_run=not same_run)
+
+    def revoke(self, name: NodeName) -> Sidecar | None:
+        """Remove it, whatever its lease; returns it as it was, or None if it was not there."""
+        known = self._sidecars.get(name)
+        if known is not None:
+            self.counters.revoked += 1
+            self._remove(name, RemovalReason.REVOKED)
+        return known
 
     def _refuse(self, refusal: Refusal) -> Refusal:
         self.counters.refused[refusal] += 1

@@ -9,12 +9,14 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import grpc
 import yaml
 
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
+from protos.identity import CONTROL_PLANE_DNS
 from protos.model import (
     Ack,
     CandidateSet,
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from controlplane.ca import Issued
+
 Message = TypeVar("Message", bound=ControlMessage)
 
 PATIENCE_S = 30.0
@@ -49,10 +53,11 @@ _LISTENS = re.compile(r"listens: gRPC (\S+), STUN (.+), metrics (\S+)$")
 
 
 class ControlPlaneProcess:
-    """`python -m controlplane` on free ports of loopback."""
+    """`python -m controlplane` on free ports of loopback; insecure unless told a `tls_dir`."""
 
     def __init__(self, folder: Path, **changes: Any) -> None:
         settings = {
+            **({} if "tls_dir" in changes else {"insecure": True}),
             "listen": "127.0.0.1:0",
             "stun_listen": ["127.0.0.1:0"],
             "stun_servers": ["192.0.2.1:3478"],
@@ -86,10 +91,10 @@ class ControlPlaneProcess:
         assert self._process.stderr is not None
         self.lines.extend(line.rstrip() for line in self._process.stderr)
 
-    def wait_for_line(self, *parts: str) -> None:
-        """Wait until a line with all these parts is logged."""
+    def wait_for_line(self, *parts: str, after: int = 0) -> None:
+        """Wait until a line with all these parts is logged, `after` so many others."""
         end = time.monotonic() + PATIENCE_S
-        while not any(all(part in line for part in parts) for line in list(self.lines)):
+        while not any(all(part in line for part in parts) for line in self.lines[after:]):
             assert time.monotonic() < end, f"{parts} not in {self.lines}"
             time.sleep(0.02)
 
@@ -112,11 +117,33 @@ class ControlPlaneProcess:
             self._reader.join()
 
 
+@dataclass(frozen=True, slots=True)
+class Secured:
+    """A client's certificate with its key, and the CA that it trusts."""
+
+    issued: Issued
+    ca_pem: bytes
+
+
+def open_channel(address: str, secured: Secured | None) -> grpc.Channel:
+    """A channel of its own connection."""
+    options = (
+        ("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),
+        ("grpc.use_local_subchannel_pool", 1),
+        ("grpc.enable_retries", 0),
+    )
+    if secured is None:
+        return grpc.insecure_channel(address, options)
+    issued = secured.issued
+    credentials = grpc.ssl_channel_credentials(secured.ca_pem, issued.key_pem, issued.certificate_pem)
+    return grpc.secure_channel(address, credentials, options)
+
+
 class Stream:
     """One control stream: what is put in goes out, what comes in waits in a queue."""
 
-    def __init__(self, address: str) -> None:
-        self._channel = grpc.insecure_channel(address)
+    def __init__(self, address: str, secured: Secured | None = None) -> None:
+        self._channel = open_channel(address, secured)
         self._outgoing: queue.SimpleQueue[control_pb2.SidecarMessage | None] = queue.SimpleQueue()
         self._incoming: queue.SimpleQueue[ControlMessage | grpc.RpcError | None] = queue.SimpleQueue()
         stub = control_pb2_grpc.ControlPlaneStub(self._channel)
@@ -196,8 +223,8 @@ class Stream:
 class Sidecar(Stream):
     """A stream on which a sidecar registered."""
 
-    def __init__(self, address: str, said: Registration) -> None:
-        super().__init__(address)
+    def __init__(self, address: str, said: Registration, secured: Secured | None = None) -> None:
+        super().__init__(address, secured)
         self.registration = said
         self.send(said)
 
@@ -243,17 +270,17 @@ def _resource(message: PeerSet | MappingSet) -> ResourceKind:
     return ResourceKind.PEERS if isinstance(message, PeerSet) else ResourceKind.MAPPING
 
 
-def cloud(address: str, name: str, **changes: Any) -> Sidecar:
+def cloud(address: str, name: str, secured: Secured | None = None, **changes: Any) -> Sidecar:
     """A cloud that offers /plan."""
-    sidecar = Sidecar(address, registration(name, Role.CLOUD, **changes))
+    sidecar = Sidecar(address, registration(name, Role.CLOUD, **changes), secured)
     sidecar.send(CandidateSet(interfaces("eth0")))
     sidecar.send(ServiceSet((offer(),)))
     return sidecar
 
 
-def robot(address: str, name: str = "robot", **changes: Any) -> Sidecar:
+def robot(address: str, name: str = "robot", secured: Secured | None = None, **changes: Any) -> Sidecar:
     """A robot that uses /plan over wlan0 and wwan0."""
-    sidecar = Sidecar(address, registration(name, Role.ROBOT, **changes))
+    sidecar = Sidecar(address, registration(name, Role.ROBOT, **changes), secured)
     sidecar.send(CandidateSet(interfaces("wlan0", "wwan0")))
     sidecar.send(ServiceSet((), (use(),)))
     return sidecar

@@ -60,6 +60,7 @@ class ControlPlane:
         self.port = free_port()
         self._path = folder / "controlplane.yaml"
         settings: dict[str, object] = {
+            "insecure": True,
             "listen": f"127.0.0.1:{self.port}",
             "stun_listen": [],
             "metrics_listen": None,

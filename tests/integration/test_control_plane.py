@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import re
 import signal
@@ -398,11 +397,33 @@ def test_a_bad_configuration_ends_with_2_and_one_line(tmp_path: Path) -> None:
     assert missing.stderr.count("\n") == 1
 
 
-def test_check_config_and_version() -> None:
-    done = run("--config", os.devnull, "--check-config")
-    assert (done.returncode, done.stdout) == (0, f"{os.devnull}: ok\n")
+def test_check_config_and_version(tmp_path: Path) -> None:
+    config = tmp_path / "good.yaml"
+    config.write_text("insecure: true\nlisten: 127.0.0.1:0\n")
+    done = run("--config", str(config), "--check-config")
+    assert (done.returncode, done.stdout) == (0, f"{config}: ok\n")
     assert re.fullmatch(r"plr-controlplane \S+ \(protocol 1\)\n", run("--version").stdout)
     assert run().returncode == 2
+
+
+def test_insecure_mode_is_refused_where_others_reach_it_unless_one_knows(tmp_path: Path) -> None:
+    config = tmp_path / "exposed.yaml"
+    config.write_text("insecure: true\n")
+    done = run("--config", str(config), "--check-config")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"plr-controlplane: {config}: listen: expected a loopback address with insecure")
+    assert run("--config", str(config), "--check-config", "--insecure-i-know").returncode == 0
+
+
+def test_without_certificates_and_without_the_word_insecure_it_does_not_start(tmp_path: Path) -> None:
+    config = tmp_path / "neither.yaml"
+    cases = {"": "tls_dir: expected the folder", "insecure: true\ntls_dir: /etc/plr/tls": "one or the other"}
+    for text, told in cases.items():
+        config.write_text(text)
+        done = run("--config", str(config))
+        assert done.returncode == 2
+        assert told in done.stderr
+        assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -416,7 +437,7 @@ def test_an_address_in_use_ends_with_1_and_names_the_key(tmp_path: Path, key: st
             taken.listen()
         config = tmp_path / "controlplane.yaml"
         free = dict.fromkeys(("listen", "stun_listen", "metrics_listen"), "127.0.0.1:0")
-        config.write_text(yaml.safe_dump(free | {key: f"127.0.0.1:{taken.getsockname()[1]}"}))
+        config.write_text(yaml.safe_dump({"insecure": True} | free | {key: f"127.0.0.1:{taken.getsockname()[1]}"}))
         done = run("--config", str(config))
     assert done.returncode == 1
     assert f"{key}: cannot listen on" in done.stderr

@@ -55,6 +55,7 @@ def write_configurations(folder: Path) -> None:
     (folder / "controlplane.json").write_text(
         json.dumps(
             {
+                "insecure": True,
                 "listen": "127.0.0.1:50051",
                 "stun_listen": "[::]:3478",
                 "stun_servers": ["10.77.0.1:3478"],

@@ -17,7 +17,8 @@ from controlplane.config import ControlPlaneConfig
 from controlplane.core.control import ControlCore
 from controlplane.metrics import Metrics
 from protos.histogram import Histogram
-from protos.model import InterfaceName, ServiceName
+from protos.identity import Identity, IdentityRole
+from protos.model import InterfaceName, NodeName, ServiceName
 from sidecar.config import SidecarConfig
 from sidecar.core.control_session import ControlStats
 from sidecar.core.stats import EngineStats, LinkStats
@@ -130,6 +131,7 @@ def _control_metrics() -> Iterator[Metric]:
     from controlplane.core.control_events import Settings
 
     metrics = Metrics()
+    metrics.own_certificate(Identity(NodeName("control"), IdentityRole.CONTROL_PLANE, 1, 0.0, 1.0))
     metrics.update(ControlCore(Settings(), version_epoch=1, now=0.0), (), 0, 0.0)
     yield from metrics.registry.collect()
 

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def read(text: str) -> ControlPlaneConfig:
-    return parse_config(text, "control.yaml")
+    return parse_config(f"insecure: true\n{text}", "control.yaml")
 
 
 def test_an_empty_file_means_the_defaults() -> None:
     config = read("")
-    assert config == ControlPlaneConfig()
+    assert config == ControlPlaneConfig(insecure=True)
     assert config.default_capacity_interfaces == 1
     assert config.settings().lease_s == 5.0
     assert config.settings().half_life_s == 60.0
@@ -48,7 +48,7 @@ def test_one_address_may_stand_without_a_list() -> None:
         ("lease_ms: soon", "lease_ms: expected a valid integer, unable to parse string as an integer, got 'soon'"),
         ("lease_ms: [1]", "lease_ms: expected a whole number, got [1]"),
         ("lease_ms: 1", "lease_ms: expected greater than or equal to 500, got 1"),
-        ("lease_ms: 600", "lease_ms: expected at least three times report_interval_ms (500), got 600"),
+        ("lease_ms: 600\ninsecure: true", "lease_ms: expected at least three times report_interval_ms (500), got 600"),
         ("listen: '50051'", "listen: expected host:port with a port up to 65535, got '50051'"),
         ("listen: ':50051'", "listen: expected host:port with a port up to 65535, got ':50051'"),
         ("listen: '::1:50051'", "listen: expected an IPv6 address in brackets, as in"),
@@ -69,7 +69,7 @@ def test_one_address_may_stand_without_a_list() -> None:
 )
 def test_a_mistake_is_one_line_that_names_file_key_and_expectation(text: str, line: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        read(text)
+        parse_config(text, "control.yaml")
     assert str(caught.value).startswith(f"control.yaml: {line}")
     assert "\n" not in str(caught.value)
 

@@ -1,0 +1,24 @@
+"""How often something may happen: so many at once, and so many a second after that."""
+
+from __future__ import annotations
+
+
+class TokenBucket:
+    """Full at first; `rate` tokens a second come back, up to `burst`. Times are monotonic seconds."""
+
+    __slots__ = ("_at", "_burst", "_rate", "_tokens")
+
+    def __init__(self, *, rate: float, burst: float, now: float) -> None:
+        self._rate = rate
+        self._burst = burst
+        self._tokens = burst
+        self._at = now
+
+    def take(self, now: float, cost: float = 1.0) -> bool:
+        """Take `cost` tokens; False, and nothing is taken, if they are not there."""
+        self._tokens = min(self._burst, self._tokens + self._rate * max(0.0, now - self._at))
+        self._at = max(self._at, now)
+        if self._tokens < cost:
+            return False
+        self._tokens -= cost
+        return True

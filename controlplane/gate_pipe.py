@@ -1,0 +1,88 @@
+"""Moves bytes between two connections of one event loop, each no faster than the other takes them."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class PipeEnd(asyncio.Protocol):
+    """One of the two connections; what it receives before `join` waits, and it is not read further."""
+
+    def __init__(self, on_lost: Callable[[], None] | None = None) -> None:
+        self._transport: asyncio.Transport | None = None
+        self._other: PipeEnd | None = None
+        self._early = bytearray()
+        self._on_lost = on_lost
+        self.lost = False
+
+    @property
+    def transport(self) -> asyncio.Transport:
+        """The connection; there once the event loop has made it."""
+        assert self._transport is not None
+        return self._transport
+
+    @staticmethod
+    def join(one: PipeEnd, other: PipeEnd) -> None:
+        """From now on what one receives is written to the other; both have to be connected."""
+        one._other, other._other = other, one
+        for source, sink in ((one, other), (other, one)):
+            if source._early:
+                sink.transport.write(bytes(source._early))
+                source._early.clear()
+        if one.lost or other.lost:
+            one.close()
+            other.close()
+            return
+        one.transport.resume_reading()
+        other.transport.resume_reading()
+
+    def close(self) -> None:
+        """End the connection once what was written to it is out."""
+        if self._transport is not None:
+            self._transport.close()
+
+    def abort(self) -> None:
+        """End the connection now."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    # ── asyncio.Protocol ──
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The connection is there; reading waits for `join`."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.pause_reading()
+
+    def data_received(self, data: bytes) -> None:
+        """Pass it on."""
+        if self._other is None:
+            self._early += data
+        else:
+            self._other.transport.write(data)
+
+    def eof_received(self) -> bool:
+        """gRPC has no use for half a connection: both ends close."""
+        return False
+
+    def pause_writing(self) -> None:
+        """This end is slow: the other one is not read meanwhile."""
+        if self._other is not None and not self._other.lost:
+            self._other.transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """This end has caught up."""
+        if self._other is not None and not self._other.lost:
+            self._other.transport.resume_reading()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The other end has nobody to talk to any more."""
+        self.lost = True
+        if self._other is not None:
+            self._other.close()
+        if self._on_lost is not None:
+            self._on_lost()

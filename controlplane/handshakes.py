@@ -1,0 +1,79 @@
+"""What a TLS handshake needs, and why one failed: a word for the metrics and a text for the log."""
+
+from __future__ import annotations
+
+import os
+import ssl
+from typing import TYPE_CHECKING
+
+from protos.identity import EXPIRED, NOT_YET_VALID, REVOKED, UNTRUSTED
+
+if TYPE_CHECKING:
+    from protos.tls_files import TlsFiles
+
+NO_CERTIFICATE = "no_certificate"
+OLD_TLS = "old_tls"
+NOT_TLS = "not_tls"
+CLIENT_REFUSED = "client_refused"
+HANDSHAKE_TIMEOUT = "handshake_timeout"
+HANDSHAKE_ABORTED = "handshake_aborted"
+HANDSHAKE_FAILED = "handshake_failed"
+
+# X509_V_ERR_* of OpenSSL's x509_vfy.h.
+_VERIFY_REASONS = {9: NOT_YET_VALID, 10: EXPIRED, 23: REVOKED}
+
+_SSL_REASONS = {
+    "PEER_DID_NOT_RETURN_A_CERTIFICATE": (NO_CERTIFICATE, "the client shows no certificate"),
+    "UNSUPPORTED_PROTOCOL": (OLD_TLS, "the client speaks no TLS 1.3"),
+    "NO_PROTOCOLS_AVAILABLE": (OLD_TLS, "the client speaks no TLS 1.3"),
+    "WRONG_VERSION_NUMBER": (NOT_TLS, "the client speaks no TLS"),
+    "PACKET_LENGTH_TOO_LONG": (NOT_TLS, "the client speaks no TLS"),
+    "HTTP_REQUEST": (NOT_TLS, "the client speaks no TLS"),
+    "HTTPS_PROXY_REQUEST": (NOT_TLS, "the client speaks no TLS"),
+}
+
+
+def server_context(files: TlsFiles) -> ssl.SSLContext:
+    """Return what accepts TLS 1.3 from holders of a certificate of these CAs, and nothing else.
+
+    Raises:
+        ssl.SSLError: OpenSSL refuses the files.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.verify_mode = ssl.CERT_REQUIRED
+    # Every connection shows its certificate anew: a resumed session would be as old as its first handshake.
+    context.options |= ssl.OP_NO_TICKET
+    context.num_tickets = 0
+    context.set_alpn_protocols(["h2"])
+    context.load_verify_locations(cadata=files.ca_pem.decode("ascii"))
+    _load_key(context, files)
+    return context
+
+
+def _load_key(context: ssl.SSLContext, files: TlsFiles) -> None:
+    """The module reads keys from files only; the one in memory is the one that was checked."""
+    handle = os.memfd_create("plr-key")
+    try:
+        os.write(handle, files.certificate_pem + b"\n" + files.key_pem)
+        context.load_cert_chain(f"/proc/self/fd/{handle}")
+    finally:
+        os.close(handle)
+
+
+def why_failed(error: Exception) -> tuple[str, str]:
+    """Return the reason and a text for a handshake that ended with this error."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return _VERIFY_REASONS.get(error.verify_code, UNTRUSTED), f"the client's certificate: {error.verify_message}"
+    if isinstance(error, ssl.SSLError):
+        reason = str(error.reason or "")
+        if "_ALERT_" in reason:
+            return CLIENT_REFUSED, f"the client refuses us: {_words(reason.partition('_ALERT_')[2])}"
+        return _SSL_REASONS.get(reason, (HANDSHAKE_FAILED, _words(reason) or str(error)))
+    if isinstance(error, ConnectionAbortedError | TimeoutError):
+        return HANDSHAKE_TIMEOUT, "the client does not finish the TLS handshake"
+    return HANDSHAKE_ABORTED, "the client ended the connection within the TLS handshake"
+
+
+def _words(reason: str) -> str:
+    return reason.replace("_", " ").lower()

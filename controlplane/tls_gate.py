@@ -1,0 +1,284 @@
+"""The only way to the gRPC server from outside: mutual TLS 1.3 in front of a Unix socket of our own.
+
+    sidecar ══ TLS ══▶ gate ── unix socket in a folder of mode 0700 ──▶ gRPC server
+
+gRPC for Python tells neither why a handshake failed nor to whom a port still owes one, cannot refuse TLS 1.2, and
+gives no hold on a connection whose certificate is revoked. The gate has all of that: it counts every refusal by its
+reason, bounds what is half open, and ends connections. The gRPC server knows a connection by the name that the gate
+bound its end of the Unix socket to; the gate tells whose certificate stands behind that name.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import logging
+import secrets
+import socket
+import ssl
+import time
+from collections import Counter, OrderedDict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from controlplane.core.token_bucket import TokenBucket
+from controlplane.gate_pipe import PipeEnd
+from controlplane.handshakes import server_context, why_failed
+from protos.identity import REVOKED, CertificateError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.identity import Identity, Trust
+    from protos.model import NodeName
+    from protos.tls_files import TlsFiles
+
+log = logging.getLogger(__name__)
+
+HANDSHAKE_TIMEOUT_S = 5.0
+"""Two round trips over a bad cellular link take 1 to 2 s; a sidecar gives up after 5 s."""
+
+MAX_HANDSHAKES = 512
+"""Half-open connections at once; a further one ends the oldest, so that whoever holds all of them has to hurry."""
+
+MAX_HANDSHAKES_PER_SOURCE = 64
+"""Of these, from one address (IPv6: one /64): a fleet behind one NAT that comes back at once is served in turn."""
+
+MAX_CONNECTIONS = 2 * 4096 + 64
+"""Connections at once: one for each sidecar that may register and its replacement, and some for operators."""
+
+MAX_CONNECTIONS_PER_NAME = 8
+"""A further one ends the oldest: after a change of networks that one is dead and does not know it yet."""
+
+LAST_WORDS_S = 0.5
+"""Between a certificate's end and that of its connections: time for gRPC to say why."""
+
+ACCEPT_PAUSE_S = 0.1
+"""After the system refused to accept: it is out of descriptors, and will be for a moment."""
+
+TOO_MANY_HANDSHAKES = "too_many_handshakes"
+TOO_MANY_CONNECTIONS = "too_many_connections"
+_LOG_LINES_PER_S = 1.0
+_LOG_BURST = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Whose certificate stands behind a connection; `refusal` tells why it is not believed (any more)."""
+
+    identity: Identity
+    certificate: bytes = field(repr=False)
+    refusal: CertificateError | None = None
+
+
+@dataclass(slots=True, eq=False)
+class _Connection:
+    caller: Caller
+    outside: PipeEnd
+    inside: PipeEnd
+
+
+class TlsGate:
+    """Accepts connections for the gRPC server at the Unix socket `upstream`; for one event loop.
+
+    `on_refused` is told the reason of every connection that is refused or ended.
+    """
+
+    def __init__(self, files: TlsFiles, upstream: str, on_refused: Callable[[str], None]) -> None:
+        self._trust: Trust = files.trust
+        self._context = server_context(files)
+        self._upstream = upstream
+        self._on_refused = on_refused
+        self._loop = asyncio.get_running_loop()
+        self._socket: socket.socket | None = None
+        self._accepting: asyncio.Task[None] | None = None
+        self._handshakes: OrderedDict[asyncio.Task[None], str] = OrderedDict()
+        self._connections: OrderedDict[str, _Connection] = OrderedDict()
+        # Never the same name twice, in this process or another of this host: a stale one must not become somebody else.
+        self._prefix = f"plr-{secrets.token_hex(8)}"
+        self._count = 0
+        self._log_lines = TokenBucket(rate=_LOG_LINES_PER_S, burst=_LOG_BURST, now=self._loop.time())
+
+    # ── for the server ──
+
+    def listen(self, host: str, port: int) -> int:
+        """Accept connections from now on; returns the port. Raises OSError if the address cannot be had."""
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        dual = family == socket.AF_INET6 and host == "::" and socket.has_dualstack_ipv6()
+        self._socket = socket.create_server((host, port), family=family, backlog=1024, dualstack_ipv6=dual)
+        self._socket.setblocking(False)
+        self._accepting = self._loop.create_task(self._accept(self._socket))
+        taken: int = self._socket.getsockname()[1]
+        return taken
+
+    def caller(self, peer: str) -> Caller | None:
+        """Who is behind the connection that gRPC calls `peer`; None if there is no such connection (any more)."""
+        connection = self._connections.get(peer)
+        return None if connection is None else connection.caller
+
+    def use(self, files: TlsFiles) -> None:
+        """Take these files from now on; connections of certificates that they do not believe end.
+
+        Raises:
+            ssl.SSLError: OpenSSL refuses the files; the ones before stay in use.
+        """
+        self._context = server_context(files)
+        self._trust = files.trust
+        for connection in list(self._connections.values()):
+            self._review(connection)
+
+    def end_expired(self, now_wall: float) -> None:
+        """End the connections whose certificates have ended."""
+        for connection in list(self._connections.values()):
+            if connection.caller.identity.not_after < now_wall:
+                self._review(connection)
+
+    async def close(self) -> None:
+        """End everything."""
+        tasks = [*self._handshakes, *([self._accepting] if self._accepting is not None else [])]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        if self._socket is not None:
+            self._socket.close()
+        for connection in list(self._connections.values()):
+            connection.outside.abort()
+            connection.inside.abort()
+
+    # ── accepting ──
+
+    async def _accept(self, listening: socket.socket) -> None:
+        while True:
+            try:
+                accepted, address = await self._loop.sock_accept(listening)
+            except OSError as error:
+                log.warning("cannot accept a connection: %s", error)
+                await asyncio.sleep(ACCEPT_PAUSE_S)
+                continue
+            source = _source(address[0])
+            if Counter(self._handshakes.values())[source] >= MAX_HANDSHAKES_PER_SOURCE:
+                accepted.close()
+                self._refused(address[0], TOO_MANY_HANDSHAKES, "too many of its connections are half open")
+                continue
+            if len(self._handshakes) >= MAX_HANDSHAKES:
+                oldest = next(iter(self._handshakes))
+                del self._handshakes[oldest]
+                oldest.cancel()
+            task = self._loop.create_task(self._admit(accepted, address[0]))
+            self._handshakes[task] = source
+            task.add_done_callback(lambda done: self._handshakes.pop(done, None))
+
+    async def _admit(self, accepted: socket.socket, address: str) -> None:
+        outside = PipeEnd()
+        try:
+            transport, _ = await self._loop.connect_accepted_socket(
+                lambda: outside,
+                accepted,
+                ssl=self._context,
+                ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
+                ssl_shutdown_timeout=LAST_WORDS_S,
+            )
+        except asyncio.CancelledError:
+            self._on_refused(TOO_MANY_HANDSHAKES)
+            raise
+        except (OSError, ssl.SSLError) as error:
+            self._refused(address, *why_failed(error))
+            return
+        try:
+            certificate = transport.get_extra_info("ssl_object").getpeercert(binary_form=True)
+            caller = self._check(certificate or b"")
+        except CertificateError as error:
+            self._refused(address, error.reason, str(error))
+            outside.abort()
+            return
+        await self._connect(outside, caller, address)
+
+    async def _connect(self, outside: PipeEnd, caller: Caller, address: str) -> None:
+        if len(self._connections) >= MAX_CONNECTIONS:
+            self._refused(address, TOO_MANY_CONNECTIONS, f"{MAX_CONNECTIONS} connections are open")
+            outside.abort()
+            return
+        self._make_room(caller.identity.name)
+        self._count += 1
+        name = f"{self._prefix}-{self._count}"
+        peer = f"unix-abstract:{name}"
+
+        def lost() -> None:
+            self._connections.pop(peer, None)
+
+        inside = PipeEnd(lost)
+        # Before gRPC can know of it.
+        self._connections[peer] = _Connection(caller, outside, inside)
+        if caller.refusal is not None:
+            # It may hear from gRPC why, in words that its operator reads.
+            self._refused(address, caller.refusal.reason, str(caller.refusal))
+            self._loop.call_later(HANDSHAKE_TIMEOUT_S, outside.abort)
+        try:
+            await self._connect_inside(name, inside)
+        except OSError as error:
+            log.warning("no connection to the gRPC server: %s", error)
+            lost()
+            outside.abort()
+            return
+        PipeEnd.join(outside, inside)
+
+    async def _connect_inside(self, name: str, inside: PipeEnd) -> None:
+        unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            unix.setblocking(False)
+            unix.bind(f"\0{name}")
+            await self._loop.sock_connect(unix, self._upstream)
+            await self._loop.create_unix_connection(lambda: inside, sock=unix)
+        except BaseException:
+            unix.close()
+            raise
+
+    def _make_room(self, name: NodeName) -> None:
+        own = [connection for connection in self._connections.values() if connection.caller.identity.name == name]
+        for connection in own[: len(own) - MAX_CONNECTIONS_PER_NAME + 1]:
+            self._on_refused(TOO_MANY_CONNECTIONS)
+            connection.outside.abort()
+            connection.inside.abort()
+
+    def _check(self, certificate: bytes) -> Caller:
+        """Return the caller with its refusal, if any; raises CertificateError for one that is not even of our CA."""
+        identity = self._trust.identify(certificate)
+        try:
+            self._trust.check(certificate, time.time())
+        except CertificateError as error:
+            return Caller(identity, certificate, error)
+        return Caller(identity, certificate)
+
+    def _review(self, connection: _Connection) -> None:
+        """End the connection if its certificate is not good any more."""
+        caller = connection.caller
+        if caller.refusal is not None:
+            return
+        try:
+            self._trust.check(caller.certificate, time.time())
+        except CertificateError as error:
+            refusal = error
+        else:
+            return
+        connection.caller = Caller(caller.identity, caller.certificate, refusal)
+        self._refused(caller.identity.name, refusal.reason, str(refusal))
+        self._loop.call_later(LAST_WORDS_S, connection.outside.abort)
+        self._loop.call_later(LAST_WORDS_S, connection.inside.abort)
+
+    def _refused(self, who: str, reason: str, text: str) -> None:
+        self._on_refused(reason)
+        # A stranger must not fill the disk; what is revoked is worth a line in any case.
+        if reason == REVOKED or self._log_lines.take(self._loop.time()):
+            log.warning("refused a connection of %s: %s: %s", who, reason, text)
+
+
+def _source(address: str) -> str:
+    """What one sender of connections can hardly change: its IPv4 address, or its IPv6 network."""
+    with contextlib.suppress(ValueError):
+        ip = ipaddress.ip_address(address.partition("%")[0])
+        if isinstance(ip, ipaddress.IPv6Address):
+            if ip.ipv4_mapped is not None:
+                return str(ip.ipv4_mapped)
+            return str(ipaddress.IPv6Network((ip, 64), strict=False))
+    return address

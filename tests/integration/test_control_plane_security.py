@@ -1,0 +1,273 @@
+"""Who is let in to the control plane: each refusal is a real attempt over TLS, and is counted with its reason."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import ssl
+import subprocess
+import time
+import urllib.request
+from typing import TYPE_CHECKING
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+
+from controlplane.ca import Authority, Validity
+from protos.identity import CONTROL_PLANE_DNS, IdentityRole
+from protos.model import MappingSet, RemovalReason, Report, Role, Welcome
+from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
+from tests.integration.control_plane_process import (
+    PATIENCE_S,
+    ControlPlaneProcess,
+    Secured,
+    Sidecar,
+    Stream,
+    cloud,
+    open_channel,
+    robot,
+)
+from tests.unit.controlplane.samples import registration
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+HOUR_S = 3600.0
+
+
+class Plane(ControlPlaneProcess):
+    """A secured control plane with the CA of its fleet."""
+
+    def __init__(self, folder: Path) -> None:
+        self.authority = Authority.create()
+        self.tls_dir = folder / "tls"
+        self.authority.write_tls_dir(self.tls_dir, "control", IdentityRole.CONTROL_PLANE)
+        self._issued: dict[str, Secured] = {}
+        super().__init__(folder, tls_dir=str(self.tls_dir))
+
+    def member(self, name: str, role: IdentityRole = IdentityRole.ROBOT, validity: Validity | None = None) -> Secured:
+        """The certificate of this name, issued when it is first asked for."""
+        if name not in self._issued:
+            self._issued[name] = Secured(self.authority.issue(name, role, validity=validity), self.authority.ca_pem)
+        return self._issued[name]
+
+    def revoke(self, name: str) -> None:
+        self.authority.revoke(name)
+        self.install("crl.pem", self.authority.crl_pem())
+
+    def install(self, file: str, content: bytes) -> None:
+        """Put a file into its tls_dir and wait until it is in use."""
+        taken = len(self.lines)
+        part = self.tls_dir / "part"
+        part.write_bytes(content)
+        part.replace(self.tls_dir / file)
+        self.wait_for_line("took new certificate files", after=taken)
+
+    def count(self, metric: str) -> float:
+        with urllib.request.urlopen(f"http://{self.metrics}/metrics", timeout=PATIENCE_S) as answer:
+            found = re.search(rf"^{re.escape(metric)} (\S+)$", answer.read().decode(), re.MULTILINE)
+        assert found is not None, metric
+        return float(found[1])
+
+    @contextlib.contextmanager
+    def counted(self, reason: str, metric: str = "plr_refused_connections_total") -> Iterator[None]:
+        """Within it, something is refused for this reason."""
+        series = f'{metric}{{reason="{reason}"}}'
+        before = self.count(series)
+        yield
+        end = time.monotonic() + PATIENCE_S
+        while self.count(series) <= before:
+            assert time.monotonic() < end, f"no {reason} counted"
+            time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plane]:
+    with Plane(tmp_path_factory.mktemp("plane")) as process:
+        yield process
+        assert process.stop() == 0
+        bad = [number for number, line in enumerate(process.lines) if "Traceback" in line or "ERROR" in line]
+        assert not bad, process.lines[bad[0] :]
+
+
+def refused(address: str, secured: Secured | None) -> grpc.RpcError:
+    """Try to register; returns the error of it."""
+    with Sidecar(address, registration("robot-1"), secured) as stream, pytest.raises(grpc.RpcError) as error:
+        stream.next()
+    return error.value
+
+
+def test_members_are_let_in_under_their_names(plane: Plane) -> None:
+    a, r = plane.member("cloud-a", IdentityRole.CLOUD), plane.member("robot-1")
+    with cloud(plane.address, "cloud-a", a) as c, robot(plane.address, "robot-1", r) as r1:
+        r1.peers("cloud-a")
+        c.peers("robot-1")
+
+
+@pytest.mark.parametrize("case", ["untrusted", "expired", "not_yet_valid"])
+def test_certificates_that_are_no_good_are_refused(plane: Plane, case: str) -> None:
+    now = time.time()
+    match case:
+        case "untrusted":
+            secured = Secured(Authority.create().issue("robot-1", IdentityRole.ROBOT), plane.authority.ca_pem)
+        case "expired":
+            secured = plane.member("old", validity=Validity(now - 2 * HOUR_S, now - HOUR_S))
+        case _:
+            secured = plane.member("young", validity=Validity(now + HOUR_S, now + 2 * HOUR_S))
+    with plane.counted(case):
+        refused(plane.address, secured)
+
+
+def test_who_shows_no_certificate_or_speaks_no_tls_is_refused(plane: Plane) -> None:
+    host, port = plane.address.split(":")
+    with plane.counted("no_certificate"), socket.create_connection((host, int(port))) as raw:
+        context = ssl.create_default_context(cadata=plane.authority.ca_pem.decode())
+        with context.wrap_socket(raw, server_hostname=CONTROL_PLANE_DNS) as tls:
+            assert tls.recv(1) == b""
+    with plane.counted("not_tls"):
+        refused(plane.address, None)
+
+
+@pytest.mark.filterwarnings("ignore:ssl.TLSVersion:DeprecationWarning")
+def test_tls_1_2_is_refused(plane: Plane) -> None:
+    with plane.counted("old_tls"):
+        argv = ["openssl", "s_client", "-tls1_2", "-connect", plane.address]
+        done = subprocess.run(argv, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert "Cipher is (NONE)" in done.stdout
+
+
+def test_a_half_open_handshake_ends(plane: Plane) -> None:
+    host, port = plane.address.split(":")
+    with plane.counted("handshake_timeout"), socket.create_connection((host, int(port)), PATIENCE_S) as raw:
+        raw.settimeout(PATIENCE_S)
+        with contextlib.suppress(ConnectionResetError):
+            assert raw.recv(1) == b""
+
+
+def test_many_half_open_handshakes_from_one_place_do_not_keep_others_out(plane: Plane) -> None:
+    host, port = plane.address.split(":")
+    with contextlib.ExitStack() as stack:
+        with plane.counted("too_many_handshakes"):
+            for _ in range(100):
+                raw = socket.create_connection((host, int(port)), source_address=("127.0.0.2", 0))
+                stack.enter_context(raw)
+        with Sidecar(plane.address, registration("robot-1"), plane.member("robot-1")) as stream:
+            stream.expect(Welcome)
+
+
+def test_a_name_or_role_that_the_certificate_does_not_say_is_refused(plane: Plane) -> None:
+    secured, total = plane.member("robot-1"), "plr_registrations_refused_total"
+    for reason, said in (
+        ("name_mismatch", registration("robot-2")),
+        ("wrong_role", registration("robot-1", Role.CLOUD)),
+    ):
+        with plane.counted(reason, total), Stream(plane.address, secured) as stream:
+            stream.send(said)
+            code, text = stream.end()
+            assert code is grpc.StatusCode.PERMISSION_DENIED
+            assert "certificate" in text
+
+
+def test_each_service_is_for_its_roles_only(plane: Plane) -> None:
+    operator, r = plane.member("alice", IdentityRole.OPERATOR), plane.member("robot-1")
+    with plane.counted("wrong_role"):
+        error = refused(plane.address, operator)
+        assert error.code() is grpc.StatusCode.PERMISSION_DENIED
+    with open_channel(plane.address, operator) as channel:
+        admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest(), timeout=PATIENCE_S)
+        listed = reflect(channel)
+        assert listed.code() is grpc.StatusCode.OK
+    with open_channel(plane.address, r) as channel:
+        with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match=r"it may not use plr\.v1\.Admin"):
+            admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest(), timeout=PATIENCE_S)
+        with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match="ServerReflection"):
+            reflect(channel)
+        health = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=PATIENCE_S)
+        assert health.status == health_pb2.HealthCheckResponse.SERVING
+        call: grpc.UnaryUnaryMultiCallable[bytes, bytes] = channel.unary_unary("/no.such.Service/Call")
+        with pytest.raises(grpc.RpcError) as error_info:
+            call(b"", timeout=PATIENCE_S)
+        assert error_info.value.code() is grpc.StatusCode.UNIMPLEMENTED
+
+
+def reflect(channel: grpc.Channel) -> grpc.Call:
+    requests = iter([reflection_pb2.ServerReflectionRequest(list_services="")])
+    call = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(requests, timeout=PATIENCE_S)
+    list(call)
+    result: grpc.Call = call
+    return result
+
+
+def test_a_revoked_cloud_loses_its_stream_and_its_peers_are_told(plane: Plane) -> None:
+    bad, r = plane.member("cloud-bad", IdentityRole.CLOUD), plane.member("robot-1")
+    with robot(plane.address, "robot-1", r) as r1, cloud(plane.address, "cloud-bad", bad) as c:
+        r1.peers("cloud-bad")
+        r1.expect(MappingSet, lambda message: bool(message.services[0].assignments))
+        plane.revoke("cloud-bad")
+        code, text = c.end()
+        assert code is grpc.StatusCode.UNAUTHENTICATED
+        assert "revoked" in text
+        gone = r1.peers()
+        assert [(peer.name, peer.reason) for peer in gone.removed] == [("cloud-bad", RemovalReason.REVOKED)]
+        r1.expect(MappingSet, lambda message: not message.services[0].assignments)
+        with plane.counted("revoked"):
+            error = refused(plane.address, bad)
+            assert error.code() is grpc.StatusCode.UNAUTHENTICATED
+            assert "the certificate of cloud-bad is revoked" in str(error)
+
+
+def test_a_certificate_that_ends_takes_its_stream_with_it(plane: Plane) -> None:
+    now = time.time()
+    short = plane.member("short", validity=Validity(now - HOUR_S, now + 3.0))
+    with Sidecar(plane.address, registration("short"), short) as stream:
+        stream.expect(Welcome)
+        with plane.counted("expired"):
+            code, text = stream.end()
+            assert code is grpc.StatusCode.UNAUTHENTICATED
+            assert "certificate" in text
+
+
+def test_new_files_are_taken_without_a_restart(plane: Plane) -> None:
+    with Sidecar(plane.address, registration("robot-1"), plane.member("robot-1")) as before:
+        before.expect(Welcome)
+        other = Authority.create("next")
+        plane.install("ca.pem", plane.authority.ca_pem + other.ca_pem)
+        newcomer = Secured(other.issue("cloud-9", IdentityRole.CLOUD), plane.authority.ca_pem)
+        with cloud(plane.address, "cloud-9", newcomer):
+            before.peers("cloud-9")
+    assert plane.count("plr_certificate_days_left") > 1
+    assert plane.count("plr_certificate_expiry_timestamp_seconds") > time.time()
+
+
+def test_a_stream_that_speaks_too_fast_is_ended(plane: Plane) -> None:
+    with Sidecar(plane.address, registration("robot-1"), plane.member("robot-1")) as stream:
+        stream.expect(Welcome)
+        with plane.counted("too_fast"):
+            for _ in range(3000):
+                stream.send(Report())
+            code, text = stream.end()
+            assert code is grpc.StatusCode.RESOURCE_EXHAUSTED
+            assert "too fast" in text
+
+
+def test_a_message_that_is_too_long_ends_the_stream(plane: Plane) -> None:
+    with Sidecar(plane.address, registration("robot-1"), plane.member("robot-1")) as stream:
+        stream.expect(Welcome)
+        stream.send_raw(control_pb2.SidecarMessage(nack=control_pb2.Nack(error="x" * (5 << 20))))
+        assert stream.end()[0] is grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+def test_one_name_gets_few_streams(plane: Plane) -> None:
+    secured = plane.member("robot-1")
+    with contextlib.ExitStack() as stack:
+        waiting = [stack.enter_context(Stream(plane.address, secured)) for _ in range(3)]
+        time.sleep(0.3)
+        with plane.counted("too_many_streams"), Stream(plane.address, secured) as further:
+            code, text = further.end()
+            assert code is grpc.StatusCode.RESOURCE_EXHAUSTED
+            assert "robot-1 has 3 streams open" in text
+        assert waiting[0].quiet_for(0.1)
