@@ -92,10 +92,11 @@ def identity_uri(name: str, role: IdentityRole) -> str:
     return f"{URI_SCHEME}://{role.value}/{name}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Authority:
     certificate: x509.Certificate
     key: ec.EllipticCurvePublicKey
+    crl_number: int = -1  # none
     revoked: set[int] = field(default_factory=set)
 
 
@@ -103,14 +104,22 @@ class Trust:
     """The CAs to believe and what they have revoked.
 
     `ca_certificates` is PEM, one CA or several (while one takes over from the other); `crl` is PEM, one list or
-    several, each signed by one of these CAs. A list does not age: the last one stands until there is a newer. Raises
-    CertificateError where either is not what it should be.
+    several; lists of CAs that are not (or no longer) believed count for nothing, but one must be of these. A list does
+    not age: the last one stands until there is a newer. Raises CertificateError where either is not what it should be.
     """
 
     def __init__(self, ca_certificates: bytes, crl: bytes | None = None) -> None:
         self._authorities = _load_authorities(ca_certificates)
         if crl is not None:
             _load_revocations(crl, self._authorities)
+
+    def forgets(self, other: Trust) -> bool:
+        """Whether a list of `other` is missing here or older here: what is revoked there may count as good here."""
+        numbers = {authority.certificate: authority.crl_number for authority in self._authorities}
+        return any(
+            numbers.get(authority.certificate, authority.crl_number) < authority.crl_number
+            for authority in other._authorities
+        )
 
     def identify(self, certificate_der: bytes) -> Identity:
         """Return whom a certificate of these CAs names, whatever its age and revocation; raises CertificateError."""
@@ -181,10 +190,12 @@ def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
     blocks: list[bytes] = _PEM_CRL.findall(pem)
     if not blocks:
         raise CertificateError(MALFORMED, "the revocation list is not PEM")
+    known = False
     for block in blocks:
         try:
             crl = x509.load_pem_x509_crl(block)
             partial = any(extension.critical for extension in crl.extensions)
+            number = crl.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
             serials = {entry.serial_number for entry in crl}
             issuers = [
                 authority
@@ -193,13 +204,15 @@ def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
             ]
         except Exception as error:
             raise CertificateError(MALFORMED, f"the revocation list is malformed: {type(error).__name__}") from error
-        if not issuers:
-            raise CertificateError(UNTRUSTED, "the revocation list is of another CA")
         if partial:
             # RFC 5280 section 5.2: a list that is a delta, or about some certificates only, says so critically.
             raise CertificateError(MALFORMED, "the revocation list is not a complete one")
         for issuer in issuers:
+            issuer.crl_number = max(issuer.crl_number, number)
             issuer.revoked.update(serials)
+            known = True
+    if not known:
+        raise CertificateError(UNTRUSTED, "the revocation list is of another CA")
 
 
 def _check_leaf(certificate: x509.Certificate) -> None:

@@ -155,7 +155,7 @@ class TlsWatch:
 
     Call `poll` every `POLL_INTERVAL_S`. Files that do not fit together keep the old ones in force: while they are being
     replaced one by one that is nothing unusual, so it is logged only, and once, when they still do not fit at the next
-    look.
+    look. A revocation list is replaced by a newer one only.
     """
 
     def __init__(self, files: TlsFiles) -> None:
@@ -171,6 +171,9 @@ class TlsWatch:
             return None
         try:
             files = load_tls_files(self.current.directory)
+            if files.trust.forgets(self.current.trust):
+                path = str(self.current.directory / CRL_FILE)
+                raise ConfigError(path, "", "missing or older than the one in use; copy the newest there")
         except ConfigError as error:
             if fingerprint == self._broken:
                 _log.error("new TLS files are not used, the old ones stay: %s", error)

@@ -221,8 +221,16 @@ def test_what_is_no_revocation_list_is_refused(crl: bytes) -> None:
 def test_a_revocation_list_of_another_ca_is_refused() -> None:
     stranger = authority()
     with pytest.raises(CertificateError) as caught:
-        Trust(CA.ca_pem, CA.crl_pem() + stranger.crl_pem())
+        Trust(CA.ca_pem, stranger.crl_pem())
     assert caught.value.reason == "untrusted"
+
+
+def test_a_list_of_a_ca_that_is_no_longer_believed_may_stay() -> None:
+    ca = authority()
+    der = ca.issue("robot-1", IdentityRole.ROBOT).certificate_der
+    ca.revoke("robot-1")
+    for lists in (ca.crl_pem() + authority().crl_pem(), authority().crl_pem() + ca.crl_pem()):
+        assert reason(der, Trust(ca.ca_pem, lists)) == "revoked"
 
 
 def test_a_partial_revocation_list_is_refused() -> None:
@@ -231,9 +239,29 @@ def test_a_partial_revocation_list_is_refused() -> None:
         .issuer_name(CA.own.certificate.subject)
         .last_update(CA.own.certificate.not_valid_before_utc)
         .next_update(CA.own.certificate.not_valid_after_utc)
+        .add_extension(x509.CRLNumber(2), critical=False)
         .add_extension(x509.DeltaCRLIndicator(1), critical=True)
     )
     delta = builder.sign(CA.own.key, hashes.SHA256()).public_bytes(Encoding.PEM)
     with pytest.raises(CertificateError) as caught:
         Trust(CA.ca_pem, delta)
     assert caught.value.reason == "malformed"
+
+
+def test_older_and_missing_lists_are_told_from_newer_ones() -> None:
+    ca = authority()
+    bare, first = Trust(ca.ca_pem), Trust(ca.ca_pem, ca.crl_pem())
+    ca.issue("robot-1", IdentityRole.ROBOT)
+    ca.revoke("robot-1")
+    second = Trust(ca.ca_pem, ca.crl_pem())
+    assert [older.forgets(second) for older in (bare, first)] == [True, True]
+    assert bare.forgets(first)
+    assert not any(second.forgets(older) for older in (bare, first, second))
+
+    before = ca.crl_pem()
+    ca.rotate("next")
+    both = Trust(ca.ca_pem, ca.crl_pem())
+    assert not both.forgets(second)
+    assert Trust(ca.ca_pem, before).forgets(both)
+    ca.retire()
+    assert not Trust(ca.ca_pem, ca.crl_pem()).forgets(both), "of a CA that is no longer believed nothing is needed"

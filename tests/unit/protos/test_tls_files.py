@@ -201,3 +201,22 @@ def test_a_folder_that_vanishes_keeps_the_old_files(folder: Path) -> None:
     folder.rename(folder.with_name("elsewhere"))
     assert [watch.poll() for _ in range(3)] == [None] * 3
     assert watch.current is files
+
+
+def test_an_old_or_missing_revocation_list_does_not_replace_a_newer_one(
+    folder: Path, ca: Authority, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = folder / "crl.pem"
+    old = path.read_bytes()
+    ca.issue("robot-2", IdentityRole.ROBOT)
+    ca.revoke("robot-2")
+    path.write_bytes(ca.crl_pem())
+    watch = TlsWatch(load_tls_files(folder))
+    for change in (lambda: path.write_bytes(old), path.unlink):
+        change()
+        assert [watch.poll() for _ in range(3)] == [None] * 3
+    assert [record.message.partition("crl.pem: ")[2][:20] for record in caplog.records] == [
+        "missing or older than"[:20]
+    ] * 2
+    path.write_bytes(ca.crl_pem())
+    assert watch.poll() is not None, "signed anew, so not the same bytes"
