@@ -17,7 +17,8 @@ from controlplane.config import load_config as load_controlplane_config
 from controlplane.core.control import ControlCore
 from controlplane.metrics import Metrics
 from protos.config_fields import split_host_port
-from protos.model import Role
+from protos.identity import Identity, IdentityRole
+from protos.model import NodeName, Role
 from sidecar.config import load_config
 from sidecar.core.control_session import ControlStats
 from sidecar.core.stats import EngineStats
@@ -53,7 +54,7 @@ CONTRACT: dict[str, set[str]] = {
 }
 """The metrics that users may rely on, with their labels."""
 
-BEYOND_CONTRACT: dict[str, set[str]] = {"plr_control_plane_connected": set()}
+BEYOND_CONTRACT: dict[str, set[str]] = {"plr_control_plane_connected": set(), "plr_certificate_days_left": set()}
 """Further metrics of the programs that the rules and dashboards use."""
 
 METRICS = CONTRACT | BEYOND_CONTRACT
@@ -216,6 +217,7 @@ def exported_metrics() -> dict[str, set[str]]:
         )
     )
     control = Metrics()
+    control.own_certificate(Identity(NodeName("control"), IdentityRole.CONTROL_PLANE, 1, 0.0, 1.0))
     config = load_controlplane_config(DEPLOY / "config" / "controlplane.yaml")
     control.update(ControlCore(config.settings(), version_epoch=1, now=0.0), (), 0, 0.0)
     families = [*sidecar.collect(), *control.registry.collect()]
