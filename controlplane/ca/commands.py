@@ -4,34 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cryptography import x509
-from cryptography.x509.oid import NameOID
+from cryptography.x509 import ReasonFlags
 
-from controlplane.ca import listing
-from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, Authority, AuthorityError
-from controlplane.ca.files import write_tls_files
-from controlplane.ca.folder import NOT_THE_OWNER, AuthorityFolder
+from controlplane.ca import actions
+from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityError
 from protos.errors import ConfigError, DecodeError
 from protos.identity import IdentityRole
 from protos.names import node_name, text
-from protos.tls_files import (
-    CA_FILE,
-    CERTIFICATE_FILE,
-    CRL_FILE,
-    KEY_FILE,
-    KEY_FORBIDDEN,
-    load_private_key,
-    read_guarded,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from cryptography.hazmat.primitives.asymmetric import ec
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -49,16 +34,16 @@ _EXAMPLES = """examples:
 exit codes: 0 ok, 1 refused or not done, 2 bad usage or a CA folder that is not in order
 """
 
-_REASONS = {
-    reason.value: reason
+_REASONS = [
+    reason.value
     for reason in (
-        x509.ReasonFlags.unspecified,
-        x509.ReasonFlags.key_compromise,
-        x509.ReasonFlags.superseded,
-        x509.ReasonFlags.cessation_of_operation,
-        x509.ReasonFlags.privilege_withdrawn,
+        ReasonFlags.unspecified,
+        ReasonFlags.key_compromise,
+        ReasonFlags.superseded,
+        ReasonFlags.cessation_of_operation,
+        ReasonFlags.privilege_withdrawn,
     )
-}
+]
 _MAX_DAYS = 36_500.0
 _MAX_COMMON_NAME = 64
 
@@ -74,13 +59,18 @@ def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
     )
     about = ca.add_subparsers(required=True, metavar="COMMAND")
     for name, command, summary, details in (
-        ("init", _init, "make the CA", "Make the CA's key and certificate in a folder of its own."),
-        ("issue", _issue, "make a node's key and certificate", "Write a folder ready to be the node's tls_dir."),
-        ("renew", _renew, "make a further certificate for a node", "The one before it stays good until its end."),
-        ("revoke", _revoke, "refuse a node from now on", "Revoke all certificates of a name and write crl.pem."),
-        ("list", _list, "show what was issued", "Show every certificate and how long it is good."),
-        ("rotate", _rotate, "make a new CA beside the one in use", "Both are believed until: plr ca retire."),
-        ("retire", _retire, "stop believing former CAs", "Refused while a node depends on one of them."),
+        ("init", actions.init, "make the CA", "Make the CA's key and certificate in a folder of its own."),
+        ("issue", actions.issue, "make a node's key and certificate", "Write a folder ready to be the node's tls_dir."),
+        (
+            "renew",
+            actions.renew,
+            "make a further certificate for a node",
+            "The one before it stays good to its end.",
+        ),
+        ("revoke", actions.revoke, "refuse a node from now on", "Revoke all certificates of a name and write crl.pem."),
+        ("list", actions.show, "show what was issued", "Show every certificate and how long it is good."),
+        ("rotate", actions.rotate, "make a new CA beside the one in use", "Both are believed until: plr ca retire."),
+        ("retire", actions.retire, "stop believing former CAs", "Refused while a node depends on one of them."),
     ):
         parser = about.add_parser(name, help=summary, description=details)
         parser.add_argument("--dir", type=Path, default=Path("plr-ca"), help="the CA's folder (default: ./plr-ca)")
@@ -117,7 +107,7 @@ def _renew_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _revoke_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", type=_node_name, metavar="NAME")
-    parser.add_argument("--reason", choices=[*_REASONS], default=x509.ReasonFlags.unspecified.value)
+    parser.add_argument("--reason", choices=_REASONS, default=ReasonFlags.unspecified.value)
     _signing(parser)
 
 
@@ -148,102 +138,6 @@ def _reported(command: Callable[[argparse.Namespace], None]) -> Callable[[argpar
         return EXIT_OK
 
     return run
-
-
-def _init(arguments: argparse.Namespace) -> None:
-    folder = _folder(arguments)
-    authority = Authority.create(arguments.name, days=arguments.days)
-    folder.create(authority)
-    _say(f"made the CA {arguments.name}, good until {listing.day(authority.not_after)}: {folder.path}")
-
-
-def _issue(arguments: argparse.Namespace) -> None:
-    folder = _folder(arguments)
-    role = IdentityRole(arguments.role)
-    with folder.locked() as authority:
-        out = arguments.out or folder.node_folder(arguments.name)
-        _refuse_taken(out, arguments.name)
-        issued = authority.issue(arguments.name, role, days=arguments.days)
-        folder.save(authority)
-        write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
-    until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
-    _say(f"issued {arguments.name} ({role.value}), good until {until}: {out}")
-
-
-def _renew(arguments: argparse.Namespace) -> None:
-    folder = _folder(arguments)
-    with folder.locked() as authority:
-        out = arguments.out or folder.node_folder(arguments.name)
-        last = authority.latest(arguments.name)
-        _refuse_taken(out, arguments.name)
-        key = _kept_key(out) if arguments.keep_key else None
-        issued = authority.renew(arguments.name, days=arguments.days, key=key)
-        folder.save(authority)
-        write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
-    until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
-    _say(f"renewed {arguments.name} ({last.role.value}), good until {until}: {out}")
-
-
-def _revoke(arguments: argparse.Namespace) -> None:
-    folder = _folder(arguments)
-    with folder.locked() as authority:
-        revoked = authority.revoke(arguments.name, _REASONS[arguments.reason])
-        folder.save(authority)
-    _say(f"revoked {len(revoked)} of {arguments.name}; copy to the control plane's tls_dir: {folder.path / CRL_FILE}")
-
-
-def _list(arguments: argparse.Namespace) -> None:
-    folder = _folder(arguments)
-    records = folder.records()
-    _say(listing.render(records, [folder.certificate(record) for record in records], time.time()))
-
-
-def _rotate(arguments: argparse.Namespace) -> None:
-    folder = _folder(arguments)
-    with folder.locked() as authority:
-        authority.rotate(arguments.name, days=arguments.days)
-        folder.save(authority)
-    _say(f"made the CA {arguments.name}; before renewing any node, copy to every tls_dir: {folder.path / CA_FILE}")
-
-
-def _retire(arguments: argparse.Namespace) -> None:
-    folder = _folder(arguments)
-    with folder.locked() as authority:
-        authority.retire()
-        folder.save(authority)
-    _say(f"retired; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}")
-
-
-def _folder(arguments: argparse.Namespace) -> AuthorityFolder:
-    path: Path | None = getattr(arguments, "passphrase_file", None)
-    if path is None:
-        return AuthorityFolder(arguments.dir)
-    passphrase = read_guarded(path, NOT_THE_OWNER).strip(b"\r\n")
-    if not passphrase:
-        raise ConfigError(str(path), "", "expected a passphrase")
-    return AuthorityFolder(arguments.dir, passphrase)
-
-
-def _refuse_taken(out: Path, name: str) -> None:
-    """Raise AuthorityError if the folder holds the key of a node with another name."""
-    if not (out / KEY_FILE).exists():
-        return
-    try:
-        certificate = x509.load_pem_x509_certificate((out / CERTIFICATE_FILE).read_bytes())
-        owners = [each.value for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
-    except (OSError, ValueError):
-        owners = []
-    if owners != [name]:
-        raise AuthorityError(f"{out}: holds another node's key; give another --out")
-
-
-def _kept_key(out: Path) -> ec.EllipticCurvePrivateKey:
-    path = out / KEY_FILE
-    return load_private_key(read_guarded(path, KEY_FORBIDDEN), None, path)
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(f"{line}\n")
 
 
 def _node_name(value: str) -> str:
