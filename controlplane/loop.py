@@ -8,10 +8,11 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from controlplane.core.assignment import Plan, Problem
 from controlplane.core.claims import check_claims
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Close, CloseReason, DepartureNotice, NackNotice, Send
+from controlplane.core.plan import Plan
+from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
 from controlplane.mailbox import Mailbox
 from protos.identity import REVOKED, CertificateError

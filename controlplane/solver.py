@@ -11,19 +11,17 @@ from typing import TYPE_CHECKING
 
 from ortools.sat.python import cp_model
 
-from controlplane.core.assignment import (
-    FleetKey,
-    choice_of,
-    greedy,
-    independent_groups,
-    make_plan,
-)
+from controlplane.core.greedy import greedy
+from controlplane.core.grouping import independent_groups
+from controlplane.core.plan import choice_of, make_plan
+from controlplane.core.problem import FleetKey
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
-    from controlplane.core.assignment import Block, BlockKey, Choice, Plan, Problem
+    from controlplane.core.plan import Plan
+    from controlplane.core.problem import Block, BlockKey, Choice, Problem
 
 RESOLUTION = 1e-7
 """CP-SAT counts in integers: two epsilons closer than this are the same to it. No posterior mean over less than a

@@ -16,7 +16,6 @@ from collections import OrderedDict, deque
 from typing import TYPE_CHECKING, assert_never
 
 from controlplane.core import reconcile
-from controlplane.core.assignment import Plan, Problem
 from controlplane.core.control_events import (
     Close,
     CloseReason,
@@ -30,6 +29,8 @@ from controlplane.core.control_events import (
 from controlplane.core.debounce import Change, Debounce, settle
 from controlplane.core.estimator import Estimator
 from controlplane.core.picture import Picture, draw
+from controlplane.core.plan import Plan
+from controlplane.core.problem import Problem
 from controlplane.core.registry import MAX_SIDECARS, Admission, Refusal, Registry, StreamId
 from controlplane.core.snapshots import Snapshots, VersionSource
 from protos.errors import DecodeError

@@ -5,10 +5,12 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
-from controlplane.core.assignment import Plan, choice_of, independent_groups, make_plan, price
+from controlplane.core.grouping import independent_groups
+from controlplane.core.plan import Plan, choice_of, make_plan, price
 
 if TYPE_CHECKING:
-    from controlplane.core.assignment import BlockKey, BlockPlan, Choice, FleetKey, Price, Problem
+    from controlplane.core.plan import BlockPlan, Price
+    from controlplane.core.problem import BlockKey, Choice, FleetKey, Problem
 
 URGENT_DELAY_S = 0.05
 """From a path's or a sidecar's coming or going to the next solving: time for what comes along with it (both

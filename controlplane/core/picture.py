@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.assignment import Block, BlockKey, FleetKey, Problem
+from controlplane.core.problem import Block, BlockKey, FleetKey, Problem
 from protos.model import Role
 
 if TYPE_CHECKING:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.assignment import BlockKey
 from controlplane.core.picture import interfaces_of
+from controlplane.core.problem import BlockKey
 from protos.model import Assignment, RemovedPeer, ServiceMapping
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from controlplane.core.assignment import BlockPlan, Plan
     from controlplane.core.picture import BlockNotes, Picture
+    from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.registry import Registry, Sidecar
     from protos.model import InterfaceName, NodeName, Peer, Role
 

@@ -5,16 +5,8 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING
 
-from controlplane.core.assignment import (
-    Block,
-    BlockKey,
-    Choice,
-    FleetKey,
-    Price,
-    Problem,
-    is_valid,
-    price,
-)
+from controlplane.core.plan import Price, price
+from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem, is_valid
 from protos.model import InterfaceName, NodeName, ServiceName
 
 if TYPE_CHECKING:

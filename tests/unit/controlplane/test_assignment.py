@@ -6,18 +6,10 @@ import random
 
 import pytest
 
-from controlplane.core.assignment import (
-    FleetKey,
-    Price,
-    Problem,
-    choice_of,
-    fleet_excess,
-    greedy,
-    independent_groups,
-    is_valid,
-    make_plan,
-    price,
-)
+from controlplane.core.greedy import greedy
+from controlplane.core.grouping import independent_groups
+from controlplane.core.plan import Price, choice_of, make_plan, price
+from controlplane.core.problem import FleetKey, Problem, fleet_excess, is_valid
 from protos.model import NodeName
 from tests.unit.controlplane.problems import PLAN, best_price, block, random_problem
 

@@ -6,8 +6,9 @@ import random
 
 import pytest
 
-from controlplane.core.assignment import FleetKey, Plan, Problem, make_plan, price
 from controlplane.core.debounce import ROUTINE_INTERVAL_S, ROUTINE_TIMES, URGENT_DELAY_S, Change, Debounce, settle
+from controlplane.core.plan import Plan, make_plan, price
+from controlplane.core.problem import FleetKey, Problem
 from controlplane.solver import solve
 from protos.model import NodeName
 from tests.unit.controlplane.problems import PLAN, block, choices_of, random_problem

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.assignment import BlockKey, FleetKey
 from controlplane.core.estimator import Estimator
 from controlplane.core.picture import BlockNotes, Picture, draw
+from controlplane.core.problem import BlockKey, FleetKey
 from controlplane.core.registry import Sidecar
 from protos.model import Candidate, NodeName, PathReport, Report, Role, ServiceOffer, ServiceSet, ServiceUse
 from tests.unit.controlplane.samples import (

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.assignment import BlockKey, BlockPlan, FleetKey, Plan, Problem
 from controlplane.core.picture import BlockNotes, Picture
+from controlplane.core.plan import BlockPlan, Plan
+from controlplane.core.problem import BlockKey, FleetKey, Problem
 from controlplane.core.reconcile import differs, mapping_of, peers_of, removed_peers
 from controlplane.core.registry import Registry, Sidecar
 from protos.model import (

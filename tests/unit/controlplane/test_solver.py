@@ -6,7 +6,8 @@ import random
 
 import pytest
 
-from controlplane.core.assignment import FleetKey, Problem, is_valid, price
+from controlplane.core.plan import price
+from controlplane.core.problem import FleetKey, Problem, is_valid
 from controlplane.solver import RESOLUTION, solve
 from protos.model import NodeName
 from tests.unit.controlplane.problems import PLAN, best_price, block, choices_of, random_problem

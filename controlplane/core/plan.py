@@ -1,0 +1,101 @@
+"""What a plan for the assignment problem says, and what it costs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from controlplane.core.problem import block_excess, fleet_excess, is_valid
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from protos.model import InterfaceName, NodeName
+
+
+@dataclass(frozen=True, slots=True)
+class BlockPlan:
+    """Where one block's requests go."""
+
+    key: BlockKey
+    assignments: tuple[tuple[InterfaceName, NodeName], ...]
+    cost: float
+    """The sum that is minimised: of epsilon_ij, with 1 for an interface without a server."""
+    predicted_miss: float
+    """Probability that all copies miss, if the paths fail independently: the product of epsilon_ij."""
+    excess: int = 0
+    """By how many interfaces the block's own capacity is exceeded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A plan for a problem."""
+
+    blocks: Mapping[BlockKey, BlockPlan]
+    fleet_excess: Mapping[FleetKey, int] = field(default_factory=dict)
+    """By how many interfaces a server's limit over all robots is exceeded; only those that are."""
+    unproven: int = 0
+    """Groups of blocks whose optimum could not be proven in the time given."""
+
+    @property
+    def relaxed(self) -> int:
+        """By how many interfaces capacities are exceeded in all."""
+        return sum(block.excess for block in self.blocks.values()) + sum(self.fleet_excess.values())
+
+
+@dataclass(frozen=True, order=True, slots=True)
+class Price:
+    """What a plan costs; ordered: first keep to the capacities, then miss few deadlines."""
+
+    excess: int
+    cost: float
+
+
+def block_cost(block: Block, choice: Choice) -> float:
+    """The sum of epsilon_ij over the chosen pairs, with 1 for an interface without a server."""
+    total = 0.0
+    for row, server in zip(block.epsilon, choice, strict=True):
+        epsilon = row[server] if server is not None else None
+        total += 1.0 if epsilon is None else epsilon
+    return total
+
+
+def price(problem: Problem, choices: Mapping[BlockKey, Choice]) -> Price:
+    """What choices cost, of which each must be valid."""
+    excess = sum(block_excess(block, choices[block.key]) for block in problem.blocks)
+    excess += sum(fleet_excess(problem, choices).values())
+    return Price(excess, sum(block_cost(block, choices[block.key]) for block in problem.blocks))
+
+
+def make_plan(problem: Problem, choices: Mapping[BlockKey, Choice], *, unproven: int = 0) -> Plan:
+    """Write choices down as a plan."""
+    plans: dict[BlockKey, BlockPlan] = {}
+    for block in problem.blocks:
+        choice = choices[block.key]
+        pairs = [(i, j) for i, j in enumerate(choice) if j is not None]
+        plans[block.key] = BlockPlan(
+            key=block.key,
+            assignments=tuple((block.interfaces[i], block.servers[j]) for i, j in pairs),
+            cost=block_cost(block, choice),
+            predicted_miss=math.prod(block.epsilon[i][j] or 0.0 for i, j in pairs) if pairs else 1.0,
+            excess=block_excess(block, choice),
+        )
+    return Plan(plans, fleet_excess(problem, choices), unproven)
+
+
+def choice_of(block: Block, plan: BlockPlan | None) -> Choice | None:
+    """The plan's choice in the block's present numbering; None if it is not valid there any more."""
+    if plan is None:
+        return None
+    server_of = dict(plan.assignments)
+    index = {server: number for number, server in enumerate(block.servers)}
+    choice: list[int | None] = []
+    for interface in block.interfaces:
+        server = server_of.get(interface)
+        if server is not None and server not in index:
+            return None
+        choice.append(index[server] if server is not None else None)
+    found = tuple(choice)
+    return found if is_valid(block, found) else None
