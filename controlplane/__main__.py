@@ -4,6 +4,8 @@ examples:
   plr-controlplane --config /etc/plr/controlplane.yaml
   plr-controlplane --config /etc/plr/controlplane.yaml --check-config
 
+signals: SIGHUP reads the policy in the configuration again; SIGTERM and SIGINT stop
+
 exit codes: 0 stopped cleanly, 1 failed while running, 2 bad usage or configuration
 """
 
@@ -62,7 +64,7 @@ def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> 
     from controlplane.server import StartError
 
     try:
-        asyncio.run(_run(config, files))
+        asyncio.run(_run(source, config, files))
     except StartError as error:
         log.critical("%s: %s", source, error)
         return EXIT_FAILED
@@ -108,13 +110,16 @@ def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
     return not record.getMessage().startswith("ExecuteBatchError raised in core")
 
 
-async def _run(config: ControlPlaneConfig, files: TlsFiles | None) -> None:
+async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> None:
+    from controlplane.policy_reload import PolicyReload
     from controlplane.server import serve
 
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
+    reload = PolicyReload(source, config)
+    loop.add_signal_handler(signal.SIGHUP, reload.request)
     systemd = sdnotify.SystemdNotifier()
 
     def ready(addresses: Addresses) -> None:
@@ -141,7 +146,7 @@ async def _run(config: ControlPlaneConfig, files: TlsFiles | None) -> None:
             "insecure: true: no encryption towards sidecars and operators, and everybody who reaches %s is believed",
             config.listen,
         )
-    await serve(config, files, stop, ready, stopping)
+    await serve(config, files, reload, stop, ready, stopping)
 
 
 if __name__ == "__main__":

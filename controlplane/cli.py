@@ -1,4 +1,4 @@
-"""plr: ask a running control plane, certify the fleet's nodes, and look up configuration keys.
+"""plr: ask a running control plane, certify the fleet's nodes, try out a policy, look up configuration keys.
 
 examples:
   plr status
@@ -7,8 +7,9 @@ examples:
   plr ca issue robot-1 --role robot
   plr config schema controlplane
   plr config schema sidecar
+  plr policy check --config /etc/plr/controlplane.yaml --robot arm-1 --service /plan --cloud cloud-a
 
-exit codes: 0 ok, 1 the control plane cannot be reached or is not in order, 2 bad usage
+exit codes: 0 ok, 1 the control plane cannot be reached or is not in order, or the policy denies it, 2 bad usage
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING
 import grpc
 from google.protobuf import json_format
 
-from controlplane import status_table, version
+from controlplane import policy_command, status_table, version
 from controlplane.ca import commands as ca_commands
 from controlplane.config import ControlPlaneConfig
 from protos.config_fields import check_remote
@@ -77,6 +78,8 @@ def _parser() -> argparse.ArgumentParser:
     schema = about.add_parser("schema", help="print the JSON Schema of a program's configuration")
     schema.add_argument("program", choices=["controlplane", "sidecar"])
     schema.set_defaults(run=_schema)
+
+    policy_command.add_to(commands)
     return parser
 
 

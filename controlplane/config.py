@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from controlplane.core.control_events import Settings
+from controlplane.policy_config import PolicyConfig, one_or_list
 from protos.config_fields import (
     ListenAddress,
     RemoteAddress,
@@ -25,8 +26,9 @@ RECONNECT_MAX_MS = 10_000
 """Sidecars try again at most this far apart."""
 
 
-def _as_list(value: object) -> object:
-    return (value,) if isinstance(value, str) else value
+def _empty_if_null(value: object) -> object:
+    # "policy:" with nothing after it denies everything; it must not be taken for no policy, which allows everything.
+    return {} if value is None else value
 
 
 class ControlPlaneConfig(BaseModel):
@@ -48,14 +50,14 @@ class ControlPlaneConfig(BaseModel):
         "address that others reach, unless --insecure-i-know is on the command line.",
     )
     stun_listen: Annotated[
-        tuple[ListenAddress, ...], BeforeValidator(_as_list), AfterValidator(refuse_duplicates), Field(max_length=16)
+        tuple[ListenAddress, ...], BeforeValidator(one_or_list), AfterValidator(refuse_duplicates), Field(max_length=16)
     ] = Field(
         default=("[::]:3478",),
         description="address:port or a list of them where STUN is answered; an empty list turns it off. "
         "[::] means all addresses, IPv4 included.",
     )
     stun_servers: Annotated[
-        tuple[RemoteAddress, ...], BeforeValidator(_as_list), AfterValidator(refuse_duplicates), Field(max_length=16)
+        tuple[RemoteAddress, ...], BeforeValidator(one_or_list), AfterValidator(refuse_duplicates), Field(max_length=16)
     ] = Field(
         default=(),
         description="host:port of the STUN servers that sidecars are told to use, seen from the sidecars: "
@@ -94,6 +96,10 @@ class ControlPlaneConfig(BaseModel):
     solver_time_limit_ms: int = Field(
         default=2000, ge=10, le=60_000, description="Longest time for one solving; then the best plan found is taken."
     )
+    policy: Annotated[PolicyConfig | None, BeforeValidator(_empty_if_null)] = Field(
+        default=None,
+        description="Access control. Without this key everything is allowed; with it, what no rule allows is denied.",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="Least level logged.")
 
     @model_validator(mode="after")
@@ -119,6 +125,7 @@ class ControlPlaneConfig(BaseModel):
             half_life_s=self.histogram_half_life_s,
             default_capacity_interfaces=self.default_capacity_interfaces,
             stun_servers=self.stun_servers,
+            policy=self.policy.policy() if self.policy is not None else None,
         )
 
 

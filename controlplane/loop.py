@@ -10,24 +10,38 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.claims import check_claims
 from controlplane.core.control import ControlCore
-from controlplane.core.control_events import Close, CloseReason, DepartureNotice, NackNotice, Send
+from controlplane.core.control_events import (
+    Close,
+    CloseReason,
+    DepartureNotice,
+    NackNotice,
+    OffersRefusedNotice,
+    Send,
+)
 from controlplane.core.plan import Plan
+from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
 from controlplane.mailbox import Mailbox
 from protos.identity import REVOKED, CertificateError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from controlplane.config import ControlPlaneConfig
     from controlplane.core.picture import Picture
+    from controlplane.core.policy import Policy
     from controlplane.core.registry import StreamId
     from controlplane.metrics import Metrics
     from controlplane.stun_server import StunServer
     from controlplane.tls_gate import Caller
     from protos.identity import Trust
-    from protos.model import NodeName, Registration, SidecarMessage, SidecarStatus
+    from protos.model import NodeName, Registration, ServiceName, SidecarMessage, SidecarStatus
 
 log = logging.getLogger(__name__)
+
+MAX_SERVICES_LOGGED = 8
+"""Services named in one log line."""
 
 METRICS_INTERVAL_S = 1.0
 """How old what is scraped may be: Prometheus scrapes every few seconds at most."""
@@ -39,6 +53,11 @@ def wall_clock_epoch() -> int:
     Below 2^53, so that metrics (doubles) tell one version from the next.
     """
     return time.time_ns() // 1_000_000_000 << 20
+
+
+def _few(services: Sequence[ServiceName]) -> str:
+    more = len(services) - MAX_SERVICES_LOGGED
+    return ", ".join(services[:MAX_SERVICES_LOGGED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _solve(problem: Problem, time_limit_s: float, hint: Plan) -> Plan:
@@ -104,6 +123,11 @@ class ControlLoop:
         """Every registered sidecar."""
         return self._core.status(self._loop.time())
 
+    def set_policy(self, policy: Policy | None) -> None:
+        """Another policy is in force from now on."""
+        self._core.set_policy(policy, self._loop.time())
+        self._dispatch()
+
     def _dispatch(self) -> None:
         while (event := self._core.next_event()) is not None:
             match event:
@@ -120,6 +144,13 @@ class ControlLoop:
                         nack.resource.value,
                         nack.version,
                         nack.error,
+                    )
+                case OffersRefusedNotice(sidecar=name, services=services):
+                    log.warning(
+                        "%s offers %s, which the policy does not let it: told to no robot; missing under offers: %s",
+                        name,
+                        _few(services),
+                        OfferRule((name,), services[:MAX_SERVICES_LOGGED]),
                     )
                 case DepartureNotice(sidecar=name, reason=reason):
                     log.info("%s is gone: %s", name, reason.value)

@@ -93,6 +93,12 @@ class Metrics:
         for reason in REFUSAL_REASONS:
             self._refused_connections.labels(reason)
         self._own_certificate: Identity | None = None
+        self.policy_reloads = prometheus_client.Counter(
+            "plr_policy_reloads_total",
+            "Times the access policy was read again, by what came of it.",
+            ["result"],
+            registry=self.registry,
+        )
         self.registry.register(self._values)
 
     def refused_connection(self, reason: str) -> None:
@@ -209,6 +215,12 @@ def _plan(core: ControlCore, now: float) -> Iterable[Metric]:
         "Groups of assignments whose optimum was not proven within the time limit.",
         [],
         {(): core.counters.unproven},
+    )
+    yield _counter(
+        "plr_offers_refused_total",
+        "Offers that the access policy does not let their clouds make.",
+        [],
+        {(): core.counters.offers_refused},
     )
     yield _counter("plr_reports_total", "Reports merged.", [], {(): core.counters.reports})
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from controlplane.config import ControlPlaneConfig
+    from controlplane.policy_reload import PolicyReload
     from protos.tls_files import TlsFiles
 
 log = logging.getLogger(__name__)
@@ -75,6 +76,7 @@ class Addresses:
 async def serve(
     config: ControlPlaneConfig,
     files: TlsFiles | None,
+    reload: PolicyReload,
     stop: asyncio.Event,
     ready: Callable[[Addresses], None],
     stopping: Callable[[], None],
@@ -106,6 +108,7 @@ async def serve(
             keeper = None
             if files is not None and gate is not None:
                 keeper = tasks.create_task(CertificateKeeper(files, gate, loop, metrics).run())
+            reloading = tasks.create_task(reload.run(loop.set_policy, metrics))
             for name in _SERVICES:
                 await health_service.set(name, health_pb2.HealthCheckResponse.SERVING)
             ready(Addresses(grpc_address, stun, metrics_address))
@@ -115,6 +118,7 @@ async def serve(
             loop.close_streams()
             await server.stop(STOP_GRACE_S)
             loop.stop()
+            reloading.cancel()
             if keeper is not None:
                 keeper.cancel()
 

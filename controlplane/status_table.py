@@ -48,6 +48,8 @@ def _details(status: SidecarStatus) -> Iterator[str]:
     for name, resource in (("peers", status.peers), ("mapping", status.mapping)):
         if resource.state is SyncState.REJECTED:
             yield f"{name} {_rejection(resource)}"
+    if status.refused_offers:
+        yield f"REFUSED by the policy: {', '.join(status.refused_offers)} (offered here, told to no robot)"
     for mapping in status.services:
         yield _mapping(mapping)
     yield from _columns([_path(path) for path in status.paths])

@@ -7,7 +7,9 @@ call it drains `next_event`. Times are monotonic seconds.
 Warm-up. After a restart the registry is empty, while the robots go on with the peers they hold. A robot that says it
 holds a version is therefore sent nothing until every server that its own reports name is here again, or the warm-up
 is over: a set without a server that merely has not yet come back would cost the robot that server. Robots that hold
-nothing, and clouds (they find their robots by the robots' own probes), are served at once.
+nothing, and clouds (they find their robots by the robots' own probes), are served at once. Nor are sets judged by the
+policy before the warm-up is over (PeerSet.policy): a peer that is merely not back yet would be taken for one that the
+policy leaves nothing to do.
 """
 
 from __future__ import annotations
@@ -23,18 +25,23 @@ from controlplane.core.control_events import (
     DepartureNotice,
     Event,
     NackNotice,
+    OffersRefusedNotice,
     Send,
     Settings,
 )
 from controlplane.core.debounce import Change, Debounce, settle
 from controlplane.core.estimator import Estimator
+from controlplane.core.permits import Permits
 from controlplane.core.picture import Picture, draw
 from controlplane.core.plan import Plan
 from controlplane.core.problem import Problem
+from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import MAX_SIDECARS, Admission, Refusal, Registry, StreamId
-from controlplane.core.snapshots import Snapshots, VersionSource
+from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
+from controlplane.core.views import Views
 from protos.errors import DecodeError
 from protos.model import (
+    POLICY_PENDING,
     Ack,
     CandidateSet,
     Drain,
@@ -53,8 +60,9 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from controlplane.core.policy import Policy
     from controlplane.core.registry import Sidecar
-    from protos.model import NodeName, Peer, ServiceName, SidecarMessage, SyncState
+    from protos.model import NodeName, ServiceName, SidecarMessage, SyncState
 
 PUBLISH_DELAY_S = 0.02
 """From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two
@@ -72,6 +80,7 @@ class ControlCore:
         self._warm_until = now + settings.warm_up_s
         self.registry = Registry(lease_s=settings.lease_s)
         self.estimator = Estimator(half_life_s=settings.half_life_s)
+        self.permits = Permits(settings.policy)
         self.counters = Counters()
         self.plan = Plan({})
         self._picture = Picture(Problem(()))
@@ -82,6 +91,8 @@ class ControlCore:
         self._held_back: dict[NodeName, frozenset[NodeName] | None] = {}
         self._streams: dict[StreamId, NodeName] = {}
         self._last_stream = 0
+        self._warm = settings.warm_up_s > 0
+        self._refused_offers = RefusedOffers()
         self._publish_at: float | None = None
         self._events: deque[Event] = deque()
 
@@ -132,6 +143,7 @@ class ControlCore:
             case ServiceSet():
                 if self.registry.set_services(name, message):
                     self._members_changed(now)
+                    self._note_refused_offers(name)
             case Report():
                 self._receive_report(name, message, now)
             case Ack():
@@ -201,6 +213,26 @@ class ControlCore:
             self._streams.pop(sidecar.stream, None)
             self._events.append(Close(sidecar.stream, reason))
 
+    # ── policy ──
+
+    def set_policy(self, policy: Policy | None, now: float) -> None:
+        """Another policy is in force: everybody is told what changes for them."""
+        self.permits = Permits(policy)
+        self._refused_offers.clear()
+        for sidecar in self.registry:
+            self._note_refused_offers(sidecar.name)
+        self._members_changed(now)
+
+    def _note_refused_offers(self, name: NodeName) -> None:
+        sidecar = self.registry.get(name)
+        if sidecar is None:
+            return
+        refused = self.permits.refused_offers(sidecar)
+        new, untold = self._refused_offers.update(name, refused)
+        self.counters.offers_refused += new
+        if untold:
+            self._events.append(OffersRefusedNotice(name, untold))
+
     def disconnected(self, stream: StreamId, now: float) -> None:
         """A stream ended, whoever ended it."""
         name = self._streams.pop(stream, None)
@@ -212,7 +244,7 @@ class ControlCore:
 
     def next_timer(self) -> float | None:
         """When to call `handle_timer` and `start_solving` next."""
-        warm = self._warm_until if self._held_back else None
+        warm = self._warm_until if self._warm else None
         times = (self.registry.next_expiry(), self._publish_at, self._debounce.next_time(), warm)
         return min((time for time in times if time is not None), default=None)
 
@@ -222,7 +254,8 @@ class ControlCore:
             self._end_stream(sidecar, CloseReason.LEASE_EXPIRED)
             self._forget(sidecar.name, RemovalReason.LEASE_EXPIRED)
             self._members_changed(now)
-        if self._held_back and now >= self._warm_until:
+        if self._warm and now >= self._warm_until:
+            self._warm = False
             self._held_back.clear()
             self._publish_soon(now)
         if self._publish_at is not None and self._publish_at <= now:
@@ -232,6 +265,7 @@ class ControlCore:
         self._events.append(DepartureNotice(name, reason))
         self.estimator.forget_paths(name)
         self._held_back.pop(name, None)
+        self._refused_offers.forget(name)
         self._gone_snapshots[name] = self._snapshots.pop(name)
         if len(self._gone_snapshots) > MAX_GONE_SNAPSHOTS:
             self._gone_snapshots.popitem(last=False)
@@ -253,6 +287,7 @@ class ControlCore:
         ready = (sidecar for sidecar in self.registry if sidecar.ready)
         return draw(
             ready,
+            self.permits,
             self.estimator,
             now,
             default_capacity_interfaces=self._settings.default_capacity_interfaces,
@@ -279,12 +314,17 @@ class ControlCore:
 
     def _publish(self) -> None:
         self._publish_at = None
-        peers = {role: reconcile.peers_of(role, self.registry) for role in Role}
-        for sidecar in self.registry:
-            if sidecar.stream is not None and not self._is_held_back(sidecar.name):
-                self._publish_to(sidecar, sidecar.stream, peers[sidecar.role])
+        views = Views(self.registry, self.permits)
+        # Clouds first: what a robot learns that it may call is then refused nowhere.
+        for sidecar in sorted(self.registry, key=lambda sidecar: sidecar.role is Role.ROBOT):
+            if sidecar.stream is not None and not self._is_held_back(sidecar):
+                self._publish_to(sidecar, sidecar.stream, views)
 
-    def _is_held_back(self, name: NodeName) -> bool:
+    def _is_held_back(self, sidecar: Sidecar) -> bool:
+        if self.permits.restricted and sidecar.role is Role.CLOUD and not sidecar.ready:
+            # What robots may call on it depends on what it offers.
+            return True
+        name = sidecar.name
         if name not in self._held_back:
             return False
         servers = self._held_back[name]
@@ -296,15 +336,18 @@ class ControlCore:
             return False
         return True
 
-    def _publish_to(self, sidecar: Sidecar, stream: StreamId, peers: tuple[Peer, ...]) -> None:
+    def _publish_to(self, sidecar: Sidecar, stream: StreamId, views: Views) -> None:
         snapshots = self._snapshots[sidecar.name]
-        if peers != snapshots.peers.sent:
-            removed = reconcile.removed_peers(snapshots.known_names, peers, self.registry)
-            self._events.append(Send(stream, snapshots.send_peers(peers, removed, self._versions)))
+        judged = not (self._warm and self.permits.restricted)
+        view = PeerView(views.peers_of(sidecar), self.permits.fingerprint if judged else POLICY_PENDING)
+        if view != snapshots.peers.sent:
+            removed = views.removed(sidecar, snapshots.known_names)
+            self._events.append(Send(stream, snapshots.send_peers(view, removed, self._versions)))
         if sidecar.role is not Role.ROBOT:
             return
         sent = snapshots.mapping.sent
-        mapping = reconcile.mapping_of(sidecar, peers, self.plan, self._picture, sent or ())
+        servers = views.servers_of(sidecar.name)
+        mapping = reconcile.mapping_of(sidecar, servers, self.plan, self._picture, sent or ())
         if sent is None:
             # Nothing to say yet is no reason to take away what the sidecar holds from before.
             worth_sending = bool(mapping)
@@ -335,6 +378,7 @@ class ControlCore:
                     mapping=snapshots.mapping.status,
                     services=snapshots.mapping.sent or (),
                     paths=tuple(self.estimator.paths(sidecar.name)),
+                    refused_offers=self.permits.refused_offers(sidecar),
                 )
             )
         return found

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from controlplane.core.policy import Policy
     from controlplane.core.registry import StreamId
-    from protos.model import ControlMessage, Nack, NodeName, RemovalReason, ResourceKind
+    from protos.model import ControlMessage, Nack, NodeName, RemovalReason, ResourceKind, ServiceName
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +23,7 @@ class Settings:
     half_life_s: float = 60.0
     default_capacity_interfaces: int = 1
     stun_servers: tuple[str, ...] = ()
+    policy: Policy | None = None
 
 
 class CloseReason(enum.Enum):
@@ -63,6 +65,8 @@ class Counters:
     """Reports of clouds, which measure nothing."""
     old_stream_messages: int = 0
     """Messages on a stream that is not the sidecar's any more."""
+    offers_refused: int = 0
+    """Offers that became known and which the policy does not let their clouds make."""
     solved: int = 0
     relaxations: int = 0
     """Plans taken that exceed a capacity."""
@@ -86,5 +90,13 @@ class DepartureNotice:
     reason: RemovalReason
 
 
-Event = Send | Close | NackNotice | DepartureNotice
+@dataclass(frozen=True, slots=True)
+class OffersRefusedNotice:
+    """A cloud offers services that the policy does not let it, for the log; each is told once."""
+
+    sidecar: NodeName
+    services: tuple[ServiceName, ...]
+
+
+Event = Send | Close | NackNotice | DepartureNotice | OffersRefusedNotice
 """What the driver has to do, in this order."""

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from controlplane.core.estimator import Estimator
+    from controlplane.core.permits import Permits
     from controlplane.core.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceName, ServiceUse
 
@@ -38,10 +39,17 @@ class Picture:
     notes: Mapping[BlockKey, BlockNotes] = field(default_factory=dict)
 
 
-def draw(sidecars: Iterable[Sidecar], estimator: Estimator, now: float, *, default_capacity_interfaces: int) -> Picture:
+def draw(
+    sidecars: Iterable[Sidecar],
+    permits: Permits,
+    estimator: Estimator,
+    now: float,
+    *,
+    default_capacity_interfaces: int,
+) -> Picture:
     """Build the problem. Only paths that are up are candidates, unless none of a robot's is for a service."""
     robots: list[Sidecar] = []
-    servers: dict[tuple[ServiceName, str], list[NodeName]] = {}
+    servers: dict[tuple[ServiceName, str], list[Sidecar]] = {}
     fleet_capacity: dict[FleetKey, int] = {}
     for sidecar in sorted(sidecars, key=lambda sidecar: sidecar.name):
         if sidecar.role is Role.ROBOT:
@@ -50,7 +58,7 @@ def draw(sidecars: Iterable[Sidecar], estimator: Estimator, now: float, *, defau
         if sidecar.draining:
             continue
         for offer in sidecar.offers:
-            servers.setdefault((offer.name, offer.type), []).append(sidecar.name)
+            servers.setdefault((offer.name, offer.type), []).append(sidecar)
             if offer.capacity:
                 fleet_capacity[FleetKey(sidecar.name, offer.name)] = offer.capacity
     blocks: list[Block] = []
@@ -58,7 +66,12 @@ def draw(sidecars: Iterable[Sidecar], estimator: Estimator, now: float, *, defau
     for robot in robots:
         for use in robot.uses:
             key = BlockKey(robot.name, use.name)
-            found = tuple(servers.get((use.name, use.type), ()))
+            offering = servers.get((use.name, use.type), ())
+            group = permits.group(robot.name)
+            found = tuple(cloud.name for cloud in offering if use.name in permits.of(group, cloud))
+            if offering and not found:
+                notes[key] = BlockNotes(unserved="the access policy lets this robot call it on no live server")
+                continue
             block, notes[key] = _block(robot, use, found, estimator, now, default_capacity_interfaces)
             if block is not None:
                 blocks.append(block)

@@ -1,4 +1,4 @@
-"""What each sidecar should hold, from who is there and the plan. Pure functions."""
+"""The mapping each robot should hold, from who is there and the plan. Pure functions."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.picture import interfaces_of
 from controlplane.core.problem import BlockKey
-from protos.model import Assignment, RemovedPeer, ServiceMapping
+from protos.model import NO_CALLS, Assignment, ServiceMapping
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Mapping
 
     from controlplane.core.picture import BlockNotes, Picture
     from controlplane.core.plan import BlockPlan, Plan
-    from controlplane.core.registry import Registry, Sidecar
-    from protos.model import InterfaceName, NodeName, Peer, Role
+    from controlplane.core.registry import Sidecar
+    from protos.model import CallPermit, InterfaceName, NodeName
 
 PREDICTION_CHANGE = 2.0
 """A new predicted miss probability alone is sent when it differs by this factor: it informs, nothing acts on it."""
@@ -23,34 +23,17 @@ PREDICTION_FLOOR = 1e-3
 """Below this, predictions count as equal."""
 
 
-def peers_of(role: Role, registry: Registry) -> tuple[Peer, ...]:
-    """The peers of a sidecar, by name: robots see clouds, clouds see robots, once these told their addresses."""
-    others = sorted((other for other in registry if other.role is not role and other.ready), key=lambda s: s.name)
-    return tuple(other.as_peer() for other in others)
-
-
-def removed_peers(
-    known_names: Collection[NodeName], peers: tuple[Peer, ...], registry: Registry
-) -> tuple[RemovedPeer, ...]:
-    """Notices on those a sidecar may know and should not list any more, with the reason, by name."""
-    present = {peer.name for peer in peers}
-    return tuple(
-        RemovedPeer(name, registry.removal_reason(name)) for name in sorted(known_names) if name not in present
-    )
-
-
 def mapping_of(
     robot: Sidecar,
-    peers: tuple[Peer, ...],
+    servers: Mapping[NodeName, CallPermit],
     plan: Plan,
     picture: Picture,
     previous: tuple[ServiceMapping, ...],
 ) -> tuple[ServiceMapping, ...]:
-    """The mapping of a robot, by service; names only its own interfaces and the `peers` it is sent.
+    """The mapping of a robot, by service; names only its own interfaces and `servers`, for what it may call there.
 
     A use that the picture does not know yet is left out until the next solving, which is due then.
     """
-    servers = {peer.name for peer in peers}
     interfaces = set(interfaces_of(robot))
     before = {mapping.service: mapping for mapping in previous}
     mappings: list[ServiceMapping] = []
@@ -68,7 +51,7 @@ def mapping_of(
         kept = tuple(
             assignment
             for assignment in (*planned, *standby)
-            if assignment.interface in interfaces and assignment.server in servers
+            if assignment.interface in interfaces and use.name in servers.get(assignment.server, NO_CALLS)
         )
         predicted = block.predicted_miss if set(planned) & set(kept) else 1.0
         mappings.append(ServiceMapping(use.name, kept, min(1.0, predicted), _reason(block, notes, plan)))

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
 from protos.model import (
-    ALL_CALLS,
     NodeName,
     Peer,
     Registration,
@@ -24,13 +23,16 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Candidate, ServiceOffer, ServiceSet, ServiceUse, SessionId
+    from protos.model import Candidate, ServiceName, ServiceOffer, ServiceSet, ServiceUse, SessionId
 
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""
 
 MAX_SIDECARS = 4096
 """Sidecars known at once: as many as one set of peers holds. One more is refused, not let in for another."""
+
+MAX_OFFERED = 1024
+"""Names of services remembered for one cloud: as many as it may offer at once. More: only what it offers now."""
 
 MAX_REMEMBERED_REMOVALS = 4096
 """Reasons of removals kept for notices; beyond that the oldest goes, and its notice says "lease expired"."""
@@ -68,6 +70,8 @@ class Sidecar:
     services: ServiceSet | None = None
     """None until told."""
     draining: bool = False
+    offered: frozenset[ServiceName] = frozenset()
+    """Services it has offered since it registered, at most MAX_OFFERED."""
 
     @property
     def name(self) -> NodeName:
@@ -106,7 +110,6 @@ class Sidecar:
             offers=self.offers,
             draining=self.draining,
             credential=self.registration.credential,
-            may_call=ALL_CALLS,
         )
 
 
@@ -213,7 +216,11 @@ class Registry:
     def set_services(self, name: NodeName, services: ServiceSet) -> bool:
         """Replace its services; True if they changed."""
         known = self._sidecars[name]
-        self._sidecars[name] = replace(known, services=services)
+        now_offered = frozenset(offer.name for offer in services.offers)
+        offered = known.offered | now_offered
+        if len(offered) > MAX_OFFERED:
+            offered = now_offered
+        self._sidecars[name] = replace(known, services=services, offered=offered)
         return services != known.services
 
     def set_draining(self, name: NodeName) -> bool:

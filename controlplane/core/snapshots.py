@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from protos.model import MappingSet, PeerSet, ResourceStatus, SyncState, Version
+from protos.model import POLICY_PENDING, MappingSet, PeerSet, ResourceStatus, SyncState, Version
 
 if TYPE_CHECKING:
     from protos.model import Ack, Nack, NodeName, Peer, RemovedPeer, ServiceMapping
 
 C = TypeVar("C")
+
+
+@dataclass(frozen=True, slots=True)
+class PeerView:
+    """What a sidecar is told of its peers."""
+
+    peers: tuple[Peer, ...]
+    policy: int = POLICY_PENDING
+    """Of PeerSet."""
 
 
 class VersionSource:
@@ -90,16 +100,16 @@ class Snapshots:
     __slots__ = ("known_names", "mapping", "peers")
 
     def __init__(self) -> None:
-        self.peers: Track[tuple[Peer, ...]] = Track()
+        self.peers: Track[PeerView] = Track()
         self.mapping: Track[tuple[ServiceMapping, ...]] = Track()
         self.known_names: set[NodeName] = set()
         """Peers the sidecar may know: of the set it acknowledged last and of all sent since."""
 
-    def send_peers(self, peers: tuple[Peer, ...], removed: tuple[RemovedPeer, ...], versions: VersionSource) -> PeerSet:
+    def send_peers(self, view: PeerView, removed: tuple[RemovedPeer, ...], versions: VersionSource) -> PeerSet:
         """Send the sidecar its peers."""
-        version = self.peers.send(peers, versions)
-        self.known_names.update(peer.name for peer in peers)
-        return PeerSet(version, self.peers.nonce, peers, removed)
+        version = self.peers.send(view, versions)
+        self.known_names.update(peer.name for peer in view.peers)
+        return PeerSet(version, self.peers.nonce, view.peers, removed, view.policy)
 
     def send_mapping(self, services: tuple[ServiceMapping, ...], versions: VersionSource) -> MappingSet:
         """Send the sidecar its mapping."""
@@ -110,5 +120,6 @@ class Snapshots:
         """The sidecar applied its peers: it forgot all others."""
         if not self.peers.ack(ack):
             return False
-        self.known_names = {peer.name for peer in self.peers.sent or ()}
+        if self.peers.sent is not None:
+            self.known_names = {peer.name for peer in self.peers.sent.peers}
         return True

@@ -80,11 +80,12 @@ def host(tmp_path: Path) -> Path:
     etc.mkdir(parents=True)
     for unit in UNITS:
         shutil.copy(unit, etc)
-        program = re.search(r"^ExecStart=(\S+)", unit.read_text(), re.MULTILINE)
-        assert program
-        path = tmp_path / program[1].lstrip("/")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch(mode=0o755)
+        programs = re.findall(r"^Exec\w+=(\S+)", unit.read_text(), re.MULTILINE)
+        assert programs
+        for program in programs:
+            path = tmp_path / program.lstrip("/")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch(mode=0o755)
     return tmp_path
 
 

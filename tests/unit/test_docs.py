@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import re
+import types
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,9 +72,9 @@ def _nested(annotation: Any) -> tuple[type[BaseModel] | None, str]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation, ""
     for inner in getattr(annotation, "__args__", ()):
-        found, _ = _nested(inner)
+        found, mark = _nested(inner)
         if found is not None:
-            return found, "[]"
+            return found, mark if isinstance(annotation, types.UnionType) else "[]"
     return None, ""
 
 

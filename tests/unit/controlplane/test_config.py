@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from controlplane.config import ControlPlaneConfig, load_config, parse_config
+from controlplane.core.policy import CallRule, OfferRule, Policy
 from protos.config_fields import check_remote, split_host_port
 from protos.config_file import MAX_CONFIG_BYTES
 from protos.errors import ConfigError
@@ -40,10 +41,38 @@ def test_one_address_may_stand_without_a_list() -> None:
     )
 
 
+def test_no_policy_is_another_thing_than_an_empty_one() -> None:
+    assert read("").settings().policy is None
+    assert read("policy:").settings().policy == Policy()
+    assert read("policy: {}").settings().policy == Policy()
+
+
+def test_a_policy_is_read_with_lists_or_single_patterns() -> None:
+    text = "policy: {calls: [{robots: 'r-*', services: [/a, /b/*], clouds: '*'}], offers: [{clouds: c, services: /a}]}"
+    assert read(text).settings().policy == Policy(
+        (CallRule(("r-*",), ("/a", "/b/*"), ("*",)),), (OfferRule(("c",), ("/a",)),)
+    )
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
         ("lease: 3", "lease: unknown key; did you mean lease_ms?"),
+        ("policy: []", "policy: expected keys and values, got []"),
+        ("policy: {call: []}", "policy.call: unknown key; did you mean calls?"),
+        ("policy: {calls: null}", "policy.calls: expected a list, got nothing"),
+        ("policy: {calls: [{robots: r, services: /s}]}", "policy.calls[0].clouds: expected, but missing"),
+        ("policy: {offers: [{robots: r, services: /s, clouds: c}]}", "policy.offers[0].robots: unknown key; expected"),
+        ("policy: {offers: [{clouds: [], services: /s}]}", "policy.offers[0].clouds: expected at least 1 entry"),
+        ("policy: {offers: [{clouds: [c, c], services: /s}]}", "policy.offers[0].clouds: expected each entry once"),
+        (
+            "policy: {offers: [{clouds: 'c d', services: /s}]}",
+            "policy.offers[0].clouds[0]: matches no name",
+        ),
+        (
+            "policy: {offers: [{clouds: c, services: plan}]}",
+            "policy.offers[0].services[0]: matches no name",
+        ),
         ("xyz: 3", "xyz: unknown key; expected one of default_capacity_interfaces, "),
         ("lease_ms: soon", "lease_ms: expected a valid integer, unable to parse string as an integer, got 'soon'"),
         ("lease_ms: [1]", "lease_ms: expected a whole number, got [1]"),

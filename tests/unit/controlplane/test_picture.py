@@ -5,10 +5,22 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.estimator import Estimator
+from controlplane.core.permits import Permits
 from controlplane.core.picture import BlockNotes, Picture, draw
+from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem import BlockKey, FleetKey
 from controlplane.core.registry import Sidecar
-from protos.model import Candidate, NodeName, PathReport, Report, Role, ServiceOffer, ServiceSet, ServiceUse
+from protos.model import (
+    Candidate,
+    NodeName,
+    PathReport,
+    Report,
+    Role,
+    ServiceName,
+    ServiceOffer,
+    ServiceSet,
+    ServiceUse,
+)
 from tests.unit.controlplane.samples import (
     PLAN,
     candidate,
@@ -30,14 +42,17 @@ def robot(*uses: ServiceUse, candidates: tuple[Candidate, ...] = interfaces("wla
 
 def cloud(name: str, *offers: ServiceOffer, draining: bool = False) -> Sidecar:
     services = ServiceSet(offers or (offer(),))
-    return Sidecar(registration(name, Role.CLOUD), 9.0, stream(2), interfaces("eth0"), services, draining)
+    offered = frozenset(offer.name for offer in services.offers)
+    return Sidecar(registration(name, Role.CLOUD), 9.0, stream(2), interfaces("eth0"), services, draining, offered)
 
 
-def picture(*sidecars: Sidecar, paths: tuple[PathReport, ...] = (), capacity: int = 1) -> Picture:
+def picture(
+    *sidecars: Sidecar, paths: tuple[PathReport, ...] = (), capacity: int = 1, policy: Policy | None = None
+) -> Picture:
     estimator = Estimator(half_life_s=60.0)
     if paths:
         estimator.merge(NodeName("robot"), Report(paths=paths), 0.0)
-    return draw(sidecars, estimator, 0.0, default_capacity_interfaces=capacity)
+    return draw(sidecars, Permits(policy), estimator, 0.0, default_capacity_interfaces=capacity)
 
 
 def test_only_paths_that_are_up_are_candidates() -> None:
@@ -124,3 +139,18 @@ def test_each_use_has_its_own_deadline() -> None:
     epsilon = {block.key.service: block.epsilon[0][0] for block in drawn.problem.blocks}
     assert epsilon[slow.name] == pytest.approx(0.005, abs=0.002)
     assert epsilon[fast.name] == pytest.approx(0.995, abs=0.002)
+
+
+def test_servers_that_the_policy_keeps_from_a_robot_are_no_candidates() -> None:
+    policy = Policy((CallRule(("robot",), ("*",), ("a", "c")),), (OfferRule(("a", "b"), ("*",)),))
+    drawn = picture(robot(), cloud("a"), cloud("b"), cloud("c"), policy=policy)
+    (block,) = drawn.problem.blocks
+    assert block.servers == ("a",)
+    assert drawn.notes[KEY].servers == ("a",)
+
+
+def test_a_use_that_the_policy_lets_nowhere_says_so() -> None:
+    drawn = picture(robot(use(), use("/other")), cloud("a"), policy=Policy())
+    assert drawn.problem.blocks == ()
+    assert drawn.notes[KEY].unserved == "the access policy lets this robot call it on no live server"
+    assert "no live server offers it" in drawn.notes[BlockKey(NodeName("robot"), ServiceName("/other"))].unserved

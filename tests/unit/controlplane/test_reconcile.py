@@ -7,21 +7,20 @@ import pytest
 from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.plan import BlockPlan, Plan
 from controlplane.core.problem import BlockKey, FleetKey, Problem
-from controlplane.core.reconcile import differs, mapping_of, peers_of, removed_peers
-from controlplane.core.registry import Registry, Sidecar
+from controlplane.core.reconcile import differs, mapping_of
+from controlplane.core.registry import Sidecar
 from protos.model import (
+    ALL_CALLS,
     Assignment,
+    CallPermit,
     InterfaceName,
     NodeName,
-    Peer,
-    RemovalReason,
-    RemovedPeer,
-    Role,
     ServiceMapping,
+    ServiceName,
     ServiceSet,
     ServiceUse,
 )
-from tests.unit.controlplane.samples import PLAN, interfaces, offer, registration, stream, use
+from tests.unit.controlplane.samples import PLAN, interfaces, registration, stream, use
 
 KEY = BlockKey(NodeName("robot"), PLAN)
 A, B, C = NodeName("a"), NodeName("b"), NodeName("c")
@@ -34,11 +33,8 @@ def robot(*uses: ServiceUse) -> Sidecar:
     )
 
 
-def peers(*names: str) -> tuple[Peer, ...]:
-    return tuple(
-        Sidecar(registration(name, Role.CLOUD), 9.0, stream(2), interfaces("eth0"), ServiceSet((offer(),))).as_peer()
-        for name in names
-    )
+def servers(*names: str) -> dict[NodeName, CallPermit]:
+    return {NodeName(name): ALL_CALLS for name in names}
 
 
 def plan(*pairs: tuple[InterfaceName, NodeName], predicted: float = 0.01, excess: int = 0) -> Plan:
@@ -53,52 +49,35 @@ def pairs(mapping: ServiceMapping) -> list[tuple[str, str]]:
     return [(assignment.interface, assignment.server) for assignment in mapping.assignments]
 
 
-def test_peers_are_the_other_role_by_name_when_ready() -> None:
-    registry = Registry(lease_s=5.0)
-    for number, (name, role) in enumerate(
-        [("b", Role.CLOUD), ("a", Role.CLOUD), ("r", Role.ROBOT), ("late", Role.CLOUD)]
-    ):
-        registry.register(registration(name, role), stream(number), 0.0)
-        if name != "late":
-            registry.set_candidates(NodeName(name), interfaces("eth0"))
-            registry.set_services(NodeName(name), ServiceSet())
-    assert [peer.name for peer in peers_of(Role.ROBOT, registry)] == ["a", "b"]
-    assert [peer.name for peer in peers_of(Role.CLOUD, registry)] == ["r"]
-
-
-def test_notices_name_those_known_but_not_listed_with_their_reason() -> None:
-    registry = Registry(lease_s=5.0)
-    registry.register(registration("a", Role.CLOUD), stream(1), 0.0)
-    registry.set_draining(A)
-    registry.disconnect(A, stream(1))
-    assert removed_peers({A, B, C}, peers("c"), registry) == (
-        RemovedPeer(A, RemovalReason.LEFT),
-        RemovedPeer(B, RemovalReason.LEASE_EXPIRED),
-    )
-
-
 def test_a_mapping_is_the_plan() -> None:
-    (mapping,) = mapping_of(robot(), peers("a", "b"), plan((WLAN, A), (WWAN, B)), picture(servers=(A, B)), ())
+    (mapping,) = mapping_of(robot(), servers("a", "b"), plan((WLAN, A), (WWAN, B)), picture(servers=(A, B)), ())
     assert pairs(mapping) == [("wlan0", "a"), ("wwan0", "b")]
     assert mapping.predicted_miss == 0.01
 
 
 def test_a_mapping_names_no_peer_and_no_interface_that_is_not_there() -> None:
     stale = plan((WLAN, A), (WWAN, B), (InterfaceName("usb0"), B))
-    (mapping,) = mapping_of(robot(), peers("b"), stale, picture(servers=(A, B)), ())
+    (mapping,) = mapping_of(robot(), servers("b"), stale, picture(servers=(A, B)), ())
     assert pairs(mapping) == [("wwan0", "b")]
-    (nothing,) = mapping_of(robot(), (), stale, picture(servers=(A, B)), ())
+    (nothing,) = mapping_of(robot(), {}, stale, picture(servers=(A, B)), ())
     assert pairs(nothing) == []
     assert nothing.predicted_miss == 1.0
 
 
+def test_a_mapping_names_no_server_that_the_robot_may_not_call_there() -> None:
+    """The plan may be older than the policy."""
+    permits = {A: CallPermit(frozenset({ServiceName("/other")})), B: CallPermit(frozenset({PLAN}))}
+    (mapping,) = mapping_of(robot(), permits, plan((WLAN, A), (WWAN, B)), picture(servers=(A, B)), ())
+    assert pairs(mapping) == [("wwan0", "b")]
+
+
 def test_a_use_not_yet_solved_for_is_left_out() -> None:
-    found = mapping_of(robot(use(), use("/new")), peers("a"), plan((WLAN, A)), picture(servers=(A,)), ())
+    found = mapping_of(robot(use(), use("/new")), servers("a"), plan((WLAN, A)), picture(servers=(A,)), ())
     assert [mapping.service for mapping in found] == [PLAN]
 
 
 def test_a_use_that_nobody_serves_says_why() -> None:
-    (mapping,) = mapping_of(robot(), peers("a"), Plan({}), picture(unserved="no live server"), ())
+    (mapping,) = mapping_of(robot(), servers("a"), Plan({}), picture(unserved="no live server"), ())
     assert mapping == ServiceMapping(PLAN, (), 1.0, "no live server")
 
 
@@ -109,7 +88,7 @@ def test_a_use_that_nobody_serves_says_why() -> None:
 def test_a_dark_interface_keeps_its_server_or_takes_a_free_one(before: tuple[Assignment, ...], expected: str) -> None:
     previous = (ServiceMapping(PLAN, before),)
     dark = picture(servers=(A, B, C), dark=(WWAN,))
-    (mapping,) = mapping_of(robot(), peers("a", "b", "c"), plan((WLAN, A)), dark, previous)
+    (mapping,) = mapping_of(robot(), servers("a", "b", "c"), plan((WLAN, A)), dark, previous)
     assert pairs(mapping) == [("wlan0", "a"), ("wwan0", expected)]
     assert "standby" in mapping.reason
 
@@ -117,16 +96,16 @@ def test_a_dark_interface_keeps_its_server_or_takes_a_free_one(before: tuple[Ass
 def test_a_dark_interface_of_what_is_not_idempotent_takes_the_one_server() -> None:
     previous = (ServiceMapping(PLAN, (Assignment(WWAN, B),)),)
     dark = picture(servers=(A, B), dark=(WWAN,))
-    (mapping,) = mapping_of(robot(use(idempotent=False)), peers("a", "b"), plan((WLAN, A)), dark, previous)
+    (mapping,) = mapping_of(robot(use(idempotent=False)), servers("a", "b"), plan((WLAN, A)), dark, previous)
     assert pairs(mapping) == [("wlan0", "a"), ("wwan0", "a")]
 
 
 def test_relaxations_stand_in_the_reason() -> None:
     own = plan((WLAN, A), (WWAN, A), excess=1)
-    (mapping,) = mapping_of(robot(), peers("a"), own, picture(servers=(A,)), ())
+    (mapping,) = mapping_of(robot(), servers("a"), own, picture(servers=(A,)), ())
     assert "too few servers: capacity exceeded by 1" in mapping.reason
     fleet = Plan(own.blocks, {FleetKey(A, PLAN): 2, FleetKey(B, PLAN): 5})
-    (mapping,) = mapping_of(robot(), peers("a"), fleet, picture(servers=(A,)), ())
+    (mapping,) = mapping_of(robot(), servers("a"), fleet, picture(servers=(A,)), ())
     assert "for all robots: capacity exceeded by 2" in mapping.reason
 
 

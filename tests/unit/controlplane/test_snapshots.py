@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.snapshots import Snapshots, Track, VersionSource
+from controlplane.core.snapshots import PeerView, Snapshots, Track, VersionSource
 from protos.model import Ack, Nack, NodeName, Peer, ResourceKind, Role, SessionId, SyncState, Version
 
 EPOCH = 1000
@@ -126,8 +126,8 @@ def peer(name: str) -> Peer:
 
 def test_names_a_sidecar_may_know_grow_until_it_acknowledges(versions: VersionSource) -> None:
     snapshots = Snapshots()
-    snapshots.send_peers((peer("a"), peer("b")), (), versions)
-    snapshots.send_peers((peer("b"), peer("c")), (), versions)
+    snapshots.send_peers(PeerView((peer("a"), peer("b"))), (), versions)
+    snapshots.send_peers(PeerView((peer("b"), peer("c"))), (), versions)
     assert snapshots.known_names == {"a", "b", "c"}
     stale = Ack(ResourceKind.PEERS, snapshots.peers.version_sent, snapshots.peers.nonce - 1)
     assert not snapshots.peers_acked(stale)

@@ -1,0 +1,94 @@
+"""Shell-style patterns for names: `*` any text ('/' included), `?` one character, `[ab]` or `[!ab]` one of or none of.
+
+Case counts. The dialect is Python's `fnmatch.fnmatchcase`, as in the sidecars' `services[].name`.
+"""
+
+from __future__ import annotations
+
+import enum
+import fnmatch
+import functools
+import re
+import string
+
+MAX_PATTERN_CHARACTERS = 255
+"""No name is longer (protos/names.py)."""
+
+_LETTERS = frozenset(string.ascii_letters)
+_ALNUM = _LETTERS | frozenset(string.digits)
+
+
+class NameKind(enum.Enum):
+    """What a pattern stands for."""
+
+    NODE = "a sidecar"
+    SERVICE = "a service"
+
+
+_State = tuple[tuple[frozenset[str], int], ...]
+_STATES: dict[NameKind, tuple[tuple[_State, ...], int]] = {
+    # What protos/names.py lets through, as automata: where each state leads by which characters; the last one accepts.
+    NameKind.NODE: ((((_ALNUM, 1),), ((_ALNUM | frozenset("_.-"), 1),)), 1),
+    NameKind.SERVICE: (
+        (
+            ((frozenset("/"), 1),),
+            ((_LETTERS | {"_"}, 2),),
+            ((_ALNUM | {"_"}, 2), (frozenset("/"), 1)),
+        ),
+        2,
+    ),
+}
+
+
+@functools.lru_cache(maxsize=4096)
+def _compiled(patterns: tuple[str, ...]) -> re.Pattern[str]:
+    return re.compile("|".join(fnmatch.translate(pattern) for pattern in patterns))
+
+
+def matches(name: str, patterns: tuple[str, ...]) -> bool:
+    """Whether one of the patterns matches the name."""
+    return _compiled(patterns).match(name) is not None
+
+
+def can_match(pattern: str, kind: NameKind) -> bool:
+    """Whether any valid name matches the pattern: a walk through pattern and grammar of names side by side."""
+    states, accepting = _STATES[kind]
+    units = _units(pattern)
+    seen: set[tuple[int, int]] = set()
+    frontier = [(0, 0)]
+    while frontier:
+        here = frontier.pop()
+        if here in seen:
+            continue
+        seen.add(here)
+        position, state = here
+        if position == len(units):
+            if state == accepting:
+                return True
+            continue
+        unit = units[position]
+        if unit == "*":
+            frontier.append((position + 1, state))
+            frontier += [(position, target) for _, target in states[state]]
+        else:
+            for characters, target in states[state]:
+                if any(fnmatch.fnmatchcase(character, unit) for character in characters):
+                    frontier.append((position + 1, target))
+    return False
+
+
+def _units(pattern: str) -> list[str]:
+    """Cut into parts that match one character each, and stars. A bracket that is not closed is a plain character."""
+    units: list[str] = []
+    position = 0
+    while position < len(pattern):
+        end = position + 1
+        if pattern[position] == "[":
+            # A ']' right after the bracket, or after its '!', is one of the set.
+            search = end + 1 if pattern[end : end + 1] == "!" else end
+            closing = pattern.find("]", search + 1)
+            if closing >= 0:
+                end = closing + 1
+        units.append(pattern[position:end])
+        position = end
+    return units

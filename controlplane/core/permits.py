@@ -1,0 +1,84 @@
+"""The policy applied to the sidecars that are there, with what was worked out kept until the policy changes.
+
+A publication asks for every robot and every cloud. Robots that the same rules are about form a group and may do the
+same, so that the rules are tried once for each group and cloud, not for each robot.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from controlplane.core.registry import MAX_SIDECARS
+from protos.model import ALL_CALLS, NO_POLICY, CallPermit
+
+if TYPE_CHECKING:
+    from controlplane.core.policy import Policy
+    from controlplane.core.registry import Sidecar
+    from protos.model import NodeName, ServiceName
+
+MAX_GROUPED = 2 * MAX_SIDECARS
+"""Robots whose group is kept; then all are worked out anew."""
+
+MAX_KEPT_PERMITS = 65_536
+"""Permits kept, of some hundred bytes each; then all are worked out anew."""
+
+Group = frozenset[int]
+"""Indices of the `calls` rules that are about a robot."""
+
+
+class Permits:
+    """What robots may call and clouds may offer; without a policy, everything."""
+
+    def __init__(self, policy: Policy | None) -> None:
+        self._policy = policy
+        self._groups: dict[NodeName, Group] = {}
+        self._permits: dict[tuple[Group, NodeName], tuple[frozenset[ServiceName], CallPermit]] = {}
+        self.fingerprint = NO_POLICY if policy is None else policy.fingerprint
+
+    @property
+    def restricted(self) -> bool:
+        """Whether there is a policy."""
+        return self._policy is not None
+
+    def group(self, robot: NodeName) -> Group:
+        """The group of a robot."""
+        if self._policy is None:
+            return frozenset()
+        group = self._groups.get(robot)
+        if group is None:
+            group = frozenset(index for index, rule in enumerate(self._policy.calls) if rule.concerns(robot))
+            if len(self._groups) >= MAX_GROUPED:
+                self._groups.clear()
+            self._groups[robot] = group
+        return group
+
+    def of(self, group: Group, cloud: Sidecar) -> CallPermit:
+        """What the robots of a group may call on a cloud, of all it offered since it registered.
+
+        Not only of what it offers now: a server that is away for a moment must not cost its robots their place.
+        """
+        if self._policy is None:
+            return ALL_CALLS
+        known = self._permits.get((group, cloud.name))
+        if known is not None and known[0] == cloud.offered:
+            return known[1]
+        rules = [self._policy.calls[index] for index in group]
+        names = frozenset(
+            service
+            for service in cloud.offered
+            if self._policy.offer_rule(cloud.name, service) is not None
+            and any(rule.lets_call(service, cloud.name) for rule in rules)
+        )
+        permit = CallPermit(names)
+        if len(self._permits) >= MAX_KEPT_PERMITS:
+            self._permits.clear()
+        self._permits[group, cloud.name] = (cloud.offered, permit)
+        return permit
+
+    def may_offer(self, cloud: NodeName, service: ServiceName) -> bool:
+        """Whether a cloud may offer a service."""
+        return self._policy is None or self._policy.offer_rule(cloud, service) is not None
+
+    def refused_offers(self, cloud: Sidecar) -> tuple[ServiceName, ...]:
+        """What a cloud offers now and may not."""
+        return tuple(offer.name for offer in cloud.offers if not self.may_offer(cloud.name, offer.name))

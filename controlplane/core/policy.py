@@ -1,0 +1,104 @@
+"""Access control: which robots may call which services on which clouds, and which clouds may offer which services.
+
+A policy is two lists of rules of patterns (`patterns.py`). A call is allowed when some rule under `offers` lets the
+cloud offer the service, and some rule under `calls` lets the robot call the service on that cloud. What no rule allows
+is denied; there are no rules that deny. Where no policy is given at all, everything is allowed (`access.py`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from controlplane.core.patterns import matches
+from protos.model import NO_POLICY
+
+if TYPE_CHECKING:
+    from protos.model import NodeName, ServiceName
+
+MAX_RULES = 1024
+"""Rules in one list."""
+
+MAX_PATTERNS = 1024
+"""Patterns in one list of one rule."""
+
+_FINGERPRINT_BYTES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class CallRule:
+    """These robots may call these services on these clouds."""
+
+    robots: tuple[str, ...]
+    services: tuple[str, ...]
+    clouds: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """As the configuration has it."""
+        return f"{{robots: {_listed(self.robots)}, services: {_listed(self.services)}, clouds: {_listed(self.clouds)}}}"
+
+    def concerns(self, robot: NodeName) -> bool:
+        """Whether the rule is about this robot."""
+        return matches(robot, self.robots)
+
+    def lets_call(self, service: ServiceName, cloud: NodeName) -> bool:
+        """Whether the rule lets the robots it is about call the service on the cloud."""
+        return matches(cloud, self.clouds) and matches(service, self.services)
+
+
+@dataclass(frozen=True, slots=True)
+class OfferRule:
+    """These clouds may offer these services."""
+
+    clouds: tuple[str, ...]
+    services: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """As the configuration has it."""
+        return f"{{clouds: {_listed(self.clouds)}, services: {_listed(self.services)}}}"
+
+    def lets_offer(self, cloud: NodeName, service: ServiceName) -> bool:
+        """Whether the rule lets the cloud offer the service."""
+        return matches(cloud, self.clouds) and matches(service, self.services)
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """All rules; their order does not matter."""
+
+    calls: tuple[CallRule, ...] = ()
+    offers: tuple[OfferRule, ...] = ()
+
+    def offer_rule(self, cloud: NodeName, service: ServiceName) -> int | None:
+        """Index of the first rule that lets the cloud offer the service."""
+        return next((index for index, rule in enumerate(self.offers) if rule.lets_offer(cloud, service)), None)
+
+    def call_rule(self, robot: NodeName, service: ServiceName, cloud: NodeName) -> int | None:
+        """Index of the first rule that lets the robot call the service on the cloud, may that offer it or not."""
+        for index, rule in enumerate(self.calls):
+            if rule.lets_call(service, cloud) and rule.concerns(robot):
+                return index
+        return None
+
+    def allows(self, robot: NodeName, service: ServiceName, cloud: NodeName) -> bool:
+        """Whether the robot may call the service on the cloud."""
+        return self.offer_rule(cloud, service) is not None and self.call_rule(robot, service, cloud) is not None
+
+    @property
+    def fingerprint(self) -> int:
+        """64 bits that differ between policies, and from what stands in their place where there is none."""
+        text = json.dumps(
+            [
+                [[rule.robots, rule.services, rule.clouds] for rule in self.calls],
+                [[rule.clouds, rule.services] for rule in self.offers],
+            ]
+        )
+        value = int.from_bytes(hashlib.sha256(text.encode()).digest()[:_FINGERPRINT_BYTES], "big")
+        return max(value, NO_POLICY + 1)
+
+
+def _listed(patterns: tuple[str, ...]) -> str:
+    """A YAML list; quoted, since a star at the beginning means something else there."""
+    return json.dumps(patterns)

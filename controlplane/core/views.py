@@ -1,0 +1,84 @@
+"""What each sidecar is told of the others: the other role, those ready, and of them what the policy lets it have to do
+with. Made for one publication, so that what many are told alike is made once.
+
+- A robot is told of the clouds on which it may call something, with the offers it may call.
+- A cloud is told of the robots that may call something on it, each with what that is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from protos.model import RemovalReason, RemovedPeer, Role
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from controlplane.core.permits import Group, Permits
+    from controlplane.core.registry import Registry, Sidecar
+    from protos.model import CallPermit, NodeName, Peer
+
+
+class Views:
+    """The views of all sidecars at one moment."""
+
+    def __init__(self, registry: Registry, permits: Permits) -> None:
+        self._registry = registry
+        self._permits = permits
+        ready = sorted((sidecar for sidecar in registry if sidecar.ready), key=lambda sidecar: sidecar.name)
+        self._robots = [sidecar for sidecar in ready if sidecar.role is Role.ROBOT]
+        self._clouds = [sidecar for sidecar in ready if sidecar.role is Role.CLOUD]
+        self._of_robots: dict[Group, tuple[Peer, ...]] = {}
+        self._of_clouds: dict[tuple[CallPermit, ...], tuple[Peer, ...]] = {}
+        self._servers: dict[Group, Mapping[NodeName, CallPermit]] = {}
+
+    def peers_of(self, sidecar: Sidecar) -> tuple[Peer, ...]:
+        """The peers a sidecar is told of, by name."""
+        if sidecar.role is Role.CLOUD:
+            return self._robots_for(sidecar)
+        group = self._permits.group(sidecar.name)
+        peers = self._of_robots.get(group)
+        if peers is None:
+            servers = self.servers_of(sidecar.name)
+            peers = tuple(_offering(cloud, servers[cloud.name]) for cloud in self._clouds if cloud.name in servers)
+            self._of_robots[group] = peers
+        return peers
+
+    def servers_of(self, robot: NodeName) -> Mapping[NodeName, CallPermit]:
+        """The clouds a robot is told of, and what it may call there."""
+        group = self._permits.group(robot)
+        servers = self._servers.get(group)
+        if servers is None:
+            found = ((cloud.name, self._permits.of(group, cloud)) for cloud in self._clouds)
+            servers = self._servers[group] = {name: permit for name, permit in found if permit}
+        return servers
+
+    def _robots_for(self, cloud: Sidecar) -> tuple[Peer, ...]:
+        permits = tuple(self._permits.of(self._permits.group(robot.name), cloud) for robot in self._robots)
+        peers = self._of_clouds.get(permits)
+        if peers is None:
+            pairs = zip(self._robots, permits, strict=True)
+            peers = tuple(dataclasses.replace(robot.as_peer(), may_call=permit) for robot, permit in pairs if permit)
+            self._of_clouds[permits] = peers
+        return peers
+
+    def removed(self, sidecar: Sidecar, known_names: Collection[NodeName]) -> tuple[RemovedPeer, ...]:
+        """Notices on those a sidecar may know and should not list any more, with the reason, by name."""
+        present = {peer.name for peer in self.peers_of(sidecar)}
+        return tuple(
+            RemovedPeer(name, self._reason(sidecar, name)) for name in sorted(known_names) if name not in present
+        )
+
+    def _reason(self, sidecar: Sidecar, name: NodeName) -> RemovalReason:
+        other = self._registry.get(name)
+        if other is None or not other.ready:
+            return self._registry.removal_reason(name)
+        cloud = other if other.role is Role.CLOUD else sidecar
+        # A cloud that has not offered anything yet forbids nothing: it may be on its way back.
+        return RemovalReason.FORBIDDEN if cloud.offered else RemovalReason.LEASE_EXPIRED
+
+
+def _offering(cloud: Sidecar, permit: CallPermit) -> Peer:
+    peer = cloud.as_peer()
+    return dataclasses.replace(peer, offers=tuple(offer for offer in peer.offers if offer.name in permit))

@@ -1,0 +1,63 @@
+"""`plr policy`: what the access policy of a configuration file says, without a running control plane."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from controlplane.config import load_config
+from controlplane.core.policy_explain import explain
+from protos.errors import ConfigError, DecodeError
+from protos.names import node_name, service_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+EXIT_ALLOWED = 0
+EXIT_DENIED = 1
+EXIT_USAGE = 2
+
+N = TypeVar("N")
+
+if TYPE_CHECKING:
+    Commands = argparse._SubParsersAction[argparse.ArgumentParser]
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command to `plr`."""
+    policy = commands.add_parser("policy", help="about the access policy in a control plane's configuration")
+    about = policy.add_subparsers(required=True, metavar="COMMAND")
+    check = about.add_parser(
+        "check",
+        help="whether a robot may call a service on a cloud, and which rules say so",
+        epilog="exit codes: 0 allowed, 1 denied, 2 bad usage or configuration",
+    )
+    check.add_argument("--config", type=Path, required=True, metavar="FILE", help="the control plane's configuration")
+    check.add_argument("--robot", type=_checked(node_name), required=True, metavar="NAME")
+    check.add_argument("--service", type=_checked(service_name), required=True, metavar="NAME")
+    check.add_argument("--cloud", type=_checked(node_name), required=True, metavar="NAME")
+    check.set_defaults(run=_check)
+
+
+def _checked(check: Callable[[str, str], N]) -> Callable[[str], N]:
+    def parse(text: str) -> N:
+        try:
+            return check(text, "the name")
+        except DecodeError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return parse
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    try:
+        policy = load_config(arguments.config).settings().policy
+    except ConfigError as error:
+        sys.stderr.write(f"plr: {error}\n")
+        return EXIT_USAGE
+    decision = explain(policy, arguments.robot, arguments.service, arguments.cloud)
+    lines = ["allowed" if decision.allowed else "denied", *(f"  {reason}" for reason in decision.reasons)]
+    sys.stdout.write("\n".join(lines) + "\n")
+    return EXIT_ALLOWED if decision.allowed else EXIT_DENIED

@@ -1,0 +1,73 @@
+"""Takes a new access policy from the configuration file while running, when told to (SIGHUP).
+
+When told, and not whenever the file changes: a file that an editor has saved half must not decide who may do what.
+What cannot be read or is not in order leaves the policy in force.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from controlplane.config import load_config
+from protos.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from controlplane.config import ControlPlaneConfig
+    from controlplane.core.policy import Policy
+    from controlplane.metrics import Metrics
+
+log = logging.getLogger(__name__)
+
+
+def announce(policy: Policy | None) -> None:
+    """Log what is in force."""
+    if policy is None:
+        log.warning("there is no policy: every robot may call, and every cloud may offer, every service")
+    else:
+        log.info("policy in force: %d rules for calls, %d for offers", len(policy.calls), len(policy.offers))
+
+
+class PolicyReload:
+    """Reads the file again for each `request`."""
+
+    def __init__(self, source: Path, config: ControlPlaneConfig) -> None:
+        self._source = source
+        self._config = config
+        self._requested = asyncio.Event()
+
+    def request(self) -> None:
+        """Read the file soon; for a signal handler."""
+        self._requested.set()
+
+    async def run(self, apply: Callable[[Policy | None], None], metrics: Metrics) -> None:
+        """Serve requests until cancelled; `apply` puts a policy in force."""
+        announce(self._config.settings().policy)
+        while True:
+            await self._requested.wait()
+            self._requested.clear()
+            try:
+                config = await asyncio.to_thread(load_config, self._source)
+            except ConfigError as error:
+                metrics.policy_reloads.labels("refused").inc()
+                log.error("%s; the policy in force stays", error)
+                continue
+            metrics.policy_reloads.labels("applied").inc()
+            self._take(config, apply)
+
+    def _take(self, config: ControlPlaneConfig, apply: Callable[[Policy | None], None]) -> None:
+        changed = [key for key in type(config).model_fields if getattr(config, key) != getattr(self._config, key)]
+        others = [key for key in changed if key != "policy"]
+        if others:
+            log.warning("%s: %s changed too, which needs a restart", self._source, ", ".join(others))
+        if "policy" not in changed:
+            log.info("%s: the policy is the same as before", self._source)
+            return
+        self._config = self._config.model_copy(update={"policy": config.policy})
+        policy = self._config.settings().policy
+        announce(policy)
+        apply(policy)
