@@ -7,7 +7,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, PlainValidator, WithJsonSchema
 
-_NODE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
+from protos.errors import DecodeError
+from protos.names import node_name
+
 _INTERFACE = re.compile(r"[^\s/]{1,15}")
 _INTERFACE_GLOB = re.compile(r"[^\s/]{1,64}")
 _SERVICE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -22,9 +24,11 @@ def is_glob(pattern: str) -> bool:
 
 
 def _check_node_name(text: str) -> str:
-    if not _NODE_NAME.fullmatch(text):
-        raise ValueError(f"expected 1 to 63 letters, digits, '-', '_' or '.', a letter or digit first, got {text!r}")
-    return text
+    try:
+        return node_name(text, "name")
+    except DecodeError:
+        problem = f"expected 1 to 63 letters, digits, '-', '_' or '.', a letter or digit first, got {text!r}"
+        raise ValueError(problem) from None
 
 
 def _check_interface(text: str) -> str:
