@@ -3,21 +3,13 @@
 A driver calls `register`, `receive` and `disconnected` as streams come, speak and go, `handle_timer` when
 `next_timer` says so, and `start_solving` / `solved` around the solver, which may run elsewhere meanwhile; after each
 call it drains `next_event`. Times are monotonic seconds.
-
-Warm-up. After a restart the registry is empty, while the robots go on with the peers they hold. A robot that says it
-holds a version is therefore sent nothing until every server that its own reports name is here again, or the warm-up
-is over: a set without a server that merely has not yet come back would cost the robot that server. Robots that hold
-nothing, and clouds (they find their robots by the robots' own probes), are served at once. Nor are sets judged by the
-policy before the warm-up is over (PeerSet.policy): a peer that is merely not back yet would be taken for one that the
-policy leaves nothing to do.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import deque
 from typing import TYPE_CHECKING, assert_never
 
-from controlplane.core import reconcile
 from controlplane.core.control_events import (
     Close,
     CloseReason,
@@ -35,13 +27,11 @@ from controlplane.core.permits import Permits
 from controlplane.core.picture import Picture, draw
 from controlplane.core.plan import Plan
 from controlplane.core.problem import Problem
+from controlplane.core.publisher import Publisher
 from controlplane.core.refused_offers import RefusedOffers
-from controlplane.core.registry import MAX_SIDECARS, Admission, Refusal, Registry, StreamId
-from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
-from controlplane.core.views import Views
+from controlplane.core.registry import Admission, Refusal, Registry, StreamId
 from protos.errors import DecodeError
 from protos.model import (
-    POLICY_PENDING,
     Ack,
     CandidateSet,
     Drain,
@@ -68,16 +58,12 @@ PUBLISH_DELAY_S = 0.02
 """From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two
 messages, and these should make one version."""
 
-MAX_GONE_SNAPSHOTS = MAX_SIDECARS
-"""Sidecars that are gone and whose last set is remembered, for the notices when they return; the oldest go."""
-
 
 class ControlCore:
     """Registry, estimator, plan and snapshots, put together."""
 
     def __init__(self, settings: Settings, *, version_epoch: int, now: float) -> None:
         self._settings = settings
-        self._warm_until = now + settings.warm_up_s
         self.registry = Registry(lease_s=settings.lease_s)
         self.estimator = Estimator(half_life_s=settings.half_life_s)
         self.permits = Permits(settings.policy)
@@ -85,13 +71,10 @@ class ControlCore:
         self.plan = Plan({})
         self._picture = Picture(Problem(()))
         self._debounce = Debounce()
-        self._versions = VersionSource(version_epoch)
-        self._snapshots: dict[NodeName, Snapshots] = {}
-        self._gone_snapshots: OrderedDict[NodeName, Snapshots] = OrderedDict()
-        self._held_back: dict[NodeName, frozenset[NodeName] | None] = {}
+        warm_until = now + settings.warm_up_s if settings.warm_up_s else None
+        self._publisher = Publisher(self.registry, version_epoch=version_epoch, warm_until=warm_until)
         self._streams: dict[StreamId, NodeName] = {}
         self._last_stream = 0
-        self._warm = settings.warm_up_s > 0
         self._refused_offers = RefusedOffers()
         self._publish_at: float | None = None
         self._events: deque[Event] = deque()
@@ -112,13 +95,7 @@ class ControlCore:
         self._streams[stream] = name
         if result.new_run:
             self.estimator.forget_paths(name)
-        snapshots = self._snapshots.get(name) or self._gone_snapshots.pop(name, None) or Snapshots()
-        self._snapshots[name] = snapshots
-        snapshots.peers.begin_stream(registration.peers_version)
-        snapshots.mapping.begin_stream(registration.mapping_version)
-        holds = max(registration.peers_version, registration.mapping_version)
-        if registration.role is Role.ROBOT and holds and now < self._warm_until and not snapshots.known_names:
-            self._held_back[name] = None
+        self._publisher.begin_stream(registration)
         self._events.append(
             Send(
                 stream,
@@ -166,22 +143,17 @@ class ControlCore:
         self.counters.reports += 1
         changed = self.estimator.merge(name, report, now)
         self._debounce.note(Change.PATH if changed else Change.REPORT, now)
-        if name in self._held_back:
-            self._held_back[name] = frozenset(path.server for path in report.paths)
+        if self._publisher.waits_for(name, (path.server for path in report.paths)):
             self._publish_soon(now)
 
     def _receive_ack(self, name: NodeName, ack: Ack) -> None:
-        snapshots = self._snapshots[name]
-        fresh = snapshots.peers_acked(ack) if ack.resource is ResourceKind.PEERS else snapshots.mapping.ack(ack)
-        if fresh:
+        if self._publisher.acked(name, ack):
             self.counters.acks[ack.resource] += 1
         else:
             self.counters.stale_answers += 1
 
     def _receive_nack(self, name: NodeName, nack: Nack) -> None:
-        snapshots = self._snapshots[name]
-        track = snapshots.peers if nack.resource is ResourceKind.PEERS else snapshots.mapping
-        if track.nack(nack):
+        if self._publisher.nacked(name, nack):
             self.counters.nacks[nack.resource] += 1
             self._events.append(NackNotice(name, nack))
         else:
@@ -244,8 +216,12 @@ class ControlCore:
 
     def next_timer(self) -> float | None:
         """When to call `handle_timer` and `start_solving` next."""
-        warm = self._warm_until if self._warm else None
-        times = (self.registry.next_expiry(), self._publish_at, self._debounce.next_time(), warm)
+        times = (
+            self.registry.next_expiry(),
+            self._publish_at,
+            self._debounce.next_time(),
+            self._publisher.warm_until,
+        )
         return min((time for time in times if time is not None), default=None)
 
     def handle_timer(self, now: float) -> None:
@@ -254,9 +230,8 @@ class ControlCore:
             self._end_stream(sidecar, CloseReason.LEASE_EXPIRED)
             self._forget(sidecar.name, RemovalReason.LEASE_EXPIRED)
             self._members_changed(now)
-        if self._warm and now >= self._warm_until:
-            self._warm = False
-            self._held_back.clear()
+        if self._publisher.warm_until is not None and self._publisher.warm_until <= now:
+            self._publisher.end_warm_up()
             self._publish_soon(now)
         if self._publish_at is not None and self._publish_at <= now:
             self._publish()
@@ -264,11 +239,8 @@ class ControlCore:
     def _forget(self, name: NodeName, reason: RemovalReason) -> None:
         self._events.append(DepartureNotice(name, reason))
         self.estimator.forget_paths(name)
-        self._held_back.pop(name, None)
         self._refused_offers.forget(name)
-        self._gone_snapshots[name] = self._snapshots.pop(name)
-        if len(self._gone_snapshots) > MAX_GONE_SNAPSHOTS:
-            self._gone_snapshots.popitem(last=False)
+        self._publisher.forget(name)
 
     def _members_changed(self, now: float) -> None:
         self._debounce.note(Change.MEMBERS, now)
@@ -310,51 +282,9 @@ class ControlCore:
         self._debounce.finished(now)
         self._debounce.note(Change.REPORT, now)
 
-    # ── publishing ──
-
     def _publish(self) -> None:
         self._publish_at = None
-        views = Views(self.registry, self.permits)
-        # Clouds first: what a robot learns that it may call is then refused nowhere.
-        for sidecar in sorted(self.registry, key=lambda sidecar: sidecar.role is Role.ROBOT):
-            if sidecar.stream is not None and not self._is_held_back(sidecar):
-                self._publish_to(sidecar, sidecar.stream, views)
-
-    def _is_held_back(self, sidecar: Sidecar) -> bool:
-        if self.permits.restricted and sidecar.role is Role.CLOUD and not sidecar.ready:
-            # What robots may call on it depends on what it offers.
-            return True
-        name = sidecar.name
-        if name not in self._held_back:
-            return False
-        servers = self._held_back[name]
-        if servers is None:
-            return True
-        known = (self.registry.get(server) for server in servers)
-        if all(sidecar is not None and sidecar.ready for sidecar in known):
-            del self._held_back[name]
-            return False
-        return True
-
-    def _publish_to(self, sidecar: Sidecar, stream: StreamId, views: Views) -> None:
-        snapshots = self._snapshots[sidecar.name]
-        judged = not (self._warm and self.permits.restricted)
-        view = PeerView(views.peers_of(sidecar), self.permits.fingerprint if judged else POLICY_PENDING)
-        if view != snapshots.peers.sent:
-            removed = views.removed(sidecar, snapshots.known_names)
-            self._events.append(Send(stream, snapshots.send_peers(view, removed, self._versions)))
-        if sidecar.role is not Role.ROBOT:
-            return
-        sent = snapshots.mapping.sent
-        servers = views.servers_of(sidecar.name)
-        mapping = reconcile.mapping_of(sidecar, servers, self.plan, self._picture, sent or ())
-        if sent is None:
-            # Nothing to say yet is no reason to take away what the sidecar holds from before.
-            worth_sending = bool(mapping)
-        else:
-            worth_sending = reconcile.differs(mapping, sent)
-        if worth_sending:
-            self._events.append(Send(stream, snapshots.send_mapping(mapping, self._versions)))
+        self._events.extend(self._publisher.publish(self.permits, self.plan, self._picture))
 
     def next_event(self) -> Event | None:
         """What the driver has to do next."""
@@ -366,7 +296,7 @@ class ControlCore:
         """Every registered sidecar, by name."""
         found: list[SidecarStatus] = []
         for sidecar in sorted(self.registry, key=lambda sidecar: sidecar.name):
-            snapshots = self._snapshots[sidecar.name]
+            snapshots = self._publisher[sidecar.name]
             found.append(
                 SidecarStatus(
                     peer=sidecar.as_peer(),
@@ -385,11 +315,7 @@ class ControlCore:
 
     def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
         """How far every registered sidecar follows; clouds get no mapping."""
-        for sidecar in self.registry:
-            snapshots = self._snapshots[sidecar.name]
-            yield sidecar.name, ResourceKind.PEERS, snapshots.peers.state
-            if sidecar.role is Role.ROBOT:
-                yield sidecar.name, ResourceKind.MAPPING, snapshots.mapping.state
+        return self._publisher.sync_states()
 
     def miss_ratios(self, now: float) -> dict[tuple[NodeName, ServiceName], tuple[float, float | None]]:
         """For every planned (robot, service) the predicted miss probability and the observed ratio."""

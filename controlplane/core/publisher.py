@@ -1,0 +1,147 @@
+"""Sends each sidecar its peers and its mapping when they change, and keeps what came of it.
+
+Warm-up. After a restart the registry is empty, while the robots go on with the peers they hold. A robot that says it
+holds a version is therefore sent nothing until every server that its own reports name is here again, or the warm-up
+is over: a set without a server that merely has not yet come back would cost the robot that server. Robots that hold
+nothing, and clouds (they find their robots by the robots' own probes), are served at once. Nor are sets judged by the
+policy before the warm-up is over (PeerSet.policy): a peer that is merely not back yet would be taken for one that the
+policy leaves nothing to do.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import TYPE_CHECKING
+
+from controlplane.core import reconcile
+from controlplane.core.control_events import Send
+from controlplane.core.registry import MAX_SIDECARS
+from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
+from controlplane.core.views import Views
+from protos.model import POLICY_PENDING, ResourceKind, Role
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from controlplane.core.permits import Permits
+    from controlplane.core.picture import Picture
+    from controlplane.core.plan import Plan
+    from controlplane.core.registry import Registry, Sidecar, StreamId
+    from protos.model import Ack, Nack, NodeName, Registration, SyncState
+
+MAX_GONE_SNAPSHOTS = MAX_SIDECARS
+"""Sidecars that are gone and whose last set is remembered, for the notices when they return; the oldest go."""
+
+
+class Publisher:
+    """The snapshots of all sidecars, those registered and the last ones gone."""
+
+    def __init__(self, registry: Registry, *, version_epoch: int, warm_until: float | None) -> None:
+        self._registry = registry
+        self._versions = VersionSource(version_epoch)
+        self._snapshots: dict[NodeName, Snapshots] = {}
+        self._gone: OrderedDict[NodeName, Snapshots] = OrderedDict()
+        self.warm_until = warm_until
+        """When the warm-up ends; None once it is over."""
+        self._held_back: dict[NodeName, frozenset[NodeName] | None] = {}
+        """Robots, and the servers that they wait for; None before their first report."""
+
+    def __getitem__(self, name: NodeName) -> Snapshots:
+        return self._snapshots[name]
+
+    def begin_stream(self, registration: Registration) -> None:
+        """A registered sidecar has a new stream."""
+        name = registration.name
+        snapshots = self._snapshots.get(name) or self._gone.pop(name, None) or Snapshots()
+        self._snapshots[name] = snapshots
+        snapshots.peers.begin_stream(registration.peers_version)
+        snapshots.mapping.begin_stream(registration.mapping_version)
+        holds = max(registration.peers_version, registration.mapping_version)
+        if registration.role is Role.ROBOT and holds and self.warm_until is not None and not snapshots.known_names:
+            self._held_back[name] = None
+
+    def forget(self, name: NodeName) -> None:
+        """A sidecar is not registered any more."""
+        self._held_back.pop(name, None)
+        self._gone[name] = self._snapshots.pop(name)
+        if len(self._gone) > MAX_GONE_SNAPSHOTS:
+            self._gone.popitem(last=False)
+
+    def waits_for(self, name: NodeName, servers: Iterable[NodeName]) -> bool:
+        """A robot reports on these servers; True if it is held back."""
+        if name not in self._held_back:
+            return False
+        self._held_back[name] = frozenset(servers)
+        return True
+
+    def end_warm_up(self) -> None:
+        """Whoever is not back now is gone."""
+        self.warm_until = None
+        self._held_back.clear()
+
+    def acked(self, name: NodeName, ack: Ack) -> bool:
+        """A sidecar applied what it was sent; False if that is stale."""
+        snapshots = self._snapshots[name]
+        return snapshots.peers_acked(ack) if ack.resource is ResourceKind.PEERS else snapshots.mapping.ack(ack)
+
+    def nacked(self, name: NodeName, nack: Nack) -> bool:
+        """A sidecar refused what it was sent; False if that is stale."""
+        snapshots = self._snapshots[name]
+        return (snapshots.peers if nack.resource is ResourceKind.PEERS else snapshots.mapping).nack(nack)
+
+    def publish(self, permits: Permits, plan: Plan, picture: Picture) -> Iterator[Send]:
+        """Everything that is news to somebody.
+
+        Clouds first: what a robot learns that it may call shall be refused nowhere.
+        """
+        views = Views(self._registry, permits)
+        for sidecar in sorted(self._registry, key=lambda sidecar: sidecar.role is Role.ROBOT):
+            if sidecar.stream is None or self._is_held_back(sidecar, permits):
+                continue
+            yield from self._peers(sidecar, sidecar.stream, views, permits)
+            if sidecar.role is Role.ROBOT:
+                yield from self._mapping(sidecar, sidecar.stream, views, plan, picture)
+
+    def _is_held_back(self, sidecar: Sidecar, permits: Permits) -> bool:
+        if permits.restricted and sidecar.role is Role.CLOUD and not sidecar.ready:
+            # What robots may call on it depends on what it offers.
+            return True
+        name = sidecar.name
+        if name not in self._held_back:
+            return False
+        servers = self._held_back[name]
+        if servers is None:
+            return True
+        known = (self._registry.get(server) for server in servers)
+        if all(other is not None and other.ready for other in known):
+            del self._held_back[name]
+            return False
+        return True
+
+    def _peers(self, sidecar: Sidecar, stream: StreamId, views: Views, permits: Permits) -> Iterator[Send]:
+        snapshots = self._snapshots[sidecar.name]
+        judged = self.warm_until is None or not permits.restricted
+        view = PeerView(views.peers_of(sidecar), permits.fingerprint if judged else POLICY_PENDING)
+        if view != snapshots.peers.sent:
+            removed = views.removed(sidecar, snapshots.known_names)
+            yield Send(stream, snapshots.send_peers(view, removed, self._versions))
+
+    def _mapping(self, robot: Sidecar, stream: StreamId, views: Views, plan: Plan, picture: Picture) -> Iterator[Send]:
+        snapshots = self._snapshots[robot.name]
+        sent = snapshots.mapping.sent
+        mapping = reconcile.mapping_of(robot, views.servers_of(robot.name), plan, picture, sent or ())
+        if sent is None:
+            # Nothing to say yet is no reason to take away what the sidecar holds from before.
+            worth_sending = bool(mapping)
+        else:
+            worth_sending = reconcile.differs(mapping, sent)
+        if worth_sending:
+            yield Send(stream, snapshots.send_mapping(mapping, self._versions))
+
+    def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
+        """How far every registered sidecar follows; clouds get no mapping."""
+        for sidecar in self._registry:
+            snapshots = self._snapshots[sidecar.name]
+            yield sidecar.name, ResourceKind.PEERS, snapshots.peers.state
+            if sidecar.role is Role.ROBOT:
+                yield sidecar.name, ResourceKind.MAPPING, snapshots.mapping.state
