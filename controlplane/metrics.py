@@ -16,6 +16,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from controlplane import handshakes, limits, tls_gate
 from protos import identity
+from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind, Role, SyncState
 
 if TYPE_CHECKING:
@@ -111,8 +112,7 @@ class Metrics:
 
     def start(self, host: str, port: int) -> tuple[str, int]:
         """Serve them over HTTP; returns where. Raises OSError if the address cannot be had."""
-        server, _ = prometheus_client.start_http_server(port, host, self.registry)
-        return host, server.server_port
+        return host, MetricsServer(host, port, self.registry).port
 
     def update(self, core: ControlCore, stun_servers: Sequence[StunServer], superseded: int, now: float) -> None:
         """Take the values of this moment."""

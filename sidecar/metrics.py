@@ -8,11 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
+from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.core import HistogramMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
 from protos.config_fields import split_host_port
+from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind
 from sidecar.metric_families import by_one, counter, cumulative, gauge
 from sidecar.state_store import FAILURES
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.ros.stats import BridgeStats
 
-_STOP_TIMEOUT_S = 1.0
 _OUTCOMES = ("ok", "deadline_missed", "failed", "rejected")
 
 
@@ -73,26 +73,13 @@ class SidecarCollector(Collector):
         )
 
 
-class MetricsServer:
-    """Serves /metrics on `listen` (address:port) from a thread of its own; raises OSError when it cannot listen."""
-
-    def __init__(self, listen: str, sources: MetricSources) -> None:
-        registry = CollectorRegistry()
-        registry.register(SidecarCollector(sources))
-        ProcessCollector(registry=registry)
-        host, port = split_host_port(listen)
-        self._server, self._thread = start_http_server(port, addr=host, registry=registry)
-
-    @property
-    def port(self) -> int:
-        """The port listened on, also where the configuration leaves it open."""
-        return self._server.server_port
-
-    def close(self) -> None:
-        """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join(_STOP_TIMEOUT_S)
+def serve_metrics(listen: str, sources: MetricSources) -> MetricsServer:
+    """Serve /metrics on `listen` (address:port); raises OSError when that cannot be had."""
+    registry = CollectorRegistry()
+    registry.register(SidecarCollector(sources))
+    ProcessCollector(registry=registry)
+    host, port = split_host_port(listen)
+    return MetricsServer(host, port, registry)
 
 
 def _requests(stats: EngineStats) -> Iterator[Metric]:

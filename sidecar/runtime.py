@@ -17,7 +17,7 @@ from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, SessionId
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.core.engine import EngineConfig
-from sidecar.metrics import MetricSources, MetricsServer
+from sidecar.metrics import MetricSources, serve_metrics
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import Identity, InterfaceManager
 from sidecar.ros.bridge import RosBridge
@@ -26,6 +26,7 @@ from sidecar.state_store import StateDirError, StateStore
 if TYPE_CHECKING:
     import threading
 
+    from protos.metrics_server import MetricsServer
     from protos.model import Assignment, InterfaceName, MappingSet, PeerSet, Report, ServiceName, Welcome
     from sidecar.config import SidecarConfig
     from sidecar.core.stun_events import StunEvent
@@ -135,7 +136,7 @@ class Sidecar:
             state_failures=lambda: self._store.failures,
         )
         try:
-            self._metrics = MetricsServer(listen, sources)
+            self._metrics = serve_metrics(listen, sources)
         except OSError as error:
             problem = f"expected an address and port to listen on, got '{listen}': {error.strerror or error}"
             raise ConfigError("the configuration", "metrics_listen", problem) from error

@@ -4,6 +4,7 @@ import subprocess
 import threading
 import urllib.request
 from collections import Counter
+from typing import TYPE_CHECKING
 
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
@@ -14,8 +15,11 @@ from protos.model import InterfaceName, NodeName, ResourceKind, ServiceName
 from sidecar.core.control_session import ControlStats
 from sidecar.core.stats import EngineStats, LinkStats, PathStats
 from sidecar.metric_families import DURATION_BOUNDS_S, cumulative
-from sidecar.metrics import MetricSources, MetricsServer, SidecarCollector
+from sidecar.metrics import MetricSources, SidecarCollector, serve_metrics
 from sidecar.ros.stats import BridgeStats
+
+if TYPE_CHECKING:
+    from protos.metrics_server import MetricsServer
 
 PLAN = ServiceName("/plan")
 WLAN = InterfaceName("wlan0")
@@ -198,7 +202,7 @@ def scrape(server: MetricsServer, host: str = "127.0.0.1") -> str:
 
 def test_serves_what_promtool_accepts_and_stops_cleanly() -> None:
     before = threading.active_count()
-    server = MetricsServer("127.0.0.1:0", busy().sources())
+    server = serve_metrics("127.0.0.1:0", busy().sources())
     try:
         text = scrape(server)
     finally:
@@ -213,16 +217,16 @@ def test_serves_what_promtool_accepts_and_stops_cleanly() -> None:
 
 
 def test_an_address_in_use_is_an_error() -> None:
-    server = MetricsServer("127.0.0.1:0", busy().sources())
+    server = serve_metrics("127.0.0.1:0", busy().sources())
     try:
         with pytest.raises(OSError, match="in use"):
-            MetricsServer(f"127.0.0.1:{server.port}", busy().sources())
+            serve_metrics(f"127.0.0.1:{server.port}", busy().sources())
     finally:
         server.close()
 
 
 def test_listens_on_ipv6() -> None:
-    server = MetricsServer("[::1]:0", busy().sources())
+    server = serve_metrics("[::1]:0", busy().sources())
     try:
         assert "plr_requests_total" in scrape(server, "[::1]")
     finally:

@@ -1,0 +1,80 @@
+"""The metrics page is there for those who ask for it, whoever else holds connections open."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import urllib.request
+from typing import TYPE_CHECKING
+
+import pytest
+from prometheus_client import CollectorRegistry, Gauge
+
+from protos import metrics_server
+from protos.metrics_server import MAX_CONNECTIONS, MetricsServer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[MetricsServer]:
+    monkeypatch.setattr(metrics_server._Handler, "timeout", 0.5)
+    registry = CollectorRegistry()
+    Gauge("plr_answer", "What is asked for.", registry=registry).set(42)
+    one = MetricsServer("127.0.0.1", 0, registry)
+    yield one
+    one.close()
+
+
+def scrape(server: MetricsServer) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=10.0) as answer:
+        text: str = answer.read().decode()
+    return text
+
+
+def handlers() -> int:
+    return sum("process_request_thread" in thread.name for thread in threading.enumerate())
+
+
+def test_it_serves(server: MetricsServer) -> None:
+    assert "plr_answer 42.0" in scrape(server)
+
+
+def test_connections_that_say_nothing_are_few_and_end(server: MetricsServer) -> None:
+    before = handlers()
+    with contextlib.ExitStack() as stack:
+        idle = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10.0))
+            for _ in range(4 * MAX_CONNECTIONS)
+        ]
+        idle[0].sendall(b"GET /metrics HT")
+        # The last ones find no room, the first ones run out of time: all are closed by the other side.
+        with contextlib.suppress(ConnectionError):
+            assert idle[-1].recv(1) == b""
+        assert handlers() - before <= MAX_CONNECTIONS
+        for one in idle:
+            with contextlib.suppress(ConnectionError):
+                assert one.recv(1) == b""
+    assert "plr_answer 42.0" in scrape(server)
+
+
+def test_a_port_in_use_is_an_error(server: MetricsServer) -> None:
+    with pytest.raises(OSError, match="in use"):
+        MetricsServer("127.0.0.1", server.port, CollectorRegistry())
+
+
+def test_nonsense_breaks_nothing(server: MetricsServer) -> None:
+    for words in (
+        b"\0" * 100,
+        b"GET " + b"x" * 70_000 + b"\r\n\r\n",
+        b"POST /metrics HTTP/1.1\r\n\r\n",
+        b"GET\r\n\r\n",
+    ):
+        with contextlib.suppress(ConnectionError), socket.create_connection(("127.0.0.1", server.port), 10.0) as one:
+            one.sendall(words)
+            one.shutdown(socket.SHUT_WR)
+            while one.recv(1 << 16):
+                pass
+    assert "plr_answer 42.0" in scrape(server)
