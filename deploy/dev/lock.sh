@@ -17,6 +17,8 @@ compile() {
 compile --all-extras pyproject.toml --output-file requirements/dev.txt "$@"
 # The runtime alone, for a deployment whose rclpy comes from the system; the same versions as above.
 compile --constraint requirements/dev.txt pyproject.toml --output-file requirements/runtime.txt "$@"
+# The same with a ROS of its own.
+compile --constraint requirements/dev.txt --extra ros pyproject.toml --output-file requirements/runtime-ros.txt "$@"
 # What installs the above: the installer, for pip to fetch, and what builds the packages that have no wheel.
 {
   grep '^uv==' requirements/constraints.txt

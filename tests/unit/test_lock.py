@@ -13,7 +13,7 @@ from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-LOCKS = ("dev.txt", "runtime.txt", "bootstrap.txt")
+LOCKS = ("dev.txt", "runtime.txt", "runtime-ros.txt", "bootstrap.txt")
 PIN = re.compile(r"^([A-Za-z0-9._-]+)(?:\[[^]]*\])?==(\S+)(?: ; (.*?))? \\$", re.MULTILINE)
 
 Pins = dict[str, set[Version]]
@@ -49,6 +49,13 @@ def test_the_runtime_is_locked_at_the_same_versions() -> None:
     assert not unmet(PROJECT["dependencies"], runtime), "run: make lock"
     assert all(everything[package] == versions for package, versions in runtime.items())
     assert not any(package.startswith("ros-") for package in runtime)
+
+
+def test_the_runtime_with_ros_is_locked_at_the_same_versions() -> None:
+    asked = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["ros"]]
+    runtime, everything = pins("runtime-ros.txt"), pins("dev.txt")
+    assert not unmet(asked, runtime), "run: make lock"
+    assert all(everything[package] == versions for package, versions in runtime.items())
 
 
 def test_what_is_not_locked_is_noticed() -> None:
