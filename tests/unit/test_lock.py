@@ -76,3 +76,14 @@ def test_every_line_is_pinned_and_hashed(name: str) -> None:
 def test_no_registry_is_named(name: str) -> None:
     text = (ROOT / "requirements" / name).read_text()
     assert not re.search(r"https?:|file:|--(extra-)?index-url|--find-links|--index", text)
+
+
+@pytest.mark.parametrize("page", ["deploy/README.md", "deploy/dev/setup.sh"])
+def test_nothing_is_installed_but_by_its_hash(page: str) -> None:
+    lines = (ROOT / page).read_text().splitlines()
+    locked = [line for line in lines if "-r requirements/" in line]
+    own = [line for line in lines if re.search(r"install\b.* \.$", line) or line.endswith("--editable .")]
+    assert len(locked) >= 2
+    assert len(own) == 1
+    assert all("--require-hashes" in line for line in locked)
+    assert all("--no-deps" in line for line in own)
