@@ -15,6 +15,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from bench.null_cipher import null_cipher
 from protos.model import (
     ALL_CALLS,
     Candidate,
@@ -27,7 +28,6 @@ from protos.model import (
     Role,
     ServiceName,
     ServiceOffer,
-    SessionId,
     Version,
 )
 from sidecar.core.datagrams import LinkIdentity
@@ -37,6 +37,7 @@ from sidecar.core.frame import BASE_SYMBOL_BYTES, symbol_count
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
+from sidecar.start_session import start_session
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -53,12 +54,14 @@ class Side:
     """One sidecar with one interface."""
 
     def __init__(self, name: str, role: Role, session: int, now: float) -> None:
-        self.name, self.role, self.session = NodeName(name), role, SessionId(session)
+        self.name, self.role = NodeName(name), role
         self.token = session.to_bytes(16, "big")
         self.address = (name, 1)
-        self.engine = Engine(EngineConfig(role, (ServiceRule("/*", 10.0, 60.0, idempotent=True),)), now)
+        self.own = start_session(self.name, role, 1, None)
+        self.session = self.own.credential.session
+        self.engine = Engine(EngineConfig(role, (ServiceRule("/*", 10.0, 60.0, idempotent=True),)), self.own, now)
         interface = InterfaceName("eth0")
-        identity = LinkIdentity(interface, InterfaceId(0), self.session, self.token, 1)
+        identity = LinkIdentity.of(self.own.credential, self.token, interface, InterfaceId(0))
         self.link = Link(identity, random.Random(session), now)
         self.link.execute(SetReady(ready=True), now)
         self.engine.set_interfaces([interface], now)
@@ -69,7 +72,17 @@ class Side:
 
     def as_peer(self) -> Peer:
         candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, self.address)
-        return Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers, may_call=ALL_CALLS)
+        return Peer(
+            self.name,
+            self.role,
+            self.session,
+            self.token,
+            1,
+            (candidate,),
+            self.offers,
+            may_call=ALL_CALLS,
+            credential=self.own.credential.encode(),
+        )
 
     def turn(self, now: float) -> list[Batch]:
         """Let engine and link talk until both are done; returns what leaves."""
@@ -180,8 +193,8 @@ TRAFFIC = (
 )
 
 
-def measure(traffic: Traffic, batch: int) -> str:
-    """Run one kind of traffic and describe its cost."""
+def measure(traffic: Traffic, batch: int) -> tuple[str, float]:
+    """Run one kind of traffic and describe its cost; returns also the Mbit of payload that a CPU second carries."""
     pair = Pair(batch)
     payload = random.Random(1).randbytes(traffic.size)
     pair.call(payload, traffic.at_once)  # warm: windows grow, caches fill
@@ -193,10 +206,11 @@ def measure(traffic: Traffic, batch: int) -> str:
     requests = traffic.rounds * traffic.at_once
     datagrams = (pair.robot.datagrams + pair.cloud.datagrams - before) / requests
     fragments = requests * (symbol_count(traffic.size, BASE_SYMBOL_BYTES) + 1)
-    return (
+    line = (
         f"{traffic.name:24s} {cpu_s / requests * 1e6:12.0f} {datagrams:12.1f} "
         f"{fragments / cpu_s:14.0f} {requests * traffic.size / cpu_s / 1e6:10.1f}"
     )
+    return line, requests * traffic.size / cpu_s * 8 / 1e6
 
 
 def main() -> None:
@@ -209,15 +223,21 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     chosen = [traffic for traffic in TRAFFIC if arguments.only in traffic.name]
-    print(f"{'both cores together':24s} {'us/request':>12s} {'datagrams':>12s} {'fragments/s':>14s} {'MB/s':>10s}")
+    print(
+        f"{'both cores together':24s} {'us/request':>12s} {'datagrams':>12s} {'fragments/s':>14s} {'MB/s':>10s}"
+        f" {'goodput_null_cipher_mbit_s':>26s} {'sealed_over_null_goodput':>24s}"
+    )
     for traffic in chosen:
         if arguments.profile:
             with cProfile.Profile() as profile:
-                line = measure(traffic, arguments.batch)
+                line, _ = measure(traffic, arguments.batch)
             print(line)
             pstats.Stats(profile).sort_stats("tottime").print_stats(25)
         else:
-            print(measure(traffic, arguments.batch))
+            line, sealed = measure(traffic, arguments.batch)
+            with null_cipher():
+                _, clear = measure(traffic, arguments.batch)
+            print(f"{line} {clear:26.0f} {sealed / clear:24.2f}")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NewType
 if TYPE_CHECKING:
     from protos.histogram import Histogram
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 """Version of the control stream and of the datagram layout; peers of another version are refused."""
 
 NodeName = NewType("NodeName", str)

@@ -142,6 +142,8 @@ class SidecarConfig(_Section):
     """How the sidecar learns its addresses as seen from outside."""
     state_dir: Annotated[Path, _converted] = Path("/var/lib/plr")
     """Absolute path of the folder for the identity and the last good mapping."""
+    rekey_after_s: Annotated[int, Field(ge=1, le=86_400)] = 3600
+    """Seconds after which the keys that seal datagrams are changed; their volume changes them as well."""
     metrics_listen: ListenAddress | None = "127.0.0.1:9464"
     """address:port of the Prometheus metrics; null for none."""
     log_level: Annotated[LogLevel, _converted] = LogLevel.INFO

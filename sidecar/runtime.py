@@ -13,14 +13,15 @@ import sdnotify
 
 from protos.config_fields import split_host_port
 from protos.errors import ConfigError
-from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, SessionId, Version
+from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, Version
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.core.engine import EngineConfig
 from sidecar.metrics import MetricSources, serve_metrics
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
-from sidecar.net.interface_manager import Identity, InterfaceManager
+from sidecar.net.interface_manager import InterfaceManager
 from sidecar.ros.bridge import RosBridge
+from sidecar.start_session import start_session
 from sidecar.state_store import StateDirError, StateStore
 
 if TYPE_CHECKING:
@@ -48,34 +49,36 @@ class Sidecar:
     def __init__(self, config: SidecarConfig, version: str) -> None:
         self._config = config
         self._store = _open_store(config)
-        session = SessionId(random.SystemRandom().getrandbits(64) or 1)
+        identity = self._store.identity
+        own = start_session(config.node_name, config.role, identity.incarnation, None)
         rules = config.service_rules()
         self._bridge = RosBridge(name=config.node_name, role=config.role, rules=rules)
         self._data_plane = ThreadedDataPlane(
             EngineConfig(config.role, rules),
-            session,
+            own,
             DataPlaneHooks(self._bridge, self._on_stun, self._on_services_changed),
         )
         last = self._store.last_good
-        identity = self._store.identity
         self._control_session = ControlSession(
             Registration(
                 protocol_version=PROTOCOL_VERSION,
                 name=config.node_name,
                 role=config.role,
-                session=session,
+                session=own.credential.session,
                 token=identity.token,
                 incarnation=identity.incarnation,
                 software_version=version,
                 peers_version=last.peers.version if last.peers else Version(0),
                 mapping_version=last.mapping.version if last.mapping else Version(0),
+                credential=own.credential.encode(),
             ),
             random.SystemRandom(),
         )
         self._control = ControlClient(config.control_plane, self._control_session, self)
         self._interfaces = InterfaceManager(
             config,
-            Identity(session, identity.token, identity.incarnation),
+            own,
+            identity.token,
             self._data_plane,
             self._control.set_candidates,
         )

@@ -35,8 +35,12 @@ class Ours:
         service: Service = SERVICE,
         answer_bytes: int = HEADER.size,
         name: str = "ours",
+        null_cipher: bool = False,
     ) -> None:
-        """Start them; hosts are the lab's, None is this machine. Without `mapping` the engine picks the paths."""
+        """Start them; hosts are the lab's, None is this machine. Without `mapping` the engine picks the paths.
+
+        `null_cipher`: nothing is sealed.
+        """
         self._stack = contextlib.ExitStack()
         start = self._stack.enter_context
         try:
@@ -45,16 +49,17 @@ class Ours:
                 for cloud, host in clouds.items()
             }
             self.robot = start(Remote.start("engine", folder, host=robot, name=f"{name}.robot"))
+            seal = {"null_cipher": null_cipher}
             common = {"stun": {"enabled": False}, "udp_port": 0, "log_level": "warning"}
             self._peers: list[Any] = []
             for cloud, program in self.clouds.items():
                 config = {"name": cloud, "role": "cloud", "interfaces": [cloud_interface], **common}
                 services = [{key: service[key] for key in ("name", "fec") if key in service}]
                 self._peers.append(
-                    program.ask("start", config={**config, "services": services}, answer_bytes=answer_bytes)
+                    program.ask("start", config={**config, "services": services}, answer_bytes=answer_bytes, **seal)
                 )
             config = {"name": "robot", "role": "robot", "interfaces": list(interfaces), **common}
-            me = self.robot.ask("start", config={**config, "services": [service]})
+            me = self.robot.ask("start", config={**config, "services": [service]}, **seal)
             for program in self.clouds.values():
                 program.ask("meet", peers=[me])
             self.map_to(mapping)

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core import frame
-from sidecar.core.frame import BASE_FRAMES_BYTES, FRAGMENT_DATAGRAM_BYTES, FRAGMENT_TYPE, REPAIR_TYPE, Header
+from sidecar.core.aead import TAG_BYTES
+from sidecar.core.frame import (
+    BASE_FRAMES_BYTES,
+    CLEAR,
+    FRAGMENT_DATAGRAM_BYTES,
+    FRAGMENT_OVERHEAD_BYTES,
+    FRAGMENT_TYPE,
+    HEADER_BYTES,
+    NONCE_OFFSET,
+    REPAIR_TYPE,
+    Header,
+)
+from sidecar.core.introduction import encode_introduction
 from sidecar.core.path_id import PathState
 from sidecar.core.paths import NEVER
 
 if TYPE_CHECKING:
     import random
 
-    from protos.model import Address, InterfaceId, InterfaceName, SessionId
+    from protos.credential import SessionCredential
+    from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.paths import Path
     from sidecar.core.send_queue import Run
@@ -40,9 +53,18 @@ class LinkIdentity:
 
     interface: InterfaceName
     interface_id: InterfaceId
+    name: NodeName
     session: SessionId
-    token: bytes
-    incarnation: int
+    token: bytes = field(repr=False)
+    credential: bytes = field(repr=False)
+    """Encoded."""
+
+    @classmethod
+    def of(
+        cls, credential: SessionCredential, token: bytes, interface: InterfaceName, interface_id: InterfaceId
+    ) -> LinkIdentity:
+        """Return who the owner of a credential is on this interface."""
+        return cls(interface, interface_id, credential.name, credential.session, token, credential.encode())
 
 
 class Batch(NamedTuple):
@@ -99,15 +121,17 @@ class Burst:
 class DatagramBuilder:
     """Turns the state of a link's paths into datagrams, and notes in it what left."""
 
-    __slots__ = ("_identity", "_rng", "_stats")
+    __slots__ = ("_rng", "_stats", "identity")
 
     def __init__(self, identity: LinkIdentity, stats: LinkStats, rng: random.Random) -> None:
-        self._identity = identity
+        self.identity = identity
         self._stats = stats
         self._rng = rng
 
     def build(self, path: Path, burst: Burst, now: float, *, probing: bool) -> bool:
         """Add what the path may send now; False when the burst got full first. `probing` allows probes."""
+        if path.introductions:
+            self._answer_introductions(path, burst, now)
         if probing and path.probe_at is not None and path.probe_at <= now:
             self._add_probe(path, burst, now)
         if probing and path.mtu.timer is not None and path.mtu.timer <= now:
@@ -158,24 +182,29 @@ class DatagramBuilder:
     def _add_symbols(
         self, path: Path, remote: Address, message: OutboundMessage, indices: range, burst: Burst, now: float
     ) -> int:
-        """Build a datagram for each symbol, all but the last equally long, straight into one buffer."""
+        """Build a datagram for each symbol, all but the last equally long, and seal each where it lies."""
         count = len(indices)
         symbol, message_number, total = message.symbol, message.number, message.total
-        segment = FRAGMENT_DATAGRAM_BYTES + symbol
+        segment = FRAGMENT_OVERHEAD_BYTES + symbol
         first_number = path.recovery.take_numbers(count)
-        head = frame.clear_head(self._identity.interface_id, path.remote_id)
-        session = self._identity.session
+        sealing = path.sealing
+        sealing.use(count, now)
+        head, seal_into = sealing.head, sealing.encrypt_into
+        session = self.identity.session
         kind, counted = (FRAGMENT_TYPE, "data") if indices.start < message.count else (REPAIR_TYPE, "repair")
         self._stats.datagrams["sent", counted] += count
         pack, symbol_data = frame.FRAGMENT_DATAGRAM.pack_into, message.symbol_data
         buffer = bytearray(segment * count)
         end = 0
-        for number, index in enumerate(indices, first_number):
-            pack(buffer, end, head, session, number, kind, message_number, total, symbol, index)
-            data = symbol_data(index)
-            start = end + FRAGMENT_DATAGRAM_BYTES
-            end = start + len(data)
-            buffer[start:end] = data
+        with memoryview(buffer) as view:
+            for number, index in enumerate(indices, first_number):
+                pack(buffer, end, head, session, number, kind, message_number, total, symbol, index)
+                data = symbol_data(index)
+                start, body = end, end + HEADER_BYTES
+                plain_end = start + FRAGMENT_DATAGRAM_BYTES + len(data)
+                end = plain_end + TAG_BYTES
+                view[start + FRAGMENT_DATAGRAM_BYTES : plain_end] = data
+                seal_into(view[start + NONCE_OFFSET : body], view[body:plain_end], view[start:body], view[body:end])
         del buffer[end:]
         last = end - segment * (count - 1)
         path.recovery.on_run_sent(first_number, count, now, segment, last, message, indices.start)
@@ -190,7 +219,7 @@ class DatagramBuilder:
         message, index = run.message, run.first
         number = path.recovery.take_numbers()
         head = frame.encode_fragment_head(message.number, message.total, message.symbol, index)
-        datagram = b"".join((self._header(path, number), *control, head, message.symbol_data(index)))
+        datagram = self._sealed(path, number, now, *control, head, message.symbol_data(index))
         size = len(datagram)
         path.recovery.on_run_sent(number, 1, now, size, size, message, index, _finished(control))
         self._stats.datagrams["sent", "data" if index < message.count else "repair"] += 1
@@ -209,7 +238,7 @@ class DatagramBuilder:
             taken = _fill(control)
             finished = _finished(taken)
             number = path.recovery.take_numbers()
-            datagram = b"".join((self._header(path, number), *taken))
+            datagram = self._sealed(path, number, now, *taken)
             if finished and len(path.recovery.sent) < MAX_RUNS_IN_FLIGHT:
                 path.recovery.on_finished_sent(number, now, len(datagram), finished)
                 path.waits_for_answer(now)
@@ -218,12 +247,26 @@ class DatagramBuilder:
             self._add_alone(path, path.remote, datagram, burst)
 
     def _add_probe(self, path: Path, burst: Burst, now: float) -> None:
-        probe = frame.encode_probe(frame.Probe(path.next_probe(now, self._rng)))
-        if path.state is PathState.DOWN:
-            me = self._identity
-            probe = frame.encode_hello(frame.Hello(me.token, me.incarnation)) + probe
+        probe_id = path.next_probe(now, self._rng)
+        probe = frame.encode_probe(frame.Probe(probe_id))
+        me = self.identity
         for address in path.destinations():
-            self._add_alone(path, address, self._header(path, path.recovery.take_numbers()) + probe, burst)
+            number = path.recovery.take_numbers()
+            if path.state is PathState.DOWN:
+                header = Header(me.interface_id, path.remote_id, me.session, number)
+                datagram: bytes = encode_introduction(header, me.token, path.peer, probe_id, me.credential)
+            else:
+                datagram = self._sealed(path, number, now, probe)
+            self._add_alone(path, address, datagram, burst)
+
+    def _answer_introductions(self, path: Path, burst: Burst, now: float) -> None:
+        """Answer to where each came from, and ask back: the reply to that proves who it was, and moves the path."""
+        introductions, path.introductions = path.introductions, []
+        for address, probe_id in introductions:
+            reply = frame.encode_probe_reply(frame.ProbeReply(probe_id))
+            probe = frame.encode_probe(frame.Probe(path.counter_probe(now)))
+            datagram = self._sealed(path, path.recovery.take_numbers(), now, reply, probe)
+            self._add_alone(path, address, datagram, burst)
 
     def _add_mtu_probe(self, path: Path, burst: Burst, now: float) -> None:
         """Add a padded probe. Nobody waits for its acknowledgement, and its loss says nothing of the rest."""
@@ -231,17 +274,25 @@ class DatagramBuilder:
         size = path.mtu.next_probe(probe_id, now, MTU_PROBE_TIMEOUTS * path.recovery.rtt.probe_timeout(0.0))
         if size is None or path.remote is None:
             return
-        head = self._header(path, path.recovery.take_numbers()) + frame.encode_probe(frame.Probe(probe_id))
-        self._add_alone(path, path.remote, head + frame.encode_padding(size - len(head)), burst)
+        probe = frame.encode_probe(frame.Probe(probe_id))
+        padding = frame.encode_padding(size - HEADER_BYTES - len(probe) - TAG_BYTES)
+        datagram = self._sealed(path, path.recovery.take_numbers(), now, probe, padding)
+        self._add_alone(path, path.remote, datagram, burst)
 
     def _add_alone(self, path: Path, address: Address, datagram: bytes, burst: Burst) -> None:
         burst.add(address, datagram, len(datagram))
         self._stats.datagrams["sent", "control"] += 1
         self._sent(path, len(datagram))
 
-    def _header(self, path: Path, number: int) -> bytes:
-        me = self._identity
-        return frame.encode_header(Header(me.interface_id, path.remote_id, me.session, number))
+    def _sealed(self, path: Path, number: int, now: float, *frames: bytes | memoryview) -> bytes:
+        """Return a datagram of these encoded frames."""
+        sealing = path.sealing
+        sealing.use(1, now)
+        clear = CLEAR.pack(sealing.head, self.identity.session, number)
+        plain = b"".join(frames)
+        sealed = bytearray(len(plain) + TAG_BYTES)
+        sealing.encrypt_into(clear[NONCE_OFFSET:], plain, clear, sealed)
+        return clear + sealed
 
 
 def _fill(control: list[bytes]) -> list[bytes]:

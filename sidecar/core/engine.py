@@ -36,6 +36,7 @@ from sidecar.core.link_events import (
     PeerClosed,
     PeerRestarted,
     Seek,
+    SetCredential,
     SetPeers,
 )
 from sidecar.core.mapping import MappingTable
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceOffer, SessionId
+    from sidecar.core.session import OwnSession
 
 SWEEP_EVERY_S = 1.0
 """How often old messages and half messages are looked for."""
@@ -76,7 +78,7 @@ class EngineConfig:
 class Engine:
     """One sidecar without its sockets, its clock and ROS."""
 
-    def __init__(self, config: EngineConfig, now: float) -> None:
+    def __init__(self, config: EngineConfig, own: OwnSession, now: float) -> None:
         self._config = config
         self.stats = EngineStats()
         self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
@@ -85,7 +87,7 @@ class Engine:
         self._carried: frozenset[ServiceName] = frozenset()
         self._sweep_at = now + SWEEP_EVERY_S
         self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
-        self.peers = Peers()
+        self.peers = Peers(own, self.stats.dropped)
         self.routes = Routes()
         self.mapping = MappingTable(self.routes)
         self._offers = Offers(config.rules)
@@ -217,6 +219,19 @@ class Engine:
         self._update_offers(now)
         return None
 
+    def recheck_peers(self, now: float) -> None:
+        """Whom to trust has changed: the sessions of peers that are not to be trusted any more end at once."""
+        gone = self.peers.recheck()
+        self._offers.set_peers(self.peers.all())
+        for name in gone:
+            self._end_session(name, now)
+        self._commands.append((None, SetPeers(self.peers.for_links())))
+        self._update_offers(now)
+
+    def set_credential(self, credential: bytes) -> None:
+        """Introduce this session by this credential from now on: it was signed anew."""
+        self._commands.append((None, SetCredential(credential)))
+
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         """Take a mapping; returns why it is refused, or None."""
         error = self.mapping.apply(mapping, self._interfaces, self.peers.names())
@@ -225,6 +240,11 @@ class Engine:
             return error
         self.stats.mapping_version = self.mapping.version
         return None
+
+    @property
+    def refused_peers(self) -> dict[NodeName, str]:
+        """Peers that are left out since their credentials are bad, and why."""
+        return dict(self.peers.refused)
 
     @property
     def offer_conflicts(self) -> frozenset[tuple[ServiceName, NodeName, str]]:

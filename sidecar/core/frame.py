@@ -11,14 +11,15 @@ Datagram::
     +---------------------------------------------------------------+
     | packet number on this path and direction (64)                 |
     +---------------------------------------------------------------+
-    | frames ...                                                    |
+    | frames ..., sealed                                            |
     +---------------------------------------------------------------+
-    | authentication tag (0 now; 16 when sealed)                    |
+    | tag of the AEAD (16 bytes)                                    |
     +---------------------------------------------------------------+
 
-The first 20 bytes stay in clear and are the associated data once datagrams are sealed (flags bit 0 says sealed, bit 1
-is the key phase; both must be 0 in this version, and the size budget already leaves 16 bytes for the tag). The first
-byte tells our datagrams (0xD1) from STUN's (0x00 to 0x3F, RFC 8489 section 5) on the same socket.
+The first 20 bytes stay in clear; they are the associated data, and the last 12 of them the nonce. Flags: bit 0 says
+sealed and is always 1, bit 1 is the phase of the keys (path_keys.py), bit 2 says introduction (introduction.py: another
+key, and no frames); the others are 0. The first byte tells our datagrams (0xD2) from STUN's (0x00 to 0x3F, RFC 8489
+section 5) on the same socket.
 
 Frames, each a type byte and then::
 
@@ -32,7 +33,6 @@ Frames, each a type byte and then::
     FINISHED     6  message (64)                             the receiver has all of it
     ABANDON      7  message (64)                             the sender will not send the rest
     CLOSE        8  the sidecar goes away
-    HELLO        9  token (16 bytes) incarnation (64)        who sends under this session; place of the key agreement
     FORGOTTEN   10  message (64)                             the receiver dropped what it had of it: send it anew
 
 A message of `total size` bytes is cut into symbols of `symbol size` bytes, the last one shorter; `index` counts them.
@@ -46,20 +46,27 @@ import struct
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
-from protos.model import PROTOCOL_VERSION, TOKEN_BYTES, InterfaceId, SessionId
+from protos.model import PROTOCOL_VERSION, InterfaceId, SessionId
 from sidecar.core import pmtu
+from sidecar.core.aead import NONCE_BYTES, TAG_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 FIRST_BYTE = 0xD0 | PROTOCOL_VERSION
+SEALED_FLAG, PHASE_FLAG, INTRODUCTION_FLAG = 1, 2, 4
 HEADER = struct.Struct(">BBBBQQ")
 HEADER_BYTES = HEADER.size
+NONCE_OFFSET = HEADER_BYTES - NONCE_BYTES
+"""Where the nonce begins in the header: the lower half of the session, and the packet number."""
+PACKET_NUMBER_BYTES = 8
+CLEAR = struct.Struct(">IQQ")
+"""The header with its first four bytes as one number: head, session, packet number."""
+MIN_DATAGRAM_BYTES = HEADER_BYTES + 1 + TAG_BYTES
+"""One frame of one byte."""
 
 MAX_DATAGRAM_BYTES = pmtu.MAX_BYTES
 """UDP payload of the longest datagram that is accepted; how long those to a path may be, `pmtu.py` finds out."""
-TAG_BYTES = 16
-"""Room left for the tag of the AEAD."""
 BASE_FRAMES_BYTES = pmtu.BASE_BYTES - HEADER_BYTES - TAG_BYTES
 """Frames of a datagram that every path carries."""
 
@@ -71,17 +78,18 @@ MAX_FRAMES = 64
 """Frames in one datagram; an honest one holds a handful."""
 
 _PADDING, _PROBE, _PROBE_REPLY, _ACK, FRAGMENT_TYPE, REPAIR_TYPE, FINISHED_TYPE, _ABANDON = range(8)
-_CLOSE, _HELLO, _FORGOTTEN = 8, 9, 10
+_CLOSE, _FORGOTTEN = 8, 10
 
 _U32 = struct.Struct(">I")
 _U64 = struct.Struct(">Q")
 _ACK_HEAD = struct.Struct(">QIB")
 _ACK_RANGE = struct.Struct(">HH")
 _FRAGMENT_HEAD = struct.Struct(">QIHH")
-_TYPED_FRAGMENT_HEAD = struct.Struct(">BQIHH")
-_HELLO_BODY = struct.Struct(f">{TOKEN_BYTES}sQ")
+FRAGMENT_HEAD = struct.Struct(">BQIHH")
+"""What stands before the symbol in a FRAGMENT or REPAIR, its type byte included."""
+FRAGMENT_HEAD_BYTES = FRAGMENT_HEAD.size
 
-FRAGMENT_OVERHEAD_BYTES = HEADER_BYTES + _TYPED_FRAGMENT_HEAD.size + TAG_BYTES
+FRAGMENT_OVERHEAD_BYTES = HEADER_BYTES + FRAGMENT_HEAD_BYTES + TAG_BYTES
 """What a datagram that holds nothing but a fragment has beside the symbol."""
 BASE_SYMBOL_BYTES = pmtu.BASE_BYTES - FRAGMENT_OVERHEAD_BYTES
 """Symbol that every path carries."""
@@ -101,6 +109,7 @@ class Header(NamedTuple):
     receiver_interface: InterfaceId
     session: SessionId
     packet_number: int
+    flags: int = SEALED_FLAG
 
 
 class Probe(NamedTuple):
@@ -154,18 +163,15 @@ class Close(NamedTuple):
     """The sender goes away."""
 
 
-class Hello(NamedTuple):
-    """Who sends under the header's session."""
-
-    token: bytes
-    incarnation: int
-
-
-Frame = Probe | ProbeReply | AckFrame | Fragment | Finished | Abandon | Forgotten | Close | Hello
+Frame = Probe | ProbeReply | AckFrame | Fragment | Finished | Abandon | Forgotten | Close
 
 
 class VersionError(DecodeError):
     """Ours, but of another protocol version."""
+
+
+class UnsealedError(DecodeError):
+    """Ours, but in clear."""
 
 
 def symbol_count(total: int, symbol: int) -> int:
@@ -173,14 +179,15 @@ def symbol_count(total: int, symbol: int) -> int:
     return max(1, -(-total // symbol))
 
 
-def clear_head(sender: InterfaceId, receiver: InterfaceId) -> int:
+def clear_head(sender: InterfaceId, receiver: InterfaceId, flags: int = SEALED_FLAG) -> int:
     """Return the first four bytes of a header as one number."""
-    return FIRST_BYTE << 24 | sender << 8 | receiver
+    return FIRST_BYTE << 24 | flags << 16 | sender << 8 | receiver
 
 
 def encode_header(header: Header) -> bytes:
     """Return the 20 clear bytes."""
-    return HEADER.pack(FIRST_BYTE, 0, *header)
+    sender, receiver, session, packet_number, flags = header
+    return HEADER.pack(FIRST_BYTE, flags, sender, receiver, session, packet_number)
 
 
 def decode_header(data: bytes | memoryview) -> Header:
@@ -188,6 +195,7 @@ def decode_header(data: bytes | memoryview) -> Header:
 
     Raises:
         VersionError: ours, of another version.
+        UnsealedError: ours, in clear.
         DecodeError: anything else that is not a datagram of ours.
     """
     if len(data) < HEADER_BYTES:
@@ -197,9 +205,14 @@ def decode_header(data: bytes | memoryview) -> Header:
         if first & 0xF0 == FIRST_BYTE & 0xF0:
             raise VersionError(f"protocol version {first & 0x0F}, ours is {PROTOCOL_VERSION}")
         raise DecodeError("not one of our datagrams")
-    if flags:
-        raise DecodeError("sealed or unknown flags")
-    return Header(InterfaceId(sender), InterfaceId(receiver), SessionId(session), packet_number)
+    if not flags & SEALED_FLAG:
+        raise UnsealedError("in clear")
+    if flags not in _KNOWN_FLAGS:
+        raise DecodeError("unknown flags")
+    return Header(InterfaceId(sender), InterfaceId(receiver), SessionId(session), packet_number, flags)
+
+
+_KNOWN_FLAGS = frozenset({SEALED_FLAG, SEALED_FLAG | PHASE_FLAG, SEALED_FLAG | INTRODUCTION_FLAG})
 
 
 def encode_probe(frame: Probe) -> bytes:
@@ -235,7 +248,7 @@ def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
 def encode_fragment_head(message: int, total: int, symbol: int, index: int) -> bytes:
     """Return the bytes that go before the symbol itself."""
     kind = FRAGMENT_TYPE if index * symbol < total or not index else REPAIR_TYPE
-    return _TYPED_FRAGMENT_HEAD.pack(kind, message, total, symbol, index)
+    return FRAGMENT_HEAD.pack(kind, message, total, symbol, index)
 
 
 def encode_finished(frame: Finished) -> bytes:
@@ -269,13 +282,8 @@ def encode_padding(size: int) -> bytes:
     return bytes(size)
 
 
-def encode_hello(frame: Hello) -> bytes:
-    """Return the frame's bytes."""
-    return b"\x09" + _HELLO_BODY.pack(frame.token, frame.incarnation)
-
-
 def decode_frames(view: memoryview) -> list[Frame]:
-    """Parse what follows the header.
+    """Parse what an opened datagram holds.
 
     Raises:
         DecodeError: the bytes are not whole frames that we know; nothing of them is to be believed.
@@ -302,9 +310,6 @@ def decode_frames(view: memoryview) -> list[Frame]:
                 (probe_id,) = _U32.unpack_from(view, position)
                 frames.append(Probe(probe_id) if kind == _PROBE else ProbeReply(probe_id))
                 position += 4
-            elif kind == _HELLO:
-                frames.append(Hello(*_HELLO_BODY.unpack_from(view, position)))
-                position += _HELLO_BODY.size
             elif kind == _CLOSE:
                 frames.append(Close())
             else:

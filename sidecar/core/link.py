@@ -5,6 +5,7 @@ The driver feeds `receive_batch`, `execute` and `handle_timer`, then drains `nex
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sidecar.core import frame
@@ -26,6 +27,7 @@ from sidecar.core.link_events import (
     SendFinished,
     SendForgotten,
     SetCarrier,
+    SetCredential,
     SetMtu,
     SetPeers,
     SetReady,
@@ -34,6 +36,7 @@ from sidecar.core.link_mtu import LinkMtu
 from sidecar.core.link_reader import LinkReader
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keeper import PathKeeper
+from sidecar.core.path_keys import DEFAULT_LIMITS, KeyLimits, LinkMemory
 from sidecar.core.path_table import PathTable
 from sidecar.core.paths import NEVER
 from sidecar.core.stats import PathStats
@@ -59,10 +62,17 @@ MEASURE_EVERY_S = 0.25
 class Link:
     """All paths over one interface."""
 
-    def __init__(self, identity: LinkIdentity, rng: random.Random, now: float, first_number: int = 0) -> None:
-        """`first_number`: the `next_number` of the link that had this interface before, in the same session."""
+    def __init__(
+        self,
+        identity: LinkIdentity,
+        rng: random.Random,
+        now: float,
+        memory: LinkMemory | None = None,
+        limits: KeyLimits = DEFAULT_LIMITS,
+    ) -> None:
+        """`memory`: what the link that had this interface before, in the same session, left by `remember`."""
         self.identity = identity
-        table = self._table = PathTable(identity, first_number)
+        table = self._table = PathTable(identity, memory or LinkMemory(), limits)
         self.stats = table.stats
         self._builder = DatagramBuilder(identity, table.stats, rng)
         self._mtu = LinkMtu(table.events)
@@ -114,6 +124,8 @@ class Link:
                     self._table.owe(path, frame.encode_forgotten(frame.Forgotten(number)))
             case SetPeers(peers):
                 self._set_peers(peers, now)
+            case SetCredential(credential):
+                self._builder.identity = replace(self.identity, credential=credential)
             case SetReady(ready):
                 self._ready = ready
                 self._probe_what_is_down(now)
@@ -146,9 +158,10 @@ class Link:
         """Do what is due by now."""
         self._rearm()
         while (path_id := self._timers.pop_due(now)) is not None:
-            path = self._paths[path_id.peer, path_id.remote]
-            self._dirty[path_id] = path
-            self._keeper.on_timer(path, now)
+            path = self._paths.get((path_id.peer, path_id.remote))
+            if path is not None:  # an introduction may have taken the place of another
+                self._dirty[path_id] = path
+                self._keeper.on_timer(path, now)
         if now >= self._measure_at:
             self._measure_at = now + MEASURE_EVERY_S
             self._measure(now)
@@ -244,10 +257,9 @@ class Link:
             for name, path in best.items()
         }
 
-    @property
-    def next_number(self) -> int:
-        """No path of this link used this packet number or a later one."""
-        return self._table.next_number
+    def remember(self, *, hangs: bool = False) -> LinkMemory:
+        """End the link; returns what the interface's next one must know. `hangs`: its driver may not have ended."""
+        return self._table.remember(hangs=hangs)
 
     # -- peers ----------------------------------------------------------------------------------------------------
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from protos.credential import SessionCredential
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.frame import Fragment
+    from sidecar.core.key_schedule import PairKeys
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_id import PathId, PathState
 
@@ -18,8 +20,9 @@ class LinkPeer:
 
     name: NodeName
     session: SessionId
-    token: bytes
+    token: bytes = field(repr=False)
     incarnation: int
+    keys: PairKeys
     addresses: tuple[tuple[InterfaceId, tuple[Address, ...]], ...]
     """For each of the peer's interfaces, where it may be reached."""
 
@@ -55,6 +58,13 @@ class ResetPaths:
 @dataclass(frozen=True, slots=True)
 class Rebind:
     """The interface's address or gateway changed: what was measured is void, and peers must learn where we are."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetCredential:
+    """Introduce this session by this credential (encoded) from now on: it was signed anew."""
+
+    credential: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +131,9 @@ class SendClose:
 
 PathCommand = Send | Resend | SendFinished | SendAbandon | SendForgotten
 """What is for one path."""
-LinkCommand = SetPeers | SetReady | SetCarrier | ResetPaths | Rebind | Seek | SetMtu | PathCommand | SendClose
+LinkCommand = (
+    SetPeers | SetCredential | SetReady | SetCarrier | ResetPaths | Rebind | Seek | SetMtu | PathCommand | SendClose
+)
 
 
 class FragmentsReceived(NamedTuple):
@@ -220,11 +232,10 @@ class PathMeasured:
 
 @dataclass(frozen=True, slots=True)
 class PeerRestarted:
-    """A known peer proved a newer session."""
+    """Somebody who knows a peer's token introduced a newer session of it; the credential is not verified yet."""
 
     peer: NodeName
-    session: SessionId
-    incarnation: int
+    credential: SessionCredential
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,22 +1,21 @@
-"""Datagrams as they come: whose they are, what they hold. Nothing that is wrong gets further than a counter."""
+"""What authentic datagrams hold. Nothing that is wrong gets further than a counter."""
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core import frame
 from sidecar.core.frame import (
-    FRAGMENT_DATAGRAM,
-    FRAGMENT_DATAGRAM_BYTES,
+    FRAGMENT_HEAD,
+    FRAGMENT_HEAD_BYTES,
     FRAGMENT_TYPE,
-    HEADER_BYTES,
     MAX_MESSAGE_BYTES,
     MAX_SYMBOL_BYTES,
     MIN_SYMBOL_BYTES,
     REPAIR_TYPE,
     Fragment,
-    Header,
     is_repair_index,
 )
 from sidecar.core.link_events import (
@@ -25,13 +24,14 @@ from sidecar.core.link_events import (
     MessageFinished,
     MessageForgotten,
     PeerClosed,
-    PeerRestarted,
 )
+from sidecar.core.link_opener import LinkOpener
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
     from protos.model import Address
     from sidecar.core.link_mtu import LinkMtu
+    from sidecar.core.link_opener import Opened
     from sidecar.core.path_keeper import PathKeeper
     from sidecar.core.path_table import PathTable
     from sidecar.core.paths import Path
@@ -40,51 +40,46 @@ if TYPE_CHECKING:
 class LinkReader:
     """Reads what one link receives."""
 
-    __slots__ = ("_events", "_keeper", "_mtu", "_stats", "_table")
+    __slots__ = ("_events", "_keeper", "_mtu", "_opener", "_stats", "_table")
 
     def __init__(self, table: PathTable, keeper: PathKeeper, mtu: LinkMtu) -> None:
         self._table = table
         self._keeper = keeper
         self._mtu = mtu
+        self._opener = LinkOpener(table)
         self._events = table.events
         self._stats = table.stats
 
     def receive_batch(self, data: memoryview, segment: int, source: Address, now: float) -> None:
         """See `Link.receive_batch`."""
         self._stats.bytes["received"] += len(data)
-        end = len(data)
-        position = self._receive_fragments(data, 0, segment, source, now)
-        while position < end or not end:
-            self._receive_datagram(data[position : position + segment], source, now)
-            position += segment
-            if position >= end:
-                break
-            position = self._receive_fragments(data, position, segment, source, now)
+        if not data:
+            self._stats.dropped["malformed"] += 1
+        opened = self._opener.open_batch(data, segment, source, now)
+        position = 0
+        while position < len(opened):
+            position = self._receive_fragments(opened, position, source, now)
+            if position < len(opened):
+                self._receive_datagram(*opened[position], source, now)
+                position += 1
 
-    def _receive_fragments(self, data: memoryview, position: int, segment: int, source: Address, now: float) -> int:
+    def _receive_fragments(self, opened: list[Opened], position: int, source: Address, now: float) -> int:
         """Take the datagrams from `position` on that hold one FRAGMENT or REPAIR and nothing else, as long as they are
         of one path and come in order; returns the position of the first that is not. Nearly all datagrams of a long
         message are such. What looks odd is left to `_receive_datagram`.
         """
-        end = len(data)
-        if end - position < FRAGMENT_DATAGRAM_BYTES:
-            return position
-        unpack, new = FRAGMENT_DATAGRAM.unpack_from, tuple.__new__
-        head, session, first, kind, *_ = unpack(data, position)
-        if kind != FRAGMENT_TYPE and kind != REPAIR_TYPE:
-            return position
-        path = self._table.of_head(head, session)
-        if path is None or first <= path.received.largest:
-            return position
+        path, low, _ = opened[position]
         received = path.received
-        low = first
-        high = first - 1
+        if low <= received.largest:
+            return position
+        unpack, new = FRAGMENT_HEAD.unpack_from, tuple.__new__
+        high = low - 1
         fragments: list[Fragment] = []
-        while end - position >= FRAGMENT_DATAGRAM_BYTES:
-            its_head, its_session, number, kind, message, total, symbol, index = unpack(data, position)
-            stop = position + segment
-            if stop > end:
-                stop = end
+        for its_path, number, plain in islice(opened, position, None):
+            size = len(plain) - FRAGMENT_HEAD_BYTES
+            if size < 0 or number <= high or its_path is not path:
+                break
+            kind, message, total, symbol, index = unpack(plain)
             if kind == FRAGMENT_TYPE:
                 length = total - index * symbol
                 if length > symbol:
@@ -94,10 +89,7 @@ class LinkReader:
             else:
                 break
             if (
-                number <= high
-                or its_head != head
-                or its_session != session
-                or position + FRAGMENT_DATAGRAM_BYTES + length != stop
+                length != size
                 or not MIN_SYMBOL_BYTES <= symbol <= MAX_SYMBOL_BYTES
                 or total > MAX_MESSAGE_BYTES
                 or (length <= 0 and (index or total))
@@ -107,19 +99,17 @@ class LinkReader:
                 received.add_run(low, high, now)
                 low = number
             high = number
-            symbol_data = data[position + FRAGMENT_DATAGRAM_BYTES : stop]
-            fragments.append(new(Fragment, (message, total, symbol, index, symbol_data)))
-            position = stop
+            fragments.append(new(Fragment, (message, total, symbol, index, plain[FRAGMENT_HEAD_BYTES:])))
         if fragments:
             received.add_run(low, high, now)
             self._heard(path, source, now, newest=True)
             self._stats.datagrams["received", "data"] += len(fragments)
             self._hand_up(path, fragments)
             received.owe_ack(now, len(fragments))
-        return position
+        return position + len(fragments)
 
     def _heard(self, path: Path, source: Address, now: float, *, newest: bool) -> None:
-        """A datagram that is neither forged nor a duplicate came; `newest`: sent after all that came before."""
+        """An authentic datagram that is no duplicate came; `newest`: sent after all that came before."""
         if newest and source != path.remote:
             self._mtu.moved(path, source, now)
         if path.state is PathState.DOWN:
@@ -134,47 +124,18 @@ class LinkReader:
         else:
             self._events.append(FragmentsReceived(path.id, path.session, fragments))
 
-    def _receive_datagram(self, data: memoryview, source: Address, now: float) -> None:
-        stats = self._stats
+    def _receive_datagram(self, path: Path, number: int, plain: memoryview, source: Address, now: float) -> None:
+        newest = number > path.received.largest
+        if not path.received.add(number, now):
+            self._stats.dropped["duplicate"] += 1
+            return
         try:
-            header = frame.decode_header(data)
-            peer = self._table.by_session.get(header.session)
-            if peer is None:
-                self._receive_from_stranger(header, data[HEADER_BYTES:])
-                return
-            if header.receiver_interface != self._table.identity.interface_id:
-                stats.dropped["wrong_interface"] += 1
-                return
-            path = self._table.paths.get((peer.name, header.sender_interface))
-            frames = frame.decode_frames(data[HEADER_BYTES:])
-            if path is None:
-                path = self._table.introduce(peer, header, frames[0], now)
-                if path is None:
-                    stats.dropped["unknown_path"] += 1
-                    return
-        except frame.VersionError:
-            stats.dropped["version"] += 1
-            return
+            frames = frame.decode_frames(plain)
         except DecodeError:
-            stats.dropped["malformed"] += 1
-            return
-        newest = header.packet_number > path.received.largest
-        if not path.received.add(header.packet_number, now):
-            stats.dropped["duplicate"] += 1
+            self._stats.dropped["malformed"] += 1
             return
         self._heard(path, source, now, newest=newest)
         self._receive_frames(path, frames, now)
-
-    def _receive_from_stranger(self, header: Header, body: memoryview) -> None:
-        """An unknown session: only a HELLO of a known peer's newer start is listened to."""
-        frames = frame.decode_frames(body)
-        hello = frames[0]
-        if isinstance(hello, frame.Hello):
-            peer = self._table.by_token.get(hello.token)
-            if peer is not None and hello.incarnation > peer.incarnation:
-                self._events.append(PeerRestarted(peer.name, header.session, hello.incarnation))
-                return
-        self._stats.dropped["unknown_session"] += 1
 
     def _receive_frames(self, path: Path, frames: list[frame.Frame], now: float) -> None:
         eliciting = False
@@ -212,8 +173,6 @@ class LinkReader:
                     self._keeper.take_down(path, "peer closed")
                     events.append(PeerClosed(path.peer))
                 case frame.Close():
-                    pass
-                case frame.Hello():
                     pass
         self._stats.datagrams["received", kind] += 1
         if eliciting:

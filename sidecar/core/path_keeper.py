@@ -47,6 +47,7 @@ class PathKeeper:
         if not newly:
             return
         _mark_acked(newly)
+        path.sealing.delivered(max(run.at for run in newly))
         path.mtu.on_delivered(max(run.longest for run in newly))
         if recovery.sample is not None:
             path.control.on_acked(recovery.sample, recovery.rtt, now)

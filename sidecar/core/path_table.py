@@ -5,70 +5,101 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from protos.model import InterfaceId, SessionId
-from sidecar.core import frame
+from sidecar.core.introduction import hello_id
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.path_keys import LinkMemory, PathKeys, make_path_keys
 from sidecar.core.paths import Path
 from sidecar.core.stats import LinkStats
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.datagrams import LinkIdentity
-    from sidecar.core.frame import Header
     from sidecar.core.link_events import LinkEvent, LinkPeer
+    from sidecar.core.path_keys import KeyLimits
 
 MAX_PENDING_FRAMES = 256
 """Control frames waiting on one path; a peer that makes us owe more is not honest."""
 MAX_PATHS_OF_A_PEER = 32
-"""Of those that a peer introduces itself by; further ones wait for the control plane's word."""
+"""Those that a peer introduces itself by included. A further introduction takes the place of one that nothing
+authentic followed; if there is none, it waits for the control plane's word."""
+HANGING_LINK_NUMBERS = 1 << 32
+"""Packet numbers left to a link whose driver does not return, lest its next one seals with the same."""
+MAX_INTRODUCTIONS = 4
+"""Introductions on one path that wait for their answer; an honest peer repeats its own."""
 
 
 class PathTable:
     """Paths, who may use them, and what came of them."""
 
-    __slots__ = ("by_session", "by_token", "closing", "dirty", "events", "first_number", "identity", "paths", "stats")
+    __slots__ = (
+        "_limits", "_memory", "by_hello", "by_session", "closing", "dirty", "events", "identity", "paths", "stats",
+    )  # fmt: skip
 
-    def __init__(self, identity: LinkIdentity, first_number: int) -> None:
+    def __init__(self, identity: LinkIdentity, memory: LinkMemory, limits: KeyLimits) -> None:
+        self._memory = memory
+        self._limits = limits
         self.identity = identity
         self.stats = LinkStats(identity.interface)
         self.events: deque[LinkEvent] = deque()
         """For the engine, oldest first."""
         self.by_session: dict[SessionId, LinkPeer] = {}
-        self.by_token: dict[bytes, LinkPeer] = {}
+        self.by_hello: dict[bytes, LinkPeer] = {}
         self.paths: dict[tuple[NodeName, InterfaceId], Path] = {}
         self.dirty: dict[PathId, Path] = {}
         """Paths that may have something to send, or another timer than before."""
         self.closing = False
-        self.first_number = first_number
 
     @property
     def next_number(self) -> int:
         """No path of this link used this packet number or a later one."""
-        return max((self.first_number, *(path.recovery.next_number for path in self.paths.values())))
+        return max((self._memory.next_number, *(path.recovery.next_number for path in self.paths.values())))
 
-    def of_head(self, head: int, session: int) -> Path | None:
-        """Return the path that a datagram of this clear head (its first four bytes) and session came over."""
-        peer = self.by_session.get(SessionId(session))
-        if peer is None:
-            return None
-        sender = InterfaceId(head >> 8 & 0xFF)
-        if head != frame.clear_head(sender, self.identity.interface_id):
-            return None
-        return self.paths.get((peer.name, sender))
+    def remember(self, *, hangs: bool) -> LinkMemory:
+        """Return what the interface's next link must know; `hangs`: this one may yet seal a burst or two."""
+        memory = LinkMemory(self.next_number + (HANGING_LINK_NUMBERS if hangs else 0))
+        memory.keep_all(self._memory)
+        for path in list(self.paths.values()):
+            memory.keep(path.session, path.remote_id, path.keys.copy())
+        return memory
 
-    def introduce(self, peer: LinkPeer, header: Header, first: frame.Frame, now: float) -> Path | None:
-        """A known peer speaks from an interface that the control plane has not told of (yet): believed with its token.
+    def introduced(self, peer: LinkPeer, remote: InterfaceId, now: float) -> Path | None:
+        """Return the path to the interface by which a known peer introduced itself; None when it has too many.
 
-        So a robot's new interface works before, and without, the control plane.
+        The control plane need not have told of it: so a robot's new interface works before, and without, it.
         """
-        if not isinstance(first, frame.Hello) or first.token != peer.token:
-            return None
-        if sum(name == peer.name for name, _ in self.paths) >= MAX_PATHS_OF_A_PEER:
-            self.stats.dropped["paths_full"] += 1
-            return None
-        path_id = PathId(self.identity.interface, peer.name, header.sender_interface)
-        path = self.paths[peer.name, header.sender_interface] = Path(path_id, peer.session, (), self.next_number, now)
+        path = self.paths.get((peer.name, remote))
+        if path is not None:
+            return path
+        others = [path for path in self.paths.values() if path.peer == peer.name]
+        if len(others) >= MAX_PATHS_OF_A_PEER:
+            # Whoever knows the token could fill the table with interfaces that do not exist.
+            unproven = next((path for path in others if path.remote is None and not path.candidates), None)
+            if unproven is None:
+                self.stats.dropped["paths_full"] += 1
+                return None
+            self._drop(unproven)
+        path = self.paths[peer.name, remote] = self._new_path(peer, remote, (), self.next_number, now)
         return path
+
+    def _new_path(
+        self, peer: LinkPeer, remote: InterfaceId, addresses: tuple[Address, ...], first_number: int, now: float
+    ) -> Path:
+        path_id = PathId(self.identity.interface, peer.name, remote)
+        return Path(path_id, peer.session, self._keys(peer, remote, now), addresses, first_number, now)
+
+    def _keys(self, peer: LinkPeer, remote: InterfaceId, now: float) -> PathKeys:
+        known = self._memory.take(peer.session, remote)
+        if known is not None:
+            return known
+        return make_path_keys(peer.keys, self.identity.interface_id, remote, self._limits, now)
+
+    def _drop(self, path: Path) -> None:
+        del self.paths[path.peer, path.remote_id]
+        self.dirty.pop(path.id, None)
+        self._forget(path)
+
+    def _forget(self, path: Path) -> None:
+        self._memory.keep(path.session, path.remote_id, path.keys)
 
     def owe(self, path: Path, encoded: bytes, by: float = 0.0) -> None:
         """Queue an encoded control frame for the path's next datagram, which leaves at `by` (s) at the latest."""
@@ -83,9 +114,9 @@ class PathTable:
         """Keep the paths to these peers and begin new ones; returns those that are no more."""
         before = self.paths.copy()
         # A peer that comes back may remember our old packet numbers under the same session: never use one again.
-        first_number = self.first_number = self.next_number
+        first_number = self._memory.next_number = self.next_number
         self.by_session = {peer.session: peer for peer in peers}
-        self.by_token = {peer.token: peer for peer in peers}
+        self.by_hello = {hello_id(peer.token): peer for peer in peers}
         self.paths.clear()
         for peer in peers:
             for remote, addresses in peer.addresses:
@@ -95,8 +126,7 @@ class PathTable:
                 else:
                     if path is not None:
                         before[peer.name, remote] = path
-                    path_id = PathId(self.identity.interface, peer.name, remote)
-                    path = Path(path_id, peer.session, addresses, first_number, now)
+                    path = self._new_path(peer, remote, addresses, first_number, now)
                 self.paths[peer.name, remote] = path
                 self.dirty[path.id] = path
         for key, path in list(before.items()):
@@ -104,4 +134,6 @@ class PathTable:
             if path.state is not PathState.DOWN and known is not None and key not in self.paths:
                 # It proves itself, whatever the control plane's view says: older or newer than what happened here.
                 self.paths[key] = before.pop(key)
+        for path in before.values():
+            self._forget(path)
         return list(before.values())

@@ -9,7 +9,6 @@ from sidecar.core.frame import FINISHED_TYPE, encode_ack, finished_number
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
-from sidecar.core.received import ReceivedPackets
 from sidecar.core.recovery import Recovery
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.send_queue import SendQueue
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     import random
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
+    from sidecar.core.path_keys import PathKeys
 
 IDLE_PROBE_S = 0.5
 """A quiet path is probed this often: keeps NAT bindings open (RFC 4787 asks for 2 minutes, real ones forget after
@@ -58,7 +58,10 @@ class Path:
         "candidates",
         "control",
         "id",
+        "introductions",
+        "keys",
         "mtu",
+        "opening",
         "pending",
         "pending_by",
         "probe_at",
@@ -71,25 +74,37 @@ class Path:
         "reported_lost",
         "reported_sent",
         "rtts",
+        "sealing",
         "session",
         "state",
     )
 
     def __init__(
-        self, path_id: PathId, session: SessionId, candidates: tuple[Address, ...], first_number: int, now: float
+        self,
+        path_id: PathId,
+        session: SessionId,
+        keys: PathKeys,
+        candidates: tuple[Address, ...],
+        first_number: int,
+        now: float,
     ) -> None:
         self.id = path_id
         self.remote_id: InterfaceId = path_id.remote
         self.session = session
+        self.keys = keys
+        self.sealing = keys.sealing
+        self.opening = keys.opening
+        self.received = keys.received
         self.candidates = candidates
         self.remote: Address | None = None
         """Where the newest authentic datagram came from."""
         self.state = PathState.DOWN
         self.recovery = Recovery(first_number)
-        self.received = ReceivedPackets()
         self.control = CongestionController()
         self.mtu = PathMtu()
         self.queue = SendQueue()
+        self.introductions: list[tuple[Address, int]] = []
+        """Where the peer introduced itself from, and the probe that it wants answered there."""
         self.pending: list[bytes] = []
         """Encoded control frames that wait for the next datagram ..."""
         self.pending_by = NEVER
@@ -124,10 +139,7 @@ class Path:
     def next_probe(self, now: float, rng: random.Random) -> int:
         """Return the id of a probe that leaves now, and plan the next one."""
         self._probed_at = now
-        probe_id = self.take_probe_id()
-        self._probes_out[probe_id] = now
-        if len(self._probes_out) > MAX_PROBES_OUT:
-            del self._probes_out[next(iter(self._probes_out))]
+        probe_id = self.counter_probe(now)
         self.waits_for_answer(now)
         if self.state is PathState.UP:
             gap = IDLE_PROBE_S
@@ -138,6 +150,14 @@ class Path:
             backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
             self._probe_gap = min(gap * backoff, MAX_PROBE_S)
         self.probe_at = now + gap * rng.uniform(0.9, 1.1)
+        return probe_id
+
+    def counter_probe(self, now: float) -> int:
+        """Return the id of a probe that leaves now besides those that are planned."""
+        probe_id = self.take_probe_id()
+        self._probes_out[probe_id] = now
+        if len(self._probes_out) > MAX_PROBES_OUT:
+            del self._probes_out[next(iter(self._probes_out))]
         return probe_id
 
     def take_probe_id(self) -> int:
@@ -173,6 +193,7 @@ class Path:
         if sent_at is None:
             return False
         self.recovery.rtt.sample(now - sent_at, now)
+        self.sealing.delivered(sent_at)
         self.note_rtt()
         return True
 

@@ -1,5 +1,8 @@
 """The peers this sidecar may talk to: the control plane's view, corrected by what the paths themselves prove.
 
+A peer is known by its credential, which this sidecar judges itself (`OwnSession.admit`): one whose credential is bad
+is no peer, whatever the control plane says.
+
 A peer that merely vanished from the view (its lease ran out, or the control plane restarted with an empty registry)
 is kept while a path to it lives: a dead control plane must not cost a request. One that left, was revoked or is kept
 away by the access policy goes at once; so does every one that vanished when the policy changes, since nobody said what
@@ -11,26 +14,37 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
+from protos.errors import DecodeError
 from protos.model import NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
 from sidecar.core.link_events import LinkPeer
 
 if TYPE_CHECKING:
+    from collections import Counter
     from collections.abc import Callable
 
     from protos.model import Address, InterfaceId, NodeName, Peer, ServiceName, SessionId
+    from sidecar.core.key_schedule import PairKeys
     from sidecar.core.link_events import PeerRestarted
+    from sidecar.core.session import OwnSession
 
 MAX_PEERS = 4096
 """Peers kept; a control plane that names more is refused."""
 RESTART_GAP_S = 1.0
-"""A peer that says more often that it restarted is not believed: every restart costs all links work."""
+"""A peer that says more often that it restarted is not believed, nor is its credential looked at: every restart costs
+all links work, and every look public-key work."""
 
 
 class Peers:
     """Known peers by name."""
 
-    def __init__(self) -> None:
+    def __init__(self, own: OwnSession, dropped: Counter[str]) -> None:
+        self._own = own
+        self._dropped = dropped
         self._known: dict[NodeName, Peer] = {}
+        self._keys: dict[NodeName, PairKeys] = {}
+        """What is shared with each of them."""
+        self.refused: dict[NodeName, str] = {}
+        """Peers of the view whose credentials are bad, and why."""
         self._unlisted: set[NodeName] = set()
         self._restarted_at: dict[NodeName, float] = {}
         self._policy = NO_POLICY
@@ -60,16 +74,26 @@ class Peers:
             return "two peers share a session"
         gone = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
         sessions = {peer.session for peer in peer_set.peers}
-        known = {peer.name: self._newer(peer, sessions) for peer in peer_set.peers}
+        known: dict[NodeName, Peer] = {}
+        keys: dict[NodeName, PairKeys] = {}
+        self.refused = {}
+        for listed in peer_set.peers:
+            peer = self._newer(listed, sessions)
+            try:
+                keys[peer.name] = self._own.admit(peer)
+                known[peer.name] = peer
+            except DecodeError as error:
+                self._dropped["bad_credential"] += 1
+                self.refused[peer.name] = str(error)
         unlisted = set()
         new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)
         for name, peer in self._known.items():
             if new_policy or name in known or name in gone or peer.session in sessions or len(known) >= MAX_PEERS:
                 continue
-            if reaches(name):
-                known[name] = peer
+            if reaches(name) and name not in self.refused:
+                known[name], keys[name] = peer, self._keys[name]
                 unlisted.add(name)
-        self._known = known
+        self._known, self._keys = known, keys
         self._restarted_at = {name: at for name, at in self._restarted_at.items() if name in known}
         self._unlisted = unlisted
         if peer_set.policy != POLICY_PENDING:
@@ -78,35 +102,63 @@ class Peers:
         return None
 
     def _newer(self, listed: Peer, sessions: set[SessionId]) -> Peer:
-        """The view may be older than what the peer itself proved by its HELLO; `sessions` are the view's."""
+        """The view may be older than what the peer itself proved by its introduction; `sessions` are the view's."""
         known = self._known.get(listed.name)
         if known is None or known.token != listed.token or known.session in sessions:
             return listed
         if known.incarnation > listed.incarnation:
-            return dataclasses.replace(listed, session=known.session, incarnation=known.incarnation)
+            return dataclasses.replace(
+                listed, session=known.session, incarnation=known.incarnation, credential=known.credential
+            )
         return listed
 
     def restarted(self, event: PeerRestarted, now: float) -> bool:
-        """Take a peer's newer session; False when it is not newer, or comes too soon after the one before."""
-        peer = self._known.get(event.peer)
-        if peer is None or event.incarnation <= peer.incarnation:
+        """Take a peer's newer session; False when it is not newer or proven, or comes too soon after another."""
+        name, credential = event.peer, event.credential
+        peer = self._known.get(name)
+        if peer is None or credential.incarnation <= peer.incarnation:
             return False
-        restarted_at = self._restarted_at.get(event.peer)
+        restarted_at = self._restarted_at.get(name)
         if restarted_at is not None and now < restarted_at + RESTART_GAP_S:
             return False
-        if any(other.session == event.session for other in self._known.values()):
+        if any(other.session == credential.session for other in self._known.values()):
             return False
-        self._restarted_at[event.peer] = now
-        self._known[event.peer] = dataclasses.replace(peer, session=event.session, incarnation=event.incarnation)
+        self._restarted_at[name] = now
+        newer = dataclasses.replace(
+            peer, session=credential.session, incarnation=credential.incarnation, credential=credential.encode()
+        )
+        try:
+            self._keys[name] = self._own.admit(newer)
+        except DecodeError:
+            self._dropped["bad_credential"] += 1
+            return False
+        self._known[name] = newer
         return True
+
+    def recheck(self) -> list[NodeName]:
+        """Whom to trust has changed: judge every peer anew; returns those that are no peers any more."""
+        self._own.forget_admitted()
+        gone = []
+        for name, peer in list(self._known.items()):
+            try:
+                self._own.admit(peer)
+            except DecodeError as error:
+                self._dropped["bad_credential"] += 1
+                self.refused[name] = str(error)
+                self._forget(name)
+                gone.append(name)
+        return gone
+
+    def _forget(self, name: NodeName) -> None:
+        self._unlisted.discard(name)
+        self._restarted_at.pop(name, None)
+        del self._known[name], self._keys[name]
 
     def drop_if_unlisted(self, name: NodeName) -> bool:
         """The last path to a peer died: True when that ends it, because the view no longer lists it."""
         if name not in self._unlisted:
             return False
-        self._unlisted.discard(name)
-        self._restarted_at.pop(name, None)
-        del self._known[name]
+        self._forget(name)
         return True
 
     def may_call(self, name: NodeName, service: ServiceName) -> bool:
@@ -121,10 +173,10 @@ class Peers:
 
     def for_links(self) -> tuple[LinkPeer, ...]:
         """Return the peers as links need them."""
-        return tuple(_link_peer(peer) for peer in self._known.values())
+        return tuple(_link_peer(peer, self._keys[name]) for name, peer in self._known.items())
 
 
-def _link_peer(peer: Peer) -> LinkPeer:
+def _link_peer(peer: Peer, keys: PairKeys) -> LinkPeer:
     by_interface: dict[InterfaceId, list[Address]] = {}
     for candidate in peer.candidates:
         addresses = by_interface.setdefault(candidate.interface_id, [])
@@ -135,5 +187,6 @@ def _link_peer(peer: Peer) -> LinkPeer:
         peer.session,
         peer.token,
         peer.incarnation,
+        keys,
         tuple((interface, tuple(addresses)) for interface, addresses in sorted(by_interface.items())),
     )

@@ -8,12 +8,14 @@ comes out.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.link_events import ResetPaths, SendClose
 from sidecar.net.timerfd import Timer
@@ -22,6 +24,7 @@ from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from protos.credential import SessionCredential
     from protos.model import (
         InterfaceName,
         MappingSet,
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     )
     from sidecar.core.events import ExecutionId, RejectReason, RequestId
     from sidecar.core.link_events import LinkEvent
+    from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.interface_thread import InterfaceThread
@@ -60,16 +64,17 @@ class DataPlaneHooks:
 class ThreadedDataPlane:
     """Implements `sidecar.ports.DataPlane` and `LinkOwner`; every method may be called from any thread."""
 
-    def __init__(self, config: EngineConfig, session: SessionId, hooks: DataPlaneHooks) -> None:
-        self._session = session
+    def __init__(self, config: EngineConfig, own: OwnSession, hooks: DataPlaneHooks) -> None:
+        self._own = own
         self._hooks = hooks
         self._clock = time.monotonic
-        self._engine = Engine(config, self._clock())
+        self._engine = Engine(config, own, self._clock())
         self._lock = threading.Lock()
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
         self._watchdog = Watchdog(self._clock())
         self._stopping = False
+        self._logged_refusals: dict[NodeName, str] = {}
         self._logged_conflicts: frozenset[tuple[ServiceName, NodeName, str]] = frozenset()
         self._timer_thread = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
 
@@ -115,7 +120,7 @@ class ThreadedDataPlane:
     @property
     def session(self) -> SessionId:
         """This run's session."""
-        return self._session
+        return self._own.credential.session
 
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
         """Robot: send a serialised request."""
@@ -159,15 +164,43 @@ class ThreadedDataPlane:
 
     def apply_peers(self, peer_set: PeerSet) -> str | None:
         """Take a view of the peers; returns why it is refused, or None."""
+        for peer in peer_set.peers:
+            # What public-key work costs, it costs here: the engine, under its lock, finds it done.
+            with contextlib.suppress(DecodeError):
+                self._own.admit(peer)
         with self._lock:
             error = self._engine.apply_peers(peer_set, self._clock())
             woken = self._queue_outputs()
             conflicts = self._engine.offer_conflicts
+            refused = self._engine.refused_peers
         self._wake(woken)
+        for name, reason in refused.items():
+            if self._logged_refusals.get(name) != reason:
+                log.warning("%s is not talked to, whatever the control plane says: %s", name, reason)
+        self._logged_refusals = refused
         for service, server, kind in sorted(conflicts - self._logged_conflicts):
             log.warning("%s at %s has type %s, unlike the other servers: it gets no requests", service, server, kind)
         self._logged_conflicts = conflicts
         return error
+
+    def trust_changed(self) -> None:
+        """CAs or revocations are others now: peers that are not to be trusted any more lose their sessions at once."""
+        with self._lock:
+            self._engine.recheck_peers(self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+
+    def renew_credential(self, credential: SessionCredential) -> None:
+        """Our certificate was renewed, and this session's credential signed anew.
+
+        Raises:
+            ValueError: it is of another session.
+        """
+        with self._lock:
+            self._own.renew(credential)
+            self._engine.set_credential(credential.encode())
+            woken = self._queue_outputs()
+        self._wake(woken)
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         """Take a mapping; returns why it is refused, or None."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from protos.errors import ConfigError
 from protos.model import Candidate, InterfaceId
 from sidecar.core.datagrams import LinkIdentity
+from sidecar.core.path_keys import KeyLimits
 from sidecar.core.readiness import Readiness
 from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.stun_events import Failed, Mapped, MappingChanged
@@ -25,8 +26,10 @@ from sidecar.net.stun_names import StunNames
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address, InterfaceName, SessionId
+    from protos.model import Address, InterfaceName
     from sidecar.config import SidecarConfig
+    from sidecar.core.path_keys import LinkMemory
+    from sidecar.core.session import OwnSession
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane
     from sidecar.net.interface_thread import InterfaceThread
@@ -44,21 +47,12 @@ COALESCE_S = 0.005
 """Between two readings of a flood of announcements: each costs a turn of the interpreter, which all threads share."""
 
 
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Who this sidecar is in this run."""
-
-    session: SessionId
-    token: bytes
-    incarnation: int
-
-
 @dataclass(slots=True)
 class _Number:
-    """An interface's number in this run, kept while it is away, with the packet numbers that were not used yet."""
+    """An interface's number in this run, kept while it is away, with what its next link must know of its last."""
 
     id: InterfaceId
-    first_packet: int = 0
+    memory: LinkMemory | None = None
 
 
 class InterfaceManager:
@@ -67,12 +61,15 @@ class InterfaceManager:
     def __init__(
         self,
         config: SidecarConfig,
-        identity: Identity,
+        own: OwnSession,
+        token: bytes,
         data_plane: ThreadedDataPlane,
         candidates_changed: Callable[[tuple[Candidate, ...]], None],
     ) -> None:
         self._config = config
-        self._identity = identity
+        self._own = own
+        self._token = token
+        self._limits = KeyLimits(seconds=config.rekey_after_s)
         self._data_plane = data_plane
         self._candidates_changed = candidates_changed
         self._managed: dict[InterfaceName, ManagedInterface] = {}
@@ -250,19 +247,18 @@ class InterfaceManager:
         if gone:
             self._data_plane.set_links(self._links())
         for managed in gone:
-            self._numbers[managed.name].first_packet = managed.stop()
+            self._numbers[managed.name].memory = managed.stop()
 
     def _add(self, interface: Interface) -> bool:
         number = self._number(interface.name)
         if number is None:
             return False
-        me = self._identity
-        identity = LinkIdentity(interface.name, number.id, me.session, me.token, me.incarnation)
+        identity = LinkIdentity.of(self._own.credential, self._token, interface.name, number.id)
         with self._lock:
             servers = self._stun_servers if self._config.stun.enabled else None
             try:
                 managed = ManagedInterface(
-                    interface, self._config.udp_port, identity, number.first_packet, servers, self._data_plane
+                    interface, self._config.udp_port, identity, number.memory, self._limits, servers, self._data_plane
                 )
             except OSError as error:
                 self._socket_refused = True

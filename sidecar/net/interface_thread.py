@@ -93,14 +93,15 @@ class InterfaceThread:
         """Start the thread."""
         self._thread.start()
 
-    def stop(self, timeout_s: float) -> None:
-        """End the thread after what is queued has left, and close the socket."""
+    def stop(self, timeout_s: float) -> bool:
+        """End the thread after what is queued has left, and close the socket; False when it did not end in time."""
         self._stopping = True
         self.wake()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             self._abandoned = True
             log.warning("%s: the thread did not end within %.1f s", self.interface, timeout_s)
+        return not self._abandoned
 
     def post(self, command: LinkCommand | Callable[[StunClient], None]) -> None:
         """Queue a command for the link (or a call on the STUN client); follow it with `wake`."""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceName
     from sidecar.core.datagrams import LinkIdentity
+    from sidecar.core.path_keys import KeyLimits, LinkMemory
     from sidecar.net.interface_thread import LinkOwner
     from sidecar.net.interfaces import Interface
 
@@ -36,7 +37,8 @@ class ManagedInterface:
         interface: Interface,
         port: int,
         identity: LinkIdentity,
-        first_number: int,
+        memory: LinkMemory | None,
+        limits: KeyLimits,
         stun_servers: Iterable[Address] | None,
         owner: LinkOwner,
     ) -> None:
@@ -48,7 +50,7 @@ class ManagedInterface:
         opened = open_socket(interface, port)
         self.bound_to = opened.bound_to
         self._bound_address = opened.socket.getsockname()[0] if opened.bound_to is BoundTo.ADDRESS else None
-        link = Link(identity, random.SystemRandom(), time.monotonic(), first_number)
+        link = Link(identity, random.SystemRandom(), time.monotonic(), memory, limits)
         stun = None
         if stun_servers is not None:
             stun = StunClient(stun_servers, random.SystemRandom(), drops=link.stats.dropped)
@@ -114,10 +116,10 @@ class ManagedInterface:
         )
         return found
 
-    def stop(self) -> int:
-        """End the thread; returns the first packet number that the interface's next link may use."""
-        self.thread.stop(STOP_TIMEOUT_S)
-        return self.thread.link.next_number
+    def stop(self) -> LinkMemory:
+        """End the thread; returns what the interface's next link must know."""
+        ended = self.thread.stop(STOP_TIMEOUT_S)
+        return self.thread.link.remember(hangs=not ended)
 
     def _post(self, command: SetCarrier | Rebind | SetMtu | SetReady) -> None:
         self.thread.post(command)

@@ -25,6 +25,7 @@ from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES
 from sidecar.core.path_id import PathState
 from sidecar.core.path_table import MAX_PENDING_FRAMES
 from sidecar.core.priority import Priority
+from tests.sessions import seal
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from protos.model import InterfaceName
+    from sidecar.core.paths import Path
 
 
 def fragment(number: int, total: int, symbol: int, index: int) -> bytes:
@@ -76,7 +78,6 @@ ATTACKS: dict[str, Callable[[random.Random], bytes]] = {
         RequestMessage(RequestId(rng.randbytes(16)), 0, Priority.NORMAL, 0.1, 300.0, SERVICE, TYPE, rng.randbytes(900)),
     ),
     "goodbyes": lambda rng: frame.encode_close() * 64,
-    "restarts": lambda rng: frame.encode_hello(frame.Hello(rng.randbytes(16), rng.getrandbits(64))),
 }
 
 
@@ -87,22 +88,20 @@ class Rogue:
         self.mesh, self.node, self.victim = mesh, node, victim
         self.rng = mesh.rng
 
-    def numbers(self) -> Iterator[tuple[InterfaceName, Header]]:
+    def paths(self) -> Iterator[tuple[InterfaceName, Path, Header]]:
         """One packet number for each path from the rogue to the victim."""
         for interface, link in self.node.links.items():
             for path in link._paths.values():
                 if path.peer == self.victim.name:
                     number = path.recovery.take_numbers()
-                    yield (
-                        interface,
-                        Header(link.identity.interface_id, path.remote_id, self.node.session, number),
-                    )
+                    header = Header(link.identity.interface_id, path.remote_id, self.node.session, number)
+                    yield interface, path, header
 
     def send(self, bodies: Iterable[bytes]) -> None:
         """Each over every path, and then the victim's turn."""
         for body in bodies:
-            for interface, header in self.numbers():
-                datagram = frame.encode_header(header) + body
+            for interface, path, header in self.paths():
+                datagram = seal(path.sealing, header, body)
                 target = self.victim.links[self.victim.interfaces[header.receiver_interface]]
                 source = self.node.address(interface)
                 target.receive_batch(memoryview(datagram), len(datagram), source, self.mesh.now)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from protos.model import InterfaceId, SessionId
 from sidecar.core import frame
+from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
 from sidecar.core.link_events import FragmentsReceived, Send
 from sidecar.core.path_id import PathId
@@ -42,7 +43,6 @@ fragments = st.builds(
     st.integers(0, 12),
     st.integers(0, 1000) | st.just(300),
 )
-tokens = st.sampled_from([PEER_TOKEN, OUR_TOKEN])
 frames = st.one_of(
     st.integers(0, 70).map(lambda n: frame.encode_probe(Probe(n))),
     st.integers(0, 70).map(lambda n: frame.encode_probe_reply(ProbeReply(n))),
@@ -50,19 +50,34 @@ frames = st.one_of(
     fragments,
     numbers.map(lambda n: frame.encode_finished(frame.Finished(n))),
     st.just(frame.encode_close()),
-    st.builds(lambda token, n: frame.encode_hello(frame.Hello(token, n)), tokens, numbers),
     st.binary(max_size=20),
 )
-headers = st.builds(
-    Header,
-    st.sampled_from([0, 0, 0, 1]).map(InterfaceId),
-    st.sampled_from([3, 3, 3, 4]).map(InterfaceId),
-    st.sampled_from([PEER_SESSION, PEER_SESSION, PEER_SESSION, SessionId(5)]),
+PEER = Bench()
+"""Seals for all benches: they have the same keys."""
+sessions = st.sampled_from([PEER_SESSION, PEER_SESSION, PEER_SESSION, SessionId(5)])
+sealed = st.builds(
+    lambda interface, receiver, session, number, body: PEER.datagram(
+        *body, number=number, session=session, interface=InterfaceId(interface), receiver=InterfaceId(receiver)
+    ),
+    st.sampled_from([0, 0, 0, 1]),
+    st.sampled_from([3, 3, 3, 4]),
+    sessions,
     numbers,
+    st.lists(frames, min_size=1, max_size=5),
 )
-datagrams = st.binary(max_size=60) | st.builds(
-    lambda header, body: frame.encode_header(header) + b"".join(body), headers, st.lists(frames, max_size=5)
+introductions = st.builds(
+    lambda token, number, session, interface, incarnation: PEER.introduction(
+        token=token, number=number, session=session, interface=InterfaceId(interface), incarnation=incarnation
+    ),
+    st.sampled_from([PEER_TOKEN, PEER_TOKEN, OUR_TOKEN]),
+    numbers,
+    sessions,
+    st.integers(0, 255),
+    st.integers(0, 3),
 )
+headers = st.builds(Header, st.just(InterfaceId(0)), st.just(InterfaceId(3)), sessions, numbers, st.integers(0, 255))
+in_clear = st.builds(lambda header, body: frame.encode_header(header) + b"".join(body), headers, st.lists(frames))
+datagrams = st.one_of(st.binary(max_size=60), in_clear, sealed, sealed, introductions)
 ops = st.tuples(datagrams, st.sampled_from([0.0, 0.0, 0.001, 0.05, 1.0]), st.booleans())
 mutations = st.lists(st.tuples(st.integers(0, 1200), st.integers(0, 255)), max_size=3)
 
@@ -99,22 +114,24 @@ def test_whatever_comes_the_link_stands_and_answers_honest_probes(
     bench.know(session=SessionId(77), incarnation=2)
     probe = frame.encode_probe(Probe(4242))
     bench.receive_datagram(bench.datagram(probe, session=SessionId(77)))
-    assert frame.encode_probe_reply(ProbeReply(4242)) in b"".join(bench.sent())
+    assert ProbeReply(4242) in bench.frames(bench.sent())
 
 
 @given(st.lists(st.tuples(mutations, st.booleans()), min_size=1, max_size=20), st.integers(0, 5000))
 def test_real_datagrams_mangled_on_the_way(plan: list[tuple[list[tuple[int, int]], bool]], size: int) -> None:
-    """The datagrams of a link come back to it as if its peer had sent them, some bytes of them changed."""
+    """The frames of a link come back to it as if its peer had sent them, some bytes of them changed."""
     bench = Bench()
     path = PathId(WLAN, A, InterfaceId(0))
     for number, (changes, send) in enumerate(plan):
         if send:
             bench.execute(Send(path, message(number, size, expires=1e9)))
         for sent in bench.sent() + bench.wait(0.02):
-            body = bytearray(bench.datagram(sent[frame.HEADER_BYTES :]))
+            if frame.decode_header(sent).flags & frame.INTRODUCTION_FLAG:
+                continue
+            plain = bytearray(bench.plain(sent))
             for position, value in changes:
-                body[position % len(body)] = value
-            bench.receive_datagram(bytes(body))
+                plain[position % len(plain)] = value
+            bench.receive_datagram(bench.datagram(bytes(plain)))
         bench.events()
         assert_bounded(bench)
 
@@ -124,7 +141,7 @@ def test_a_batch_does_what_its_datagrams_do_one_by_one(seed: int) -> None:
     """Fragments in and out of order, doubled, mangled, of strangers, with other frames between them."""
     rng = random.Random(seed)
     symbol = frame.MIN_SYMBOL_BYTES
-    segment = frame.FRAGMENT_DATAGRAM_BYTES + symbol
+    segment = frame.FRAGMENT_OVERHEAD_BYTES + symbol
     together, apart = Bench(), Bench()
     number = 0
     for _ in range(20):
@@ -135,11 +152,14 @@ def test_a_batch_does_what_its_datagrams_do_one_by_one(seed: int) -> None:
             body = frame.encode_fragment_head(rng.randrange(3), 10 * symbol, symbol, index) + bytes(symbol)
             if rng.random() < 0.1:
                 body = rng.choice([frame.encode_probe(Probe(1)), frame.encode_finished(frame.Finished(5))])
-                body += frame.encode_padding(segment - frame.HEADER_BYTES - len(body))
+                body += frame.encode_padding(segment - frame.HEADER_BYTES - TAG_BYTES - len(body))
             session = SessionId(77) if rng.random() < 0.03 else PEER_SESSION
-            datagram = bytearray(together.datagram(body, number=max(number, 0), session=session))
-            if rng.random() < 0.15:
-                datagram[rng.randrange(frame.FRAGMENT_DATAGRAM_BYTES)] = rng.randrange(256)
+            plain = bytearray(body)
+            if rng.random() < 0.1:
+                plain[rng.randrange(frame.FRAGMENT_HEAD_BYTES)] = rng.randrange(256)
+            datagram = bytearray(together.datagram(bytes(plain), number=max(number, 0), session=session))
+            if rng.random() < 0.05:
+                datagram[rng.randrange(len(datagram))] ^= rng.randrange(1, 256)
             run.append(bytes(datagram))
         if rng.random() < 0.3:
             run[-1] = run[-1][: rng.randrange(segment)]
@@ -168,7 +188,7 @@ def test_a_head_that_reaches_into_the_next_datagram_is_malformed() -> None:
     bench.link.next_event()
     # One symbol too far, by as many bytes as the datagram is too short.
     head = bytes([frame.FRAGMENT_TYPE]) + frame.encode_fragment_head(1, 249, 256, 1)[1:]
-    data = bench.datagram(head).ljust(60, b"\0")
-    bench.link.receive_batch(memoryview(data), len(bench.datagram(head)) - 7, PEER_ADDRESS, bench.now)
+    bench.receive(head)
+    bench.receive(head[:-7])
     assert bench.events() == []
     assert bench.link.stats.dropped == {"malformed": 2}

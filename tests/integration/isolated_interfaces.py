@@ -6,6 +6,7 @@ be full.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import dataclasses
 import functools
@@ -41,6 +42,7 @@ from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import InterfaceThread
+from tests.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -104,7 +106,8 @@ class Robot:
         deadline_s = dict.fromkeys(services, LIFETIME_S) | {services[0]: URGENT_S}
         rules = tuple(ServiceRule(service, deadline_s[service], LIFETIME_S) for service in services)
         hooks = DataPlaneHooks(self, lambda *_: None, lambda: None)
-        self.plane = ThreadedDataPlane(EngineConfig(Role.ROBOT, rules), SESSION, hooks)
+        own = session_of("robot", Role.ROBOT, SESSION)
+        self.plane = ThreadedDataPlane(EngineConfig(Role.ROBOT, rules), own, hooks)
         self.sockets: dict[str, BadSocket] = {}
         self.threads: dict[str, InterfaceThread] = {}
         candidates = []
@@ -112,7 +115,7 @@ class Robot:
             sock = self.sockets[name] = BadSocket(socket.AF_INET, socket.SOCK_DGRAM)
             sock.setblocking(False)
             sock.bind((f"127.0.0.{number + 1}", 0))
-            identity = LinkIdentity(InterfaceName(name), InterfaceId(number), SESSION, TOKEN, 1)
+            identity = LinkIdentity.of(own.credential, TOKEN, InterfaceName(name), InterfaceId(number))
             link = Link(identity, random.Random(number), time.monotonic())
             self.threads[name] = InterfaceThread(sock, link, None, self.plane)
             host = CandidateKind.HOST.value
@@ -123,6 +126,7 @@ class Robot:
             "role": "robot",
             "session": SESSION,
             "token": "AAAAAAAAAAAAAAAAAAAAcg==",
+            "credential": base64.b64encode(own.credential.encode()).decode(),
             "candidates": candidates,
         }
         clouds = sorted({cloud for _, cloud in mapping.values()})

@@ -34,6 +34,7 @@ from protos.model import (
 )
 from sidecar.state_store import StateStore
 from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane, free_port
+from tests.sessions import with_credential
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -186,7 +187,8 @@ def test_runs_without_control_plane_and_stops_cleanly(program: Program, number: 
     assert " ERROR " not in program.log
 
 
-PEERS = PeerSet(Version(11), 0, (Peer(NodeName("cloud-a"), Role.CLOUD, SessionId(9), bytes(range(16)), incarnation=1),))
+CLOUD = with_credential(Peer(NodeName("cloud-a"), Role.CLOUD, SessionId(9), bytes(range(16)), incarnation=1))
+PEERS = PeerSet(Version(11), 0, (CLOUD,))
 
 
 def mapping(interface: str) -> MappingSet:

@@ -29,9 +29,11 @@ from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestId, ResponseArrived
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
+from sidecar.core.path_keys import DEFAULT_LIMITS
 from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.request_id import make_request_id
 from sidecar.core.rules import ServiceRule
+from tests.sessions import session_of, with_credential
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -92,12 +94,14 @@ class Node:
         now = self.mesh.now
         self.session = SessionId(self.mesh.rng.getrandbits(64))
         self.incarnation = int(now * 1e6) + 1
-        self.engine = Engine(EngineConfig(self.role, self.rules), now)
+        self.own = session_of(self.name, self.role, self.session, self.incarnation)
+        self.engine = Engine(EngineConfig(self.role, self.rules), self.own, now)
         self.links = {
             interface: Link(
-                LinkIdentity(interface, InterfaceId(number), self.session, self.token, self.incarnation),
+                LinkIdentity.of(self.own.credential, self.token, interface, InterfaceId(number)),
                 random.Random(self.mesh.rng.random()),
                 now,
+                limits=self.mesh.key_limits,
             )
             for number, interface in enumerate(self.interfaces)
         }
@@ -119,7 +123,7 @@ class Node:
             Candidate(InterfaceId(number), interface, CandidateKind.HOST, self.address(interface))
             for number, interface in enumerate(self.interfaces)
         )
-        return Peer(
+        peer = Peer(
             self.name,
             self.role,
             self.session,
@@ -129,6 +133,7 @@ class Node:
             self.offers,
             may_call=ALL_CALLS,
         )
+        return with_credential(peer)
 
     def submit(self, payload: bytes, service: ServiceName = SERVICE) -> RequestId:
         self.sequence += 1
@@ -165,6 +170,7 @@ class Mesh:
         self._order = count()
         self.version = 0
         self.calls = 0
+        self.key_limits = DEFAULT_LIMITS
 
     def add(self, name: str, role: Role, interfaces: list[str], rules: tuple[ServiceRule, ...]) -> Node:
         node = self.nodes[name] = Node(self, name, role, interfaces, rules)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
+from bench.null_cipher import install
 from protos.model import (
     ALL_CALLS,
     Assignment,
@@ -40,8 +41,9 @@ from sidecar.config import SidecarConfig
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, RequestId, ResponseArrived
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
-from sidecar.net.interface_manager import Identity, InterfaceManager
+from sidecar.net.interface_manager import InterfaceManager
 from sidecar.runtime import SWITCH_INTERVAL_S
+from sidecar.start_session import start_session
 
 if TYPE_CHECKING:
     from sidecar.core.events import ApplicationEvent
@@ -68,18 +70,22 @@ class EngineProgram:
 
     # -- questions ------------------------------------------------------------------------------------------------
 
-    def start(self, config: dict[str, Any], answer_bytes: int = HEADER.size) -> dict[str, Any]:
+    def start(
+        self, config: dict[str, Any], answer_bytes: int = HEADER.size, *, null_cipher: bool = False
+    ) -> dict[str, Any]:
         """Open the interfaces of a sidecar's configuration; returns it as a peer, for the other side's `meet`."""
+        if null_cipher:
+            install()
         parsed = SidecarConfig.model_validate({"control_plane": "127.0.0.1:1", "metrics_listen": None, **config})
         self._role, self._answer_bytes = parsed.role, answer_bytes
         logging.basicConfig(level=parsed.log_level.name, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        self._identity = Identity(SessionId(random.getrandbits(63) | 1), random.randbytes(16), 1)
+        self._name = parsed.name
+        self._own = start_session(parsed.node_name, parsed.role, 1, None)
+        self._token = random.randbytes(16)
         hooks = DataPlaneHooks(self, lambda _interface, _event: None, lambda: None)
-        self._plane = ThreadedDataPlane(
-            EngineConfig(parsed.role, parsed.service_rules()), self._identity.session, hooks
-        )
-        self._interfaces = InterfaceManager(parsed, self._identity, self._plane, self._on_candidates)
+        self._plane = ThreadedDataPlane(EngineConfig(parsed.role, parsed.service_rules()), self._own, hooks)
+        self._interfaces = InterfaceManager(parsed, self._own, self._token, self._plane, self._on_candidates)
         self._plane.start()
         self._interfaces.start()
         if parsed.role is Role.CLOUD:
@@ -166,7 +172,7 @@ class EngineProgram:
 
     def _submit(self, number: int, data: bytes) -> None:
         # The session makes the id unique over several runs of the robot's side.
-        request_id = RequestId(self._identity.session.to_bytes(8, "big") + (number & (1 << 64) - 1).to_bytes(8, "big"))
+        request_id = RequestId(self._plane.session.to_bytes(8, "big") + (number & (1 << 64) - 1).to_bytes(8, "big"))
         self._plane.submit(request_id, SERVICE, data)
 
     def _answer(self) -> None:
@@ -184,8 +190,9 @@ class EngineProgram:
         return {
             "name": name,
             "role": self._role.value,
-            "session": self._identity.session,
-            "token": base64.b64encode(self._identity.token).decode(),
+            "session": self._plane.session,
+            "token": base64.b64encode(self._token).decode(),
+            "credential": base64.b64encode(self._own.credential.encode()).decode(),
             "candidates": [
                 {"interface_id": c.interface_id, "interface": c.interface, "kind": c.kind.value, "address": c.address}
                 for c in self._candidates
@@ -202,7 +209,17 @@ def peer_of(fields: dict[str, Any]) -> Peer:
     )
     offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
     token = base64.b64decode(fields["token"])
-    return Peer(fields["name"], role, SessionId(fields["session"]), token, 1, candidates, offers, may_call=ALL_CALLS)
+    return Peer(
+        fields["name"],
+        role,
+        SessionId(fields["session"]),
+        token,
+        1,
+        candidates,
+        offers,
+        may_call=ALL_CALLS,
+        credential=base64.b64decode(fields["credential"]),
+    )
 
 
 if __name__ == "__main__":

@@ -31,11 +31,13 @@ def measure(context: Context) -> Findings:
     """Measure."""
     ours_runs: list[tuple[float | None, float]] = []
     ethernet_runs: list[tuple[float | None, float]] = []
+    null_runs: list[tuple[float | None, float]] = []
     aioquic_runs: list[tuple[float | None, float]] = []
     small: list[float | None] = []
     with contextlib.ExitStack() as stack:
         start = stack.enter_context
         ours = start(Ours(context.folder, clouds={"cloud_a": None}, service=PATIENT))
+        null = start(Ours(context.folder, clouds={"cloud_a": None}, service=PATIENT, name="null", null_cipher=True))
         host = ethernet_loopback(start(Lab(cables())))
         ethernet = start(Ours(context.folder, robot=host, clouds={"cloud_a": host}, service=PATIENT, name="ethernet"))
         server = start(Remote.start("quic", context.folder, name="quic.server"))
@@ -45,10 +47,11 @@ def measure(context: Context) -> Findings:
         context.say("goodput: warming up")
         _bulk(ours.robot, WARM_UP)
         _bulk(ethernet.robot, WARM_UP)
+        _bulk(null.robot, WARM_UP)
         _bulk(client, WARM_UP)
         for repeat in range(context.repeats):
             context.say(f"goodput: ours, {repeat + 1} of {context.repeats}")
-            for runs, pair in ((ours_runs, ours), (ethernet_runs, ethernet)):
+            for runs, pair in ((ours_runs, ours), (null_runs, null), (ethernet_runs, ethernet)):
                 runs.append(_costed((pair.robot, *pair.clouds.values()), context.scaled(OURS_COUNT, WARM_UP)))
             context.say(f"goodput: aioquic, {repeat + 1} of {context.repeats}")
             aioquic_runs.append(_costed(aioquic, context.scaled(AIOQUIC_COUNT, WARM_UP)))
@@ -63,6 +66,11 @@ def measure(context: Context) -> Findings:
             ratio(one[0], other[0]) for one, other in zip(ours_runs, aioquic_runs, strict=True)
         ),
         "cpu_ms_per_mb": median(run[1] for run in ours_runs),
+        "goodput_null_cipher_mbit_s": median(run[0] for run in null_runs),
+        "sealed_over_null_goodput": median(
+            ratio(one[0], other[0]) for one, other in zip(ours_runs, null_runs, strict=True)
+        ),
+        "null_cipher_cpu_ms_per_mb": median(run[1] for run in null_runs),
         "ethernet_goodput_mbit_s": median(run[0] for run in ethernet_runs),
         "ethernet_goodput_over_aioquic": median(
             ratio(one[0], other[0]) for one, other in zip(ethernet_runs, aioquic_runs, strict=True)
@@ -73,6 +81,7 @@ def measure(context: Context) -> Findings:
     }
     rows: tuple[tuple[str, float | None, float | None], ...] = (
         ("ours", figures["goodput_mbit_s"], figures["cpu_ms_per_mb"]),
+        ("ours, null cipher", figures["goodput_null_cipher_mbit_s"], figures["null_cipher_cpu_ms_per_mb"]),
         ("ours, packets of 1500 bytes", figures["ethernet_goodput_mbit_s"], figures["ethernet_cpu_ms_per_mb"]),
         ("aioquic", figures["aioquic_goodput_mbit_s"], figures["aioquic_cpu_ms_per_mb"]),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from protos.model import (
     ALL_CALLS,
@@ -19,9 +20,19 @@ from protos.model import (
     ServiceOffer,
     SessionId,
 )
+from sidecar.core.aead import TAG_BYTES
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.events import RequestId
-from sidecar.core.frame import Header, encode_header
+from sidecar.core.frame import (
+    HEADER_BYTES,
+    INTRODUCTION_FLAG,
+    NONCE_OFFSET,
+    Frame,
+    Header,
+    decode_frames,
+    decode_header,
+)
+from sidecar.core.introduction import Introduction, encode_introduction, open_introduction
 from sidecar.core.link import Link
 from sidecar.core.link_events import (
     LinkCommand,
@@ -34,17 +45,26 @@ from sidecar.core.link_events import (
 from sidecar.core.messages import Encoded, RequestMessage
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.path_id import PathId
+from sidecar.core.path_keys import DEFAULT_LIMITS, LinkMemory, PathKeys, make_path_keys
 from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4
 from sidecar.core.priority import Priority
 from sidecar.core.rules import ServiceRule
+from tests.sessions import credential_of, seal, session_of, with_credential
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")
 ECHO = ServiceName("/echo")
 TYPE = "t/srv/Echo"
+OUR_NAME, OUR_ID, OUR_INCARNATION = NodeName("robot-1"), InterfaceId(3), 7
+FIRST = InterfaceId(0)
 OUR_SESSION, PEER_SESSION = SessionId(0x0102030405060708), SessionId(0x1112131415161718)
 OUR_TOKEN, PEER_TOKEN = bytes(range(16)), bytes(range(16, 32))
 PEER_ADDRESS = ("192.0.2.1", 4000)
+Addresses = tuple[tuple[InterfaceId, tuple[Address, ...]], ...]
+ADDRESSES: Addresses = ((FIRST, (PEER_ADDRESS,)),)
 
 
 def path(interface: str = WLAN, peer: str = A, remote: int = 0) -> PathId:
@@ -94,7 +114,7 @@ def peer(
 ) -> Peer:
     candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, PEER_ADDRESS)
     token = NodeName(name).encode().ljust(16)[:16]
-    return Peer(
+    subject = Peer(
         NodeName(name),
         Role.CLOUD,
         SessionId(session),
@@ -105,6 +125,7 @@ def peer(
         draining,
         may_call=ALL_CALLS,
     )
+    return with_credential(subject)
 
 
 @dataclass
@@ -117,22 +138,92 @@ class Bench:
     first_number: int = 0
 
     def __post_init__(self) -> None:
-        identity = LinkIdentity(WLAN, InterfaceId(3), OUR_SESSION, OUR_TOKEN, 7)
-        self.link = Link(identity, random.Random(1), self.now, self.first_number)
+        self.own = session_of(OUR_NAME, Role.ROBOT, OUR_SESSION, OUR_INCARNATION)
+        self.session = PEER_SESSION
+        """The peer's, as the link knows it."""
+        self._incarnations = {PEER_SESSION: 1}
+        self._peer_keys: dict[tuple[SessionId, InterfaceId], PathKeys] = {}
+        identity = LinkIdentity.of(self.own.credential, OUR_TOKEN, WLAN, OUR_ID)
+        self.link = Link(identity, random.Random(1), self.now, LinkMemory(self.first_number))
         self.know()
         self.link.execute(SetMtu(BASE_BYTES + HEADERS_V4), self.now)  # no search: tests count datagrams
         self.link.execute(SetReady(ready=True), self.now)
 
     def know(self, *, session: SessionId = PEER_SESSION, incarnation: int = 1, name: NodeName = A) -> None:
-        addresses = ((InterfaceId(0), (PEER_ADDRESS,)),)
-        self.link.execute(SetPeers((LinkPeer(name, session, PEER_TOKEN, incarnation, addresses),)), self.now)
+        self.execute(SetPeers((self.link_peer(session=session, incarnation=incarnation, name=name),)))
 
-    def datagram(self, *frames: bytes, number: int | None = None, session: SessionId = PEER_SESSION) -> bytes:
+    def link_peer(
+        self,
+        *,
+        session: SessionId = PEER_SESSION,
+        incarnation: int = 1,
+        name: NodeName = A,
+        addresses: Addresses = ADDRESSES,
+        token: bytes = PEER_TOKEN,
+    ) -> LinkPeer:
+        """A cloud as the engine would tell the link of it."""
+        if name == A:
+            self.session, self._incarnations[session] = session, incarnation
+        subject = with_credential(Peer(name, Role.CLOUD, session, token, incarnation))
+        return LinkPeer(name, session, token, incarnation, self.own.admit(subject), addresses)
+
+    def peer_keys(self, session: SessionId = PEER_SESSION, interface: InterfaceId = FIRST) -> PathKeys:
+        """The other end's keys of the path to this interface of a session of A."""
+        if (session, interface) not in self._peer_keys:
+            us = Peer(OUR_NAME, Role.ROBOT, OUR_SESSION, OUR_TOKEN, OUR_INCARNATION)
+            theirs = session_of(A, Role.CLOUD, session, self._incarnations.get(session, 1))
+            pair = theirs.admit(with_credential(us))
+            self._peer_keys[session, interface] = make_path_keys(pair, interface, OUR_ID, DEFAULT_LIMITS, self.now)
+        return self._peer_keys[session, interface]
+
+    def datagram(
+        self,
+        *frames: bytes,
+        number: int | None = None,
+        session: SessionId = PEER_SESSION,
+        interface: InterfaceId = FIRST,
+        receiver: InterfaceId = OUR_ID,
+    ) -> bytes:
         """What the peer would send."""
         if number is None:
             self.number += 1
             number = self.number
-        return encode_header(Header(InterfaceId(0), InterfaceId(3), session, number)) + b"".join(frames)
+        header = Header(interface, receiver, session, number)
+        return seal(self.peer_keys(session, interface).sealing, header, b"".join(frames))
+
+    def introduction(
+        self,
+        *,
+        number: int = 0,
+        interface: InterfaceId = FIRST,
+        session: SessionId = PEER_SESSION,
+        incarnation: int = 1,
+        token: bytes = PEER_TOKEN,
+        name: NodeName = A,
+        receiver: NodeName = OUR_NAME,
+    ) -> bytes:
+        """What the peer would send over a path that is down; its probe is 77."""
+        header = Header(interface, OUR_ID, session, number)
+        credential = credential_of(name, Role.CLOUD, session, incarnation).encode()
+        return encode_introduction(header, token, receiver, 77, credential)
+
+    def opened(self, datagram: bytes) -> list[Frame | Introduction]:
+        """What the peer reads in a datagram of the link: frames, or an introduction."""
+        header = decode_header(datagram)
+        if header.flags & INTRODUCTION_FLAG:
+            return [open_introduction(header, memoryview(datagram), OUR_TOKEN, A)]
+        return [*decode_frames(memoryview(self.plain(datagram)))]
+
+    def plain(self, datagram: bytes) -> bytes:
+        """The frames' bytes in a datagram of the link that is no introduction."""
+        opening = self.peer_keys(self.session, decode_header(datagram).receiver_interface).opening
+        clear, plain = datagram[:HEADER_BYTES], bytearray(len(datagram) - HEADER_BYTES - TAG_BYTES)
+        opening.decrypt_into(clear[NONCE_OFFSET:], datagram[HEADER_BYTES:], clear, plain)
+        return bytes(plain)
+
+    def frames(self, datagrams: Iterable[bytes]) -> list[Frame | Introduction]:
+        """As `opened`, of them all."""
+        return [item for datagram in datagrams for item in self.opened(datagram)]
 
     def receive(self, *frames: bytes, number: int | None = None) -> None:
         self.receive_datagram(self.datagram(*frames, number=number))

@@ -52,6 +52,7 @@ from sidecar.core.messages import (
 )
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.priority import Priority
+from tests.sessions import credential_of, session_of
 from tests.unit.sidecar.core.builders import (
     ECHO,
     TYPE,
@@ -73,7 +74,7 @@ class Sidecar:
     """An engine with one interface, whose peer the test plays."""
 
     def __init__(self, role: Role, peer_name: str) -> None:
-        self.engine = Engine(EngineConfig(role, (rule("/*"),)), 0.0)
+        self.engine = Engine(EngineConfig(role, (rule("/*"),)), session_of("me", role, 99), 0.0)
         self.engine.set_interfaces([WLAN], 0.0)
         self.path = path(WLAN, peer_name)
         self.number = 0
@@ -212,7 +213,7 @@ def test_a_cancel_stops_what_has_not_started_and_what_is_being_sent() -> None:
 def test_fragments_of_a_session_that_is_over_are_dropped() -> None:
     sidecar = cloud()
     sidecar.receive(request(), session=2)
-    sidecar.engine.on_link_event(PeerRestarted(ROBOT, SessionId(2), 2), 0.1)
+    sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential_of(ROBOT, Role.CLOUD, 2, 2)), 0.1)
     sidecar.receive(request(), session=1)
     assert sidecar.engine.stats.dropped["fragment_of_old_session"] == 2
     sidecar.take()
@@ -242,7 +243,7 @@ def test_the_same_news_of_a_path_twice_costs_nothing(monkeypatch: pytest.MonkeyP
 
 
 def test_the_robot_offers_what_a_reachable_cloud_offers_and_says_what_it_carries() -> None:
-    engine = Engine(EngineConfig(Role.ROBOT, (rule(ECHO),)), 0.0)
+    engine = Engine(EngineConfig(Role.ROBOT, (rule(ECHO),)), session_of("me", Role.ROBOT, 99), 0.0)
     engine.set_interfaces([WLAN], 0.0)
     engine.apply_peers(PeerSet(Version(1), 1, (peer(A),)), 0.0)
     assert engine.take_events() == []
@@ -298,7 +299,8 @@ def test_a_peer_kept_only_for_its_paths_goes_with_the_last_of_them() -> None:
 def test_a_flood_of_restarts_makes_little_work() -> None:
     sidecar = cloud()
     for incarnation in range(2, 1000):
-        sidecar.engine.on_link_event(PeerRestarted(ROBOT, SessionId(incarnation), incarnation), 0.001 * incarnation)
+        credential = credential_of(ROBOT, Role.CLOUD, incarnation, incarnation)
+        sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential), 0.001 * incarnation)
     assert len([command for command in sidecar.take()[0] if isinstance(command, SetPeers)]) == 1
 
 

@@ -5,10 +5,11 @@ import pytest
 from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
 from sidecar.core import frame, pmtu
-from sidecar.core.frame import AckFrame, Close, Finished, Fragment, Header, Hello, Probe, ProbeReply
+from sidecar.core.aead import TAG_BYTES
+from sidecar.core.frame import AckFrame, Close, Finished, Fragment, Header, Probe, ProbeReply
 
 HEADER = Header(InterfaceId(1), InterfaceId(2), SessionId(0x0102030405060708), 0x1112131415161718)
-CLEAR = "d1 00 01 02 01 02 03 04 05 06 07 08 11 12 13 14 15 16 17 18"
+CLEAR = "d2 01 01 02 01 02 03 04 05 06 07 08 11 12 13 14 15 16 17 18"
 SYMBOL = bytes(range(256))
 
 GOLDENS = {
@@ -26,11 +27,6 @@ GOLDENS = {
     ),
     "finished": (frame.encode_finished(Finished(9)), "06 0000000000000009", Finished(9)),
     "close": (frame.encode_close(), "08", Close()),
-    "hello": (
-        frame.encode_hello(Hello(bytes(range(16)), 2)),
-        "09 000102030405060708090a0b0c0d0e0f 0000000000000002",
-        Hello(bytes(range(16)), 2),
-    ),
 }
 
 
@@ -44,7 +40,7 @@ def test_the_bytes_of_a_datagram_of_each_kind(kind: str) -> None:
 
 
 def test_room_is_left_for_the_tag() -> None:
-    overhead = frame.HEADER_BYTES + len(frame.encode_fragment_head(1, 1, 256, 0)) + frame.TAG_BYTES
+    overhead = frame.HEADER_BYTES + len(frame.encode_fragment_head(1, 1, 256, 0)) + TAG_BYTES
     assert overhead + frame.BASE_SYMBOL_BYTES == pmtu.BASE_BYTES == 1200
     assert overhead + frame.MAX_SYMBOL_BYTES == frame.MAX_DATAGRAM_BYTES == pmtu.MAX_BYTES
 
@@ -88,12 +84,22 @@ def test_a_range_or_gap_too_wide_to_tell_ends_the_ack_at_its_newest_part() -> No
 
 def test_another_version_is_told_from_garbage() -> None:
     datagram = frame.encode_header(HEADER)
-    with pytest.raises(frame.VersionError, match="version 2"):
-        frame.decode_header(b"\xd2" + datagram[1:])
-    for bad in (b"\x00" + datagram[1:], datagram[:-1], b"", datagram[:1] + b"\x01" + datagram[2:]):
+    with pytest.raises(frame.VersionError, match="version 1"):
+        frame.decode_header(b"\xd1" + datagram[1:])
+    for bad in (b"\x00" + datagram[1:], datagram[:-1], b"", datagram[:1] + b"\x09" + datagram[2:]):
         with pytest.raises(DecodeError) as error:
             frame.decode_header(bad)
-        assert not isinstance(error.value, frame.VersionError)
+        assert not isinstance(error.value, frame.VersionError | frame.UnsealedError)
+
+
+def test_a_datagram_in_clear_is_told_from_garbage() -> None:
+    with pytest.raises(frame.UnsealedError):
+        frame.decode_header(frame.encode_header(HEADER._replace(flags=0)))
+
+
+def test_the_nonce_is_half_of_the_session_and_the_packet_number() -> None:
+    clear = frame.encode_header(HEADER)
+    assert clear[frame.NONCE_OFFSET :].hex() == "05060708" + "1112131415161718"
 
 
 BROKEN = {
@@ -102,7 +108,7 @@ BROKEN = {
     "unknown type": "0a",
     "reserved type": "05",
     "truncated probe": "01 0000",
-    "truncated hello": "09 00",
+    "what was HELLO before sealing": "09" + "00" * 24,
     "truncated finished": "06 00",
     "ack of nothing": "03 0000000000000064 00000000 00",
     "ack with too many ranges": "03 0000000000000064 00000000 21" + "0000 0000" * 33,

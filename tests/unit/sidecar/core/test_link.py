@@ -1,15 +1,19 @@
 from __future__ import annotations
 
+import random
+from typing import Any
+
 import pytest
 
-from protos.model import InterfaceId, InterfaceName, NodeName, SessionId
+from protos.model import InterfaceId, InterfaceName, NodeName, Role, SessionId
 from sidecar.core import frame, pmtu
-from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Hello, Probe, ProbeReply, encode_header
+from sidecar.core.frame import AckFrame, Finished, Fragment, Probe, ProbeReply
+from sidecar.core.introduction import Introduction
+from sidecar.core.link import Link
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
     FragmentsReceived,
-    LinkPeer,
     MessageFinished,
     PathChanged,
     PathMeasured,
@@ -29,11 +33,13 @@ from sidecar.core.path_table import MAX_PATHS_OF_A_PEER
 from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
 from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
+from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import (
-    OUR_TOKEN,
+    OUR_INCARNATION,
+    OUR_NAME,
+    OUR_SESSION,
     PEER_ADDRESS,
     PEER_SESSION,
-    PEER_TOKEN,
     WLAN,
     A,
     Bench,
@@ -42,10 +48,7 @@ from tests.unit.sidecar.core.builders import (
 
 PATH = PathId(WLAN, A, InterfaceId(0))
 OTHER_SESSION = SessionId(99)
-
-
-def frames(datagrams: list[bytes]) -> list[frame.Frame]:
-    return [item for datagram in datagrams for item in frame.decode_frames(memoryview(datagram)[frame.HEADER_BYTES :])]
+OUR_INTRODUCTION = Introduction(0, credential_of(OUR_NAME, Role.ROBOT, OUR_SESSION, OUR_INCARNATION))
 
 
 def numbers(datagrams: list[bytes]) -> list[int]:
@@ -54,9 +57,10 @@ def numbers(datagrams: list[bytes]) -> list[int]:
 
 def up() -> Bench:
     bench = Bench()
-    probes = [item for item in frames(bench.sent()) if isinstance(item, Probe)]
+    (introduction,) = bench.frames(bench.sent())
+    assert isinstance(introduction, Introduction)
     bench.now += 0.01
-    bench.receive(frame.encode_probe_reply(ProbeReply(probes[0].id)))
+    bench.receive(frame.encode_probe_reply(ProbeReply(introduction.probe_id)))
     assert PathChanged(PATH, PathState.UP, "answers") in bench.events()
     bench.sent()
     return bench
@@ -78,7 +82,7 @@ def test_a_new_path_introduces_itself_and_probes() -> None:
     (datagram,) = bench.sent()
     header = frame.decode_header(datagram)
     assert header[:3] == (3, 0, 0x0102030405060708)
-    assert frames([datagram]) == [Hello(OUR_TOKEN, 7), Probe(0)]
+    assert bench.frames([datagram]) == [OUR_INTRODUCTION]
 
 
 def test_no_probe_leaves_before_the_interface_is_ready() -> None:
@@ -86,7 +90,7 @@ def test_no_probe_leaves_before_the_interface_is_ready() -> None:
     bench.execute(SetReady(ready=False))
     assert bench.wait(3.0) == []
     bench.execute(SetReady(ready=True))
-    assert frames(bench.sent()) == [Hello(OUR_TOKEN, 7), Probe(0)]
+    assert bench.frames(bench.sent()) == [OUR_INTRODUCTION]
 
 
 def test_probes_to_a_silent_peer_back_off() -> None:
@@ -116,8 +120,9 @@ def test_silence_makes_it_unstable_then_down_and_an_answer_up_again() -> None:
     assert 4 <= len(probes) <= 8, "one every 50 ms"
     bench.wait(max(DOWN_FACTOR * UNSTABLE_FLOOR_S, DOWN_FLOOR_S))
     assert state_changes(bench) == [PathState.DOWN]
-    probe = next(item for item in frames(bench.wait(2.0)[-1:]) if isinstance(item, Probe))
-    bench.receive(frame.encode_probe_reply(ProbeReply(probe.id)))
+    (introduction,) = bench.frames(bench.wait(2.0)[-1:])
+    assert isinstance(introduction, Introduction)
+    bench.receive(frame.encode_probe_reply(ProbeReply(introduction.probe_id)))
     assert state_changes(bench) == [PathState.UP]
 
 
@@ -125,7 +130,7 @@ def test_a_living_path_stays_up_with_two_probes_a_second() -> None:
     bench = up()
     sent = 0
     for _ in range(100):
-        for item in frames(bench.wait(0.05)):
+        for item in bench.frames(bench.wait(0.05)):
             assert isinstance(item, Probe)
             sent += 1
             bench.now += 0.001
@@ -173,7 +178,7 @@ def test_a_lost_carrier_takes_every_path_down_at_once_and_hands_back_what_they_c
     bench.now += 10
     assert bench.sent() == [], "nothing is probed without a carrier"
     bench.link.execute(SetCarrier(True), bench.now)
-    assert [type(item) for item in frames(bench.sent())] == [Hello, Probe]
+    assert [type(item) for item in bench.frames(bench.sent())] == [Introduction]
 
 
 def test_what_was_under_way_when_the_carrier_went_does_not_bring_the_path_up() -> None:
@@ -197,7 +202,7 @@ def test_a_rebinding_makes_a_path_unstable_until_it_answers_and_resends_what_was
     assert PathChanged(PATH, PathState.UNSTABLE, "rebinding") in events
     lost = [event for event in events if isinstance(event, FragmentsLost)]
     assert lost == [FragmentsLost(PATH, sent, tuple(range(sent.count)), timed_out=True)]
-    (probe,) = [item for item in frames(bench.sent()) if isinstance(item, Probe)]
+    (probe,) = [item for item in bench.frames(bench.sent()) if isinstance(item, Probe)]
     bench.now += 0.03
     bench.receive(frame.encode_probe_reply(ProbeReply(probe.id)))
     assert state_changes(bench) == [PathState.UP]
@@ -207,66 +212,129 @@ def test_a_rebinding_makes_a_path_unstable_until_it_answers_and_resends_what_was
 
 NEW_INTERFACE = InterfaceId(8)
 NEW_PATH = PathId(WLAN, A, NEW_INTERFACE)
+ELSEWHERE = ("203.0.113.9", 666)
 
 
-def introduction(bench: Bench, number: int, token: bytes = PEER_TOKEN, sender: int = NEW_INTERFACE) -> None:
-    """The peer's HELLO and probe from an interface that no view has named."""
-    header = Header(InterfaceId(sender), InterfaceId(3), PEER_SESSION, number)
-    hello = frame.encode_hello(Hello(token, 1)) + frame.encode_probe(Probe(77))
-    bench.link.receive_batch(memoryview(encode_header(header) + hello), 1500, PEER_ADDRESS, bench.now)
+def introduce(bench: Bench, number: int, **changes: Any) -> None:
+    """The peer introduces itself from an interface that no view has named."""
+    bench.receive_datagram(bench.introduction(**{"number": number, "interface": NEW_INTERFACE, **changes}))
 
 
-def test_a_peers_new_interface_is_known_by_its_hello_before_any_view_names_it() -> None:
+def test_a_peers_new_interface_is_known_by_its_introduction_before_any_view_names_it() -> None:
     bench = up()
-    introduction(bench, 0)
-    answers = frames(bench.sent())
-    assert ProbeReply(77) in answers
-    (probe,) = [item for item in answers if isinstance(item, Probe)]
-    header = Header(NEW_INTERFACE, InterfaceId(3), PEER_SESSION, 1)
-    reply = encode_header(header) + frame.encode_probe_reply(ProbeReply(probe.id))
-    bench.link.receive_batch(memoryview(reply), 1500, PEER_ADDRESS, bench.now + 0.01)
+    introduce(bench, 0)
+    reply, probe = bench.frames(bench.sent())
+    assert reply == ProbeReply(77)
+    assert isinstance(probe, Probe)
+    answer = bench.datagram(frame.encode_probe_reply(ProbeReply(probe.id)), number=1, interface=NEW_INTERFACE)
+    bench.now += 0.01
+    bench.receive_datagram(answer)
     assert PathChanged(NEW_PATH, PathState.UP, "answers") in bench.events()
     bench.know()  # a view that still does not name it
     assert state_changes(bench) == []
     assert bench.link.in_use(PEER_ADDRESS)
 
 
-def test_a_wrong_token_introduces_nobody_and_introductions_are_capped() -> None:
+def test_an_introduction_is_answered_where_it_came_from_in_fewer_bytes_and_moves_nothing() -> None:
     bench = up()
-    introduction(bench, 0, token=bytes(16))
-    assert bench.sent() == []
-    for interface in range(10, 10 + MAX_PATHS_OF_A_PEER):
-        introduction(bench, 0, sender=interface)
-    assert bench.link.stats.dropped == {"unknown_path": 2, "paths_full": 1}
+    question = bench.introduction(number=50)
+    bench.receive_datagram(question, ELSEWHERE)
+    (answer,) = bench.link.batches_to_send(bench.now)
+    assert answer.address == ELSEWHERE
+    assert len(answer.data) < len(question)
+    assert bench.events() == []
+    assert bench.link.in_use(PEER_ADDRESS)
+    assert not bench.link.in_use(ELSEWHERE)
 
 
-def test_an_introduced_path_that_is_down_is_forgotten_with_the_next_view() -> None:
+def test_an_introduction_that_comes_again_is_not_answered_once_something_newer_was_authentic() -> None:
     bench = up()
-    introduction(bench, 0)
-    bench.know()
+    again = bench.introduction(number=5)
+    bench.receive(PROBE, number=6)
     bench.sent()
-    introduction(bench, 1)
+    bench.receive_datagram(again, ELSEWHERE)
+    assert bench.sent() == []
+    assert bench.link.stats.dropped == {"duplicate": 1}
+
+
+def test_introductions_do_not_keep_sealed_datagrams_out() -> None:
+    """Whoever knows the token could send one with the largest packet number."""
+    bench = up()
+    bench.receive_datagram(bench.introduction(number=2**64 - 1))
+    bench.sent()
+    bench.receive(PROBE)
+    assert bench.frames(bench.sent()) == [ProbeReply(1)]
     assert bench.link.stats.dropped == {}
-    assert numbers(bench.sent())[0] > 0, "packet numbers go on"
+
+
+def test_a_wrong_token_introduces_nobody_and_nothing_changed_on_the_way_does() -> None:
+    bench = up()
+    introduce(bench, 0, token=bytes(16))
+    introduce(bench, 0, receiver=NodeName("robot-2"))
+    changed = bytearray(bench.introduction(number=0, interface=NEW_INTERFACE))
+    changed[60] ^= 1
+    bench.receive_datagram(bytes(changed))
+    introduce(bench, 0, name=NodeName("cloud-b"))
+    assert bench.sent() == []
+    assert bench.link.stats.dropped == {"unknown_introducer": 1, "unauthentic": 2, "malformed": 1}
+
+
+def test_introduced_paths_are_capped_and_unproven_ones_make_room() -> None:
+    bench = up()
+    for interface in range(10, 10 + MAX_PATHS_OF_A_PEER):
+        introduce(bench, 0, interface=InterfaceId(interface))
+    assert len(bench.link._paths) == MAX_PATHS_OF_A_PEER
+    assert (A, InterfaceId(0)) in bench.link._paths, "the one that the view names and that lives"
+    for path in bench.link._paths.values():
+        path.remote = path.remote or ELSEWHERE
+    introduce(bench, 0)
+    assert bench.link.stats.dropped == {"paths_full": 1}
+    bench.wait(1.0)
+
+
+def test_an_introduced_path_that_is_down_is_forgotten_with_the_next_view_but_its_numbers_are_not() -> None:
+    bench = up()
+    introduce(bench, 0)
+    bench.sent()
+    sealed = bench.datagram(PROBE, number=1, interface=NEW_INTERFACE)
+    bench.receive_datagram(sealed)
+    first = numbers(bench.sent())
+    bench.know()
+    introduce(bench, 2)
+    bench.receive_datagram(sealed)
+    assert bench.link.stats.dropped == {"duplicate": 1}
+    assert numbers(bench.sent())[0] > first[-1], "packet numbers go on"
 
 
 def test_a_path_that_lives_outlives_a_view_that_forgot_it() -> None:
     """The control plane may have heard of the interface's end and not yet of its return."""
     bench = up()
-    bench.link.execute(SetPeers((LinkPeer(A, PEER_SESSION, PEER_TOKEN, 1, ()),)), bench.now)
+    bench.link.execute(SetPeers((bench.link_peer(addresses=()),)), bench.now)
     assert state_changes(bench) == []
     bench.wait(30.0)
     assert state_changes(bench)[-1] is PathState.DOWN
-    bench.link.execute(SetPeers((LinkPeer(A, PEER_SESSION, PEER_TOKEN, 1, ()),)), bench.now)
+    bench.link.execute(SetPeers((bench.link_peer(addresses=()),)), bench.now)
     assert bench.wait(10.0) == [], "nothing is left of it"
 
 
 def test_a_link_opened_anew_goes_on_with_the_packet_numbers_of_the_one_before() -> None:
     bench = up()
-    first = bench.link.next_number
-    assert first > 0
-    again = Bench(first_number=first)
-    assert numbers(again.sent()) == [first]
+    bench.receive(PROBE, number=9)
+    first = numbers(bench.sent())[-1] + 1
+    old = bench.link
+    bench.link = Link(old.identity, random.Random(2), bench.now, old.remember())
+    bench.know()
+    bench.execute(SetReady(ready=True))
+    assert numbers(bench.sent())[0] == first
+    bench.receive(PROBE, number=9)
+    assert bench.link.stats.dropped == {"duplicate": 1}, "what the one before received is not received again"
+
+
+def test_a_link_whose_driver_hangs_keeps_packet_numbers_for_what_it_may_yet_seal() -> None:
+    bench = up()
+    bench.execute(Send(PATH, message(size=30_000)))
+    memory = bench.link.remember(hangs=True)
+    assert max(numbers(bench.sent())) < memory.next_number
 
 
 def test_the_peers_newest_address_is_followed() -> None:
@@ -285,10 +353,10 @@ def test_a_message_goes_out_in_numbered_datagrams_and_is_acknowledged() -> None:
     bench, outbound = up(), message(size=3000)
     bench.execute(Send(PATH, outbound))
     sent = bench.sent()
-    assert [item.symbol_index for item in frames(sent) if isinstance(item, Fragment)] == [0, 1, 2]
+    assert [item.symbol_index for item in bench.frames(sent) if isinstance(item, Fragment)] == [0, 1, 2]
     first = numbers(sent)[0]
     assert numbers(sent) == [first, first + 1, first + 2]
-    assert all(len(datagram) <= pmtu.BASE_BYTES - frame.TAG_BYTES for datagram in sent)
+    assert all(len(datagram) <= pmtu.BASE_BYTES for datagram in sent)
     bench.now += 0.01
     bench.receive(frame.encode_ack([(first, first + 2)], 0.0), frame.encode_finished(Finished(1)))
     assert bytes(outbound.acked) == b"\1\1\1"
@@ -322,7 +390,7 @@ def test_a_received_fragment_is_handed_up_and_acknowledged() -> None:
     assert isinstance(event, FragmentsReceived)
     assert (event.path, event.session, [item.message for item in event.fragments]) == (PATH, PEER_SESSION, [1])
     assert bench.sent() == [], "the acknowledgement waits for company"
-    (ack,) = frames(bench.wait(MAX_ACK_DELAY_S))
+    (ack,) = bench.frames(bench.wait(MAX_ACK_DELAY_S))
     assert isinstance(ack, AckFrame)
     assert ack.ranges[0] == (bench.number - 1, bench.number)
 
@@ -332,8 +400,8 @@ def test_an_owed_finished_takes_the_acknowledgement_along_and_is_repeated_until_
     bench.receive(fragment())
     bench.execute(SendFinished(PATH, 1))
     (datagram,) = bench.sent()
-    assert [type(item) for item in frames([datagram])] == [Finished, AckFrame]
-    again = [item for item in frames(bench.wait(0.2)) if isinstance(item, Finished)]
+    assert [type(item) for item in bench.frames([datagram])] == [Finished, AckFrame]
+    again = [item for item in bench.frames(bench.wait(0.2)) if isinstance(item, Finished)]
     assert again == [Finished(1)] * len(again)
     assert again
     bench.receive(frame.encode_ack([(0, numbers([datagram])[0] + 20)], 0.0))
@@ -343,10 +411,10 @@ def test_many_finished_travel_together_and_are_all_repeated_when_lost() -> None:
     bench = up()
     for number in range(100):
         bench.execute(SendFinished(PATH, number))
-    told = [[item.message for item in frames([one]) if isinstance(item, Finished)] for one in bench.sent()]
+    told = [[item.message for item in bench.frames([one]) if isinstance(item, Finished)] for one in bench.sent()]
     assert [number for one in told for number in one] == list(range(100))
     assert len(told) == 2
-    again = {item.message for item in frames(bench.wait(0.4)) if isinstance(item, Finished)}
+    again = {item.message for item in bench.frames(bench.wait(0.4)) if isinstance(item, Finished)}
     assert again == set(range(100))
 
 
@@ -359,7 +427,7 @@ def test_a_finished_whose_path_dies_is_handed_back() -> None:
     bench.execute(SendFinished(PATH, 3))
     lost = [event for event in bench.events() if isinstance(event, FinishedLost)]
     assert sorted(number for event in lost for number in event.numbers) == [1, 2, 3]
-    assert not [item for item in frames(bench.sent()) if isinstance(item, Finished)]
+    assert not [item for item in bench.frames(bench.sent()) if isinstance(item, Finished)]
 
 
 def test_expired_messages_are_not_sent_and_counted() -> None:
@@ -372,26 +440,45 @@ def test_expired_messages_are_not_sent_and_counted() -> None:
 # -- bad input: dropped, counted, and nothing is sent back ------------------------------------------------------------
 
 
-def valid_header(session: SessionId = PEER_SESSION, receiver: int = 3, sender: int = 0) -> bytes:
-    return frame.encode_header(Header(InterfaceId(sender), InterfaceId(receiver), session, 10))
-
-
 PROBE = frame.encode_probe(Probe(1))
-STRANGE_HELLO = frame.encode_hello(Hello(bytes(16), 2**63)) + PROBE
-OLD_HELLO = frame.encode_hello(Hello(PEER_TOKEN, 1)) + PROBE
+
+
+def good(**changes: Any) -> bytes:
+    return Bench().datagram(PROBE, **{"number": 10, **changes})
+
+
+def flipped(datagram: bytes, position: int) -> bytes:
+    changed = bytearray(datagram)
+    changed[position] ^= 0x10
+    return bytes(changed)
+
+
 BAD = {
     "garbage": (b"\xff" * 100, "malformed"),
     "empty": (b"", "malformed"),
-    "truncated header": (valid_header()[:-1], "malformed"),
-    "another version": (b"\xd2" + valid_header()[1:] + PROBE, "version"),
-    "sealed": (b"\xd1\x01" + valid_header()[2:] + PROBE, "malformed"),
-    "no frames": (valid_header(), "malformed"),
-    "good frame then garbage": (valid_header() + PROBE + b"\xff", "malformed"),
-    "wrong interface": (valid_header(receiver=4) + PROBE, "wrong_interface"),
-    "unknown interface of the peer": (valid_header(sender=8) + PROBE, "unknown_path"),
-    "unknown session": (valid_header(OTHER_SESSION) + PROBE, "unknown_session"),
-    "a stranger's hello": (valid_header(OTHER_SESSION) + STRANGE_HELLO, "unknown_session"),
-    "a peer's hello from before its restart": (valid_header(OTHER_SESSION) + OLD_HELLO, "unknown_session"),
+    "truncated header": (good()[:19], "malformed"),
+    "no room for a frame": (good()[:36], "malformed"),
+    "another version": (b"\xd1" + good()[1:], "version"),
+    "unsealed": (b"\xd2\x00" + good()[2:], "unsealed"),
+    "unknown flags": (b"\xd2\x09" + good()[2:], "malformed"),
+    "a frame in clear": (b"\xd2\x01" + good()[2:20] + PROBE.ljust(40, b"\0"), "unauthentic"),
+    "another phase of the keys": (b"\xd2\x03" + good()[2:], "unauthentic"),
+    "a changed packet number": (flipped(good(), 19), "unauthentic"),
+    "a changed frame": (flipped(good(), 22), "unauthentic"),
+    "a changed tag": (flipped(good(), -1), "unauthentic"),
+    "cut short": (good()[:-1], "unauthentic"),
+    "lengthened": (good() + b"\0", "unauthentic"),
+    "good frame then garbage": (Bench().datagram(PROBE, b"\xff", number=10), "malformed"),
+    "wrong interface": (good(receiver=InterfaceId(4)), "wrong_interface"),
+    "unknown interface of the peer": (good(interface=InterfaceId(8)), "unknown_path"),
+    "unknown session": (good(session=OTHER_SESSION), "unknown_session"),
+    "a stranger's introduction": (Bench().introduction(token=bytes(16), session=OTHER_SESSION), "unknown_introducer"),
+    "an introduction cut short": (Bench().introduction()[:60], "unauthentic"),
+    "an introduction of nearly nothing": (Bench().introduction()[:37], "unauthentic"),
+    "a peer's introduction from before its restart": (
+        Bench().introduction(session=OTHER_SESSION, incarnation=1),
+        "old_introduction",
+    ),
 }
 
 
@@ -399,12 +486,12 @@ BAD = {
 def test_bad_datagrams_are_counted_and_provoke_nothing(kind: str) -> None:
     datagram, reason = BAD[kind]
     bench = up()
-    bench.receive_datagram(datagram, ("203.0.113.9", 666))
+    bench.receive_datagram(datagram, ELSEWHERE)
     assert bench.link.stats.dropped == {reason: 1}
     assert bench.events() == []
     assert bench.sent() == []
     bench.receive(PROBE)
-    assert frames(bench.sent()) == [ProbeReply(1)], "the others are still served"
+    assert bench.frames(bench.sent()) == [ProbeReply(1)], "the others are still served"
 
 
 def test_a_duplicate_is_dropped_and_not_answered_again() -> None:
@@ -412,7 +499,7 @@ def test_a_duplicate_is_dropped_and_not_answered_again() -> None:
     for _ in range(3):
         bench.receive(PROBE, number=10)
     assert bench.link.stats.dropped["duplicate"] == 2
-    assert frames(bench.sent()) == [ProbeReply(1)]
+    assert bench.frames(bench.sent()) == [ProbeReply(1)]
 
 
 def test_an_unasked_probe_reply_brings_nothing_up() -> None:
@@ -445,13 +532,13 @@ def test_a_flood_of_probes_is_answered_in_fewer_bytes_than_it_has() -> None:
 def test_a_flood_to_a_path_that_is_down_provokes_few_probes() -> None:
     bench = Bench()
     bench.wait(10.0)
-    hellos = 0
+    introductions = 0
     start = bench.now
     for number in range(1000):
         bench.now += 0.0001
         bench.receive(PROBE, number=number)
-        hellos += sum(isinstance(item, Hello) for item in frames(bench.sent()))
-    assert 1 <= hellos <= (bench.now - start) / FIRST_PROBE_S + 1
+        introductions += sum(isinstance(item, Introduction) for item in bench.frames(bench.sent()))
+    assert 1 <= introductions <= (bench.now - start) / FIRST_PROBE_S + 1
 
 
 def test_owed_frames_are_capped() -> None:
@@ -459,7 +546,7 @@ def test_owed_frames_are_capped() -> None:
     for number in range(10, 60):
         bench.receive(PROBE * 60, number=number)
     assert bench.link.stats.dropped["pending_frames_full"] == 50 * 60 - 256
-    assert len(frames(bench.sent())) == 256
+    assert len(bench.frames(bench.sent())) == 256
 
 
 # -- peers ------------------------------------------------------------------------------------------------------------
@@ -467,9 +554,8 @@ def test_owed_frames_are_capped() -> None:
 
 def test_a_known_peers_newer_start_is_reported() -> None:
     bench = up()
-    hello = frame.encode_hello(Hello(PEER_TOKEN, 2)) + PROBE
-    bench.receive_datagram(bench.datagram(hello, session=OTHER_SESSION))
-    assert bench.events() == [PeerRestarted(A, OTHER_SESSION, 2)]
+    bench.receive_datagram(bench.introduction(session=OTHER_SESSION, incarnation=2))
+    assert bench.events() == [PeerRestarted(A, credential_of(A, Role.CLOUD, OTHER_SESSION, 2))]
     assert bench.sent() == []
 
 
@@ -483,16 +569,16 @@ def test_a_restarted_peer_starts_afresh_and_our_numbers_go_on() -> None:
     assert FragmentsLost(PATH, outbound, (0, 1, 2)) in events
     assert numbers(bench.sent())[0] > before[-1]
     bench.receive_datagram(bench.datagram(PROBE, number=0, session=OTHER_SESSION))
-    assert ProbeReply(1) in frames(bench.sent())
+    assert ProbeReply(1) in bench.frames(bench.sent())
 
 
 def test_a_peer_that_stays_keeps_its_path_when_others_come() -> None:
     bench = up()
-    addresses = ((InterfaceId(0), (PEER_ADDRESS,)),)
-    other = LinkPeer(NodeName("cloud-b"), OTHER_SESSION, bytes(16), 1, addresses)
-    bench.execute(SetPeers((LinkPeer(A, PEER_SESSION, PEER_TOKEN, 1, addresses), other)))
+    other = bench.link_peer(name=NodeName("cloud-b"), session=OTHER_SESSION, token=bytes(16))
+    bench.execute(SetPeers((bench.link_peer(), other)))
     assert state_changes(bench) == []
-    assert frames(bench.sent()) == [Hello(OUR_TOKEN, 7), Probe(0)], "to the newcomer"
+    (datagram,) = bench.sent()
+    assert frame.decode_header(datagram).flags & frame.INTRODUCTION_FLAG, "to the newcomer"
 
 
 def test_a_peer_that_left_is_forgotten_with_its_timers() -> None:
@@ -516,7 +602,7 @@ def test_goodbye_takes_the_path_down_once_and_a_flood_of_it_is_one() -> None:
 def test_after_our_goodbye_nothing_makes_us_look_alive() -> None:
     bench = up()
     bench.execute(SendClose())
-    assert frames(bench.sent()) == [frame.Close()]
+    assert bench.frames(bench.sent()) == [frame.Close()]
     bench.receive(PROBE)
     assert bench.sent() == []
     assert bench.wait(5.0) == []

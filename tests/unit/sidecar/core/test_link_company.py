@@ -7,14 +7,14 @@ from sidecar.core.frame import BASE_SYMBOL_BYTES, AckFrame, Finished, Fragment
 from sidecar.core.link import MAX_FINISHED_DELAY_S
 from sidecar.core.link_events import FragmentsLost, Send, SendFinished
 from tests.unit.sidecar.core.builders import message
-from tests.unit.sidecar.core.test_link import PATH, fragment, frames, numbers, up
+from tests.unit.sidecar.core.test_link import PATH, fragment, numbers, up
 
 
 def test_a_finished_that_may_wait_waits_for_a_moment_only() -> None:
     bench = up()
     bench.execute(SendFinished(PATH, 1, at_once=False))
     assert bench.sent() == []
-    assert [type(item) for item in frames(bench.wait(MAX_FINISHED_DELAY_S))] == [Finished]
+    assert [type(item) for item in bench.frames(bench.wait(MAX_FINISHED_DELAY_S))] == [Finished]
 
 
 def test_what_is_owed_travels_with_a_small_answer_and_both_are_repeated_when_lost() -> None:
@@ -25,8 +25,8 @@ def test_what_is_owed_travels_with_a_small_answer_and_both_are_repeated_when_los
     bench.execute(Send(PATH, answer))
     bench.events()
     (datagram,) = bench.sent()
-    assert [type(item) for item in frames([datagram])] == [Finished, AckFrame, Fragment]
-    assert [Finished(1)] == [item for item in frames(bench.wait(0.2)) if isinstance(item, Finished)][:1]
+    assert [type(item) for item in bench.frames([datagram])] == [Finished, AckFrame, Fragment]
+    assert [Finished(1)] == [item for item in bench.frames(bench.wait(0.2)) if isinstance(item, Finished)][:1]
     lost = [event for event in bench.events() if isinstance(event, FragmentsLost)]
     assert (lost[0].message, lost[0].indices) == (answer, (0,))
 
@@ -39,7 +39,7 @@ def test_one_acknowledgement_settles_an_answer_and_the_finished_beside_it() -> N
     (number,) = numbers(bench.sent())
     bench.receive(frame.encode_ack([(number, number)], 0.0))
     assert answer.acked[0]
-    assert not [item for item in frames(bench.wait(0.3)) if isinstance(item, Finished | Fragment)]
+    assert not [item for item in bench.frames(bench.wait(0.3)) if isinstance(item, Finished | Fragment)]
 
 
 def test_what_is_owed_leaves_before_a_datagram_that_has_no_room_for_it() -> None:
@@ -48,8 +48,8 @@ def test_what_is_owed_leaves_before_a_datagram_that_has_no_room_for_it() -> None
     bench.execute(SendFinished(PATH, 1, at_once=False))
     bench.execute(Send(PATH, message(7, BASE_SYMBOL_BYTES)))
     first, second = bench.sent()
-    assert [type(item) for item in frames([first])] == [Finished, AckFrame]
-    assert [type(item) for item in frames([second])] == [Fragment]
+    assert [type(item) for item in bench.frames([first])] == [Finished, AckFrame]
+    assert [type(item) for item in bench.frames([second])] == [Fragment]
 
 
 def test_no_datagram_has_more_frames_than_the_peer_reads() -> None:
@@ -57,4 +57,4 @@ def test_no_datagram_has_more_frames_than_the_peer_reads() -> None:
     for number in range(100):
         bench.execute(SendFinished(PATH, number, at_once=False))
     bench.execute(Send(PATH, message(7, 10)))
-    assert [len(frames([datagram])) for datagram in bench.sent()] == [64, 36, 1]
+    assert [len(bench.frames([datagram])) for datagram in bench.sent()] == [64, 36, 1]

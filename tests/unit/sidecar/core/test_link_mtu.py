@@ -13,11 +13,11 @@ from tests.unit.sidecar.core.test_link import up
 PATH = path()
 
 
-def size_probes(datagrams: list[bytes]) -> list[tuple[int, int]]:
+def size_probes(bench: Bench, datagrams: list[bytes]) -> list[tuple[int, int]]:
     """(length, id) of each padded probe."""
     found = []
     for datagram in datagrams:
-        frames = frame.decode_frames(memoryview(datagram)[frame.HEADER_BYTES :])
+        frames = bench.opened(datagram)
         found += [(len(datagram), item.id) for item in frames if isinstance(item, Probe) and len(datagram) > BASE_BYTES]
     return found
 
@@ -25,7 +25,7 @@ def size_probes(datagrams: list[bytes]) -> list[tuple[int, int]]:
 def search(bench: Bench, mtu: int = 1500) -> list[int]:
     """The interface takes `mtu`; answer every probe of the size. Returns the sizes told to the engine."""
     bench.execute(SetMtu(mtu))
-    while probes := size_probes(bench.sent()):
+    while probes := size_probes(bench, bench.sent()):
         for _, number in probes:
             bench.receive(frame.encode_probe_reply(ProbeReply(number)))
     return sizes(bench)
@@ -47,13 +47,13 @@ def test_padded_probes_go_up_to_what_the_interface_takes() -> None:
 def test_only_a_path_that_is_up_is_searched() -> None:
     bench = Bench()
     bench.execute(SetMtu(1500))
-    assert size_probes(bench.sent() + bench.wait(3.0)) == []
+    assert size_probes(bench, bench.sent() + bench.wait(3.0)) == []
 
 
 def test_a_lost_probe_of_the_size_is_no_loss() -> None:
     bench = up()
     bench.execute(SetMtu(1500))
-    lost = size_probes(bench.sent())
+    lost = size_probes(bench, bench.sent())
     assert len(lost) == 1
     bench.now += 1.5
     bench.link.handle_timer(bench.now)
@@ -91,4 +91,4 @@ def test_another_port_is_the_same_route_and_another_address_is_not() -> None:
     assert sizes(bench) == []
     bench.receive_datagram(bench.datagram(frame.encode_probe(Probe(2))), ("192.0.2.77", 9))
     assert sizes(bench) == [BASE_BYTES]
-    assert [length for length, _ in size_probes(bench.sent())] == [1252]
+    assert [length for length, _ in size_probes(bench, bench.sent())] == [1252]

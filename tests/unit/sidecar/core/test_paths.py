@@ -4,8 +4,11 @@ import random
 
 import pytest
 
-from protos.model import SessionId
+from protos.credential import Aead
+from protos.model import InterfaceId, SessionId
+from sidecar.core.key_schedule import PairKeys
 from sidecar.core.path_id import PathState
+from sidecar.core.path_keys import DEFAULT_LIMITS, make_path_keys
 from sidecar.core.paths import (
     DOWN_FACTOR,
     DOWN_FLOOR_S,
@@ -24,7 +27,9 @@ HERE, THERE, ELSEWHERE = ("192.0.2.1", 1), ("192.0.2.2", 2), ("192.0.2.3", 3)
 
 
 def new() -> Path:
-    return Path(path(), SessionId(1), (HERE, THERE), 0, 100.0)
+    pair = PairKeys(bytes(32), Aead.AES_256_GCM, first=True)
+    keys = make_path_keys(pair, InterfaceId(0), InterfaceId(0), DEFAULT_LIMITS, 100.0)
+    return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0)
 
 
 def up(now: float = 100.0, rtt_s: float = 0.01) -> Path:

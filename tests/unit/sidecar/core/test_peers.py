@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 
 from protos.model import (
     NO_POLICY,
@@ -15,14 +16,17 @@ from protos.model import (
     PeerSet,
     RemovalReason,
     RemovedPeer,
+    Role,
     ServiceName,
     SessionId,
     Version,
 )
 from sidecar.core.link_events import PeerRestarted
 from sidecar.core.peers import MAX_PEERS, RESTART_GAP_S, Peers
+from tests.sessions import credential_of, session_of, with_credential
 from tests.unit.sidecar.core.builders import ECHO, A, B, peer
 
+OWN = session_of("robot-1", Role.ROBOT, 99)
 HELD = peer(A, session=1), peer(B, session=2)
 
 
@@ -31,7 +35,7 @@ def view(*listed: Peer, removed: tuple[RemovedPeer, ...] = (), policy: int = POL
 
 
 def known(*listed: Peer) -> Peers:
-    peers = Peers()
+    peers = Peers(OWN, Counter())
     assert peers.apply(view(*listed), nobody) is None
     return peers
 
@@ -88,7 +92,7 @@ def test_one_that_vanished_goes_when_the_policy_changes() -> None:
         (NO_POLICY, 7, False),
         (POLICY_PENDING, 7, False),
     ):
-        peers = Peers()
+        peers = Peers(OWN, Counter())
         peers.apply(view(*HELD, policy=before), nobody)
         peers.apply(view(HELD[1], policy=after), everybody)
         assert (A in peers) is kept, (before, after)
@@ -97,7 +101,7 @@ def test_one_that_vanished_goes_when_the_policy_changes() -> None:
 
 def test_a_policy_that_was_away_for_a_while_is_a_change() -> None:
     """Without a policy a peer was allowed everything, which must not outlive the policy's return."""
-    peers = Peers()
+    peers = Peers(OWN, Counter())
     for policy in (7, NO_POLICY):
         peers.apply(view(HELD[0], policy=policy), everybody)
     peers.apply(view(policy=POLICY_PENDING), everybody)
@@ -115,7 +119,7 @@ def test_only_a_known_robot_may_call_and_only_what_it_was_permitted() -> None:
 
 
 def restart(name: NodeName = A, session: int = 9, incarnation: int = 2) -> PeerRestarted:
-    return PeerRestarted(name, SessionId(session), incarnation)
+    return PeerRestarted(name, credential_of(name, Role.CLOUD, session, incarnation))
 
 
 def test_a_restart_is_believed_when_it_is_newer() -> None:
@@ -173,5 +177,5 @@ def test_links_get_each_address_of_an_interface_once() -> None:
         A, HELD[0].role, SessionId(1), bytes(16), 1,
         (candidate(1, "b"), candidate(0, "a"), candidate(1, "c"), candidate(1, "b", reflexive)),
     )  # fmt: skip
-    (link_peer,) = known(subject).for_links()
+    (link_peer,) = known(with_credential(subject)).for_links()
     assert link_peer.addresses == ((0, (("a", 1),)), (1, (("b", 1), ("c", 1))))

@@ -15,6 +15,7 @@ from sidecar.core.outbound import OutboundMessage
 from sidecar.core.partial import Partial
 from sidecar.core.priority import Priority
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import ECHO, TYPE, path, peer, request_id, rule
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Application:
 def test_messages_are_decoded_while_nothing_is_locked(monkeypatch: pytest.MonkeyPatch) -> None:
     application = Application()
     hooks = DataPlaneHooks(application, lambda _interface, _event: None, lambda: None)
-    plane = ThreadedDataPlane(EngineConfig(Role.CLOUD, (rule(),)), SessionId(9), hooks)
+    plane = ThreadedDataPlane(EngineConfig(Role.CLOUD, (rule(),)), session_of("me", Role.CLOUD, 9), hooks)
     plane.set_offers((ServiceOffer(ECHO, TYPE),))
     assert plane.apply_peers(PeerSet(Version(1), 1, (peer("robot"),))) is None
     payload = random.Random(1).randbytes(5000)

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import InterfaceName, Role, SessionId
+from protos.model import InterfaceName, Role
 from sidecar.config import ServiceConfig, SidecarConfig, StunConfig
 from sidecar.core.scan_schedule import RETRY_S
 from sidecar.net import interface_manager as module
-from sidecar.net.interface_manager import Identity, InterfaceManager
+from sidecar.net.interface_manager import InterfaceManager
 from sidecar.net.interfaces import Interface
 from sidecar.net.netlink_watch import Changes
+from tests.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -43,7 +44,8 @@ class Host:
             stun=StunConfig(enabled=False),
         )
         data_plane: Any = self
-        self.manager = InterfaceManager(config, Identity(SessionId(1), bytes(16), 1), data_plane, self._candidates)
+        own = session_of("robot", Role.ROBOT, 1)
+        self.manager = InterfaceManager(config, own, bytes(16), data_plane, self._candidates)
         watch: Any = self.manager._watch
         watch.wait = lambda timeout_s: self.changes
 
@@ -102,11 +104,11 @@ def test_an_announced_end_of_a_link_suspends_it_before_any_look(host: Host) -> N
 def test_another_device_of_the_same_name_gets_a_new_socket_and_goes_on_with_the_packet_numbers(host: Host) -> None:
     host.look(LO)
     thread = host.links[LO.name]
-    thread.link._table.first_number = 1000
+    thread.link._table._memory.next_number = 1000
     host.look(replace(LO, index=7))
     again = host.links[LO.name]
     assert again is not thread
-    assert again.link.next_number == 1000
+    assert again.link._table.next_number == 1000
     assert again.link.identity.interface_id == thread.link.identity.interface_id
 
 

@@ -6,10 +6,11 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.model import InterfaceId, InterfaceName, SessionId
+from protos.model import InterfaceId, InterfaceName, Role
 from sidecar.core.datagrams import Batch, LinkIdentity
 from sidecar.core.link import Link
 from sidecar.net.interface_thread import InterfaceThread
+from tests.sessions import credential_of
 
 if TYPE_CHECKING:
     import pytest
@@ -50,7 +51,8 @@ class SlowSocket(socket.socket):
 
 def thread_with(sock: socket.socket, waiting: int) -> InterfaceThread:
     """A thread that has so many datagrams to send."""
-    identity = LinkIdentity(InterfaceName("wlan0"), InterfaceId(0), SessionId(1), bytes(16), 1)
+    credential = credential_of("robot", Role.ROBOT, 1)
+    identity = LinkIdentity.of(credential, bytes(16), InterfaceName("wlan0"), InterfaceId(0))
     thread = InterfaceThread(sock, Link(identity, random.Random(1), time.monotonic()), None, Owner())
     thread._unsent.extend(Batch(("127.0.0.1", 9), b"x", 1) for _ in range(waiting))
     return thread

@@ -1,0 +1,101 @@
+"""The datagram by which a sidecar introduces itself on a path that is down; it works without a control plane.
+
+Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
+
+    hello id (8 bytes)        = Expand(token, "plr 2 hello id")
+    sealed:  probe id (32), credential (protos/credential.py)
+    tag (16 bytes)
+
+The token is stable, and known to the sender's peers from the control plane: a gate that costs a stranger's datagram a
+look into a table. Behind it stands ChaCha20-Poly1305 with a key from Expand(token, "plr 2 introduction" | session |
+sender's interface | receiver's interface | receiver's name), the clear bytes and the hello id as associated data, and
+the nonce of every datagram (frame.py): one key for each path of a session, on which packet numbers do not repeat.
+
+Every peer of the sender knows the token, so this proves little: the credential says who it is, by its signature, and
+the sealed datagrams that follow prove that it has the session's key. Until then nothing moves, nothing counts as
+received, and the answer is shorter than the question.
+"""
+
+from __future__ import annotations
+
+import struct
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+
+from protos.credential import decode_credential
+from protos.errors import DecodeError
+from sidecar.core.aead import TAG_BYTES
+from sidecar.core.frame import HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, SEALED_FLAG, Header, encode_header
+from sidecar.core.key_schedule import expand
+from sidecar.core.pmtu import BASE_BYTES
+
+if TYPE_CHECKING:
+    from protos.credential import SessionCredential
+    from protos.model import NodeName
+
+HELLO_BYTES = 8
+INTRODUCTION_FLAGS = SEALED_FLAG | INTRODUCTION_FLAG
+_SEALED_FROM = HEADER_BYTES + HELLO_BYTES
+_PROBE_ID = struct.Struct(">I")
+_KEY_HEAD = struct.Struct(">QBB")
+MAX_INTRODUCED_BYTES = BASE_BYTES - _SEALED_FROM - _PROBE_ID.size - TAG_BYTES
+"""Longest credential that can be introduced: every path carries BASE_BYTES."""
+
+
+class UnauthenticError(DecodeError):
+    """Whoever sent it did not know the token, or it was changed on its way."""
+
+
+class Introduction(NamedTuple):
+    """What an introduction says; the credential is not verified yet."""
+
+    probe_id: int
+    credential: SessionCredential
+
+
+@lru_cache(maxsize=8192)
+def hello_id(token: bytes) -> bytes:
+    """Return the name under which the owner of a token introduces itself."""
+    return expand(token, b"plr 2 hello id", HELLO_BYTES)
+
+
+def read_hello_id(datagram: memoryview) -> bytes:
+    """Return the hello id of an introduction; shorter than HELLO_BYTES when the datagram is."""
+    return bytes(datagram[HEADER_BYTES:_SEALED_FROM])
+
+
+def encode_introduction(header: Header, token: bytes, receiver: NodeName, probe_id: int, credential: bytes) -> bytes:
+    """Return the whole datagram; `token` is ours, `credential` ours and encoded."""
+    clear = encode_header(header._replace(flags=INTRODUCTION_FLAGS)) + hello_id(token)
+    plain = _PROBE_ID.pack(probe_id) + credential
+    return clear + _cipher(header, token, receiver).encrypt(clear[NONCE_OFFSET:HEADER_BYTES], plain, clear)
+
+
+def open_introduction(header: Header, datagram: memoryview, token: bytes, receiver: NodeName) -> Introduction:
+    """Open and parse the datagram with this header; `token` is the sender's, `receiver` our name.
+
+    Raises:
+        UnauthenticError: it is not of one who knows the token.
+        DecodeError: its content breaks the layout, or is of another session.
+    """
+    clear = bytes(datagram[:_SEALED_FROM])
+    try:
+        cipher = _cipher(header, token, receiver)
+        plain = cipher.decrypt(clear[NONCE_OFFSET:HEADER_BYTES], datagram[_SEALED_FROM:], clear)
+    except InvalidTag:
+        raise UnauthenticError("not of one who knows the token") from None
+    if len(plain) < _PROBE_ID.size:
+        raise DecodeError("introduction cut off")
+    credential = decode_credential(plain[_PROBE_ID.size :])
+    if credential.session != header.session:
+        raise DecodeError("introduction with the credential of another session")
+    (probe_id,) = _PROBE_ID.unpack_from(plain)
+    return Introduction(probe_id, credential)
+
+
+def _cipher(header: Header, token: bytes, receiver: NodeName) -> ChaCha20Poly1305:
+    path = _KEY_HEAD.pack(header.session, header.sender_interface, header.receiver_interface)
+    return ChaCha20Poly1305(expand(token, b"plr 2 introduction" + path + receiver.encode()))

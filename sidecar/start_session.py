@@ -1,0 +1,65 @@
+"""Begins this run's session: a fresh key, and the credential that says whose it is. The key never leaves the memory."""
+
+from __future__ import annotations
+
+import os
+import random
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from protos.credential import Aead, SessionCredential, verify
+from protos.errors import ConfigError
+from protos.model import SessionId
+from sidecar.core.introduction import MAX_INTRODUCED_BYTES
+from sidecar.core.session import OwnSession, public_key
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import NodeName, Role
+    from protos.tls_files import TlsFiles
+
+PRIVATE_KEY_BYTES = 32
+
+
+def start_session(name: NodeName, role: Role, incarnation: int, tls: Callable[[], TlsFiles] | None) -> OwnSession:
+    """Return a new session. `tls` returns the present certificate, key and trust; None is the insecure mode.
+
+    Raises:
+        ConfigError: the certificate is too long for introductions.
+    """
+    private_key = os.urandom(PRIVATE_KEY_BYTES)
+    session = SessionId(random.SystemRandom().getrandbits(64) or 1)
+    credential = SessionCredential(name, role, session, incarnation, public_key(private_key), preferred_aead())
+    if tls is None:
+        return OwnSession(credential, private_key, _take_as_it_is)
+
+    def judge(theirs: SessionCredential) -> None:
+        verify(theirs, lambda certificate: tls().trust.check(certificate, time.time()))
+
+    return OwnSession(signed(credential, tls()), private_key, judge)
+
+
+def signed(credential: SessionCredential, tls: TlsFiles) -> SessionCredential:
+    """Return the credential with this certificate, signed: for a new session, or a renewed certificate."""
+    new = replace(credential, certificate=tls.certificate_der).sign(tls.private_key)
+    if len(new.encode()) > MAX_INTRODUCED_BYTES:
+        problem = f"expected a certificate at least {len(new.encode()) - MAX_INTRODUCED_BYTES} bytes shorter"
+        raise ConfigError(str(tls.directory / "cert.pem"), "", problem)
+    return new
+
+
+def preferred_aead() -> Aead:
+    """Return what this machine is quicker at: AES where the processor has instructions for it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return Aead.CHACHA20_POLY1305
+    words = {word for line in lines if line.startswith(("flags", "Features")) for word in line.split()}
+    return Aead.AES_256_GCM if "aes" in words else Aead.CHACHA20_POLY1305
+
+
+def _take_as_it_is(credential: SessionCredential) -> None:
+    """Insecure mode: whatever the control plane tells is believed."""
