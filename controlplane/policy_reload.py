@@ -29,7 +29,7 @@ def announce(policy: Policy | None) -> None:
     if policy is None:
         log.warning("there is no policy: every robot may call, and every cloud may offer, every service")
     else:
-        log.info("policy in force: %d rules for calls, %d for offers", len(policy.calls), len(policy.offers))
+        log.info("policy in force: rules for calls %d, for offers %d", len(policy.calls), len(policy.offers))
 
 
 class PolicyReload:

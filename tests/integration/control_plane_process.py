@@ -56,7 +56,7 @@ class ControlPlaneProcess:
     """`python -m controlplane` on free ports of loopback; insecure unless told a `tls_dir`."""
 
     def __init__(self, folder: Path, **changes: Any) -> None:
-        settings = {
+        self.settings = {
             **({} if "tls_dir" in changes else {"insecure": True}),
             "listen": "127.0.0.1:0",
             "stun_listen": ["127.0.0.1:0"],
@@ -67,7 +67,7 @@ class ControlPlaneProcess:
             **changes,
         }
         self.config = folder / "controlplane.yaml"
-        self.config.write_text(yaml.safe_dump(settings))
+        self.config.write_text(yaml.safe_dump(self.settings))
         self.lines: list[str] = []
         self._process = subprocess.Popen(
             [sys.executable, "-m", "controlplane", "--config", str(self.config)],
@@ -97,6 +97,12 @@ class ControlPlaneProcess:
         while not any(all(part in line for part in parts) for line in self.lines[after:]):
             assert time.monotonic() < end, f"{parts} not in {self.lines}"
             time.sleep(0.02)
+
+    def reload(self, **changes: Any) -> None:
+        """Change the configuration, and tell it."""
+        self.settings.update(changes)
+        self.config.write_text(yaml.safe_dump(self.settings))
+        self._process.send_signal(signal.SIGHUP)
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send a signal and return the exit code."""

@@ -12,6 +12,7 @@ from protos.model import (
     ResourceStatus,
     Role,
     ServiceMapping,
+    ServiceName,
     SessionId,
     SidecarStatus,
     SyncState,
@@ -66,3 +67,9 @@ def test_a_mapping_to_nowhere_is_said_so() -> None:
         services=(ServiceMapping(PLAN, (), 1.0, "no live server"),),
     )
     assert "/plan: nowhere (predicted miss 1; no live server)" in render([robot])
+
+
+def test_refused_offers_are_shown() -> None:
+    peer = Peer(NodeName("cloud-a"), Role.CLOUD, SessionId(2), b"", 1, offers=(offer(), offer("/secret")))
+    cloud = SidecarStatus(peer, True, 1.0, "", refused_offers=(ServiceName("/secret"),))
+    assert "REFUSED by the policy: /secret (offered here, told to no robot)" in render([cloud])
