@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from controlplane.ca import Authority
+from protos.identity import IdentityRole
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
@@ -64,6 +67,9 @@ class System:
     lab: Lab
     folder: Path
     parts: dict[str, Part] = field(default_factory=dict)
+    authority: Authority = field(default_factory=Authority.create)
+    """The CA of this fleet."""
+    _certified: set[str] = field(default_factory=set)
 
     # -- parts ----------------------------------------------------------------------------------------------------
 
@@ -71,21 +77,21 @@ class System:
         """Start plr-controlplane on the host `control`."""
         host = self.lab.host("control")
         config = {
-            "insecure": True,
+            "tls_dir": self.tls_dir("control", IdentityRole.CONTROL_PLANE),
             "listen": f"0.0.0.0:{CONTROL_PORT}",
             "stun_listen": [f"0.0.0.0:{STUN_PORT}"],
             "stun_servers": [f"{host.address()}:{STUN_PORT}"],
             "metrics_listen": f"127.0.0.1:{CONTROL_METRICS_PORT}",
             **changes,
         }
-        argv = ["-m", "controlplane", "--config", str(self._write("controlplane", config)), "--insecure-i-know"]
-        return self._popen("controlplane", host, [sys.executable, *argv], 0)
+        return self._start("controlplane", host, "controlplane", self._write("controlplane", config))
 
     def start_cloud(self, name: str, services: Sequence[dict[str, Any]], **changes: Any) -> Part:
         """Start a cloud's sidecar; `services` as in its configuration."""
         config = {
             "name": name.replace("_", "-"),
             "role": "cloud",
+            "tls_dir": self.tls_dir(name.replace("_", "-"), IdentityRole.CLOUD),
             "control_plane": f"{self.lab.host('control').address()}:{CONTROL_PORT}",
             "interfaces": ["eth0"],
             "state_dir": str(self.folder / f"{name}.state"),
@@ -110,6 +116,7 @@ class System:
         config = {
             "name": name,
             "role": "robot",
+            "tls_dir": self.tls_dir(name, IdentityRole.ROBOT),
             "control_plane": f"{self.lab.host('control').address()}:{CONTROL_PORT}",
             "interfaces": list(interfaces),
             "state_dir": str(self.folder / f"{name}.state"),
@@ -119,6 +126,14 @@ class System:
         }
         written = self._write(f"{name}.sidecar", config)
         return self._start(f"{name}.sidecar", self.lab.host(host), "sidecar", written, domain=domain)
+
+    def tls_dir(self, name: str, role: IdentityRole) -> str:
+        """The folder with the certificate of this name, which gets one when it is first asked for."""
+        path = self.folder / f"{name}.tls"
+        if name not in self._certified:
+            self.authority.write_tls_dir(path, name, role)
+            self._certified.add(name)
+        return str(path)
 
     def start_node(self, name: str, host: str, argv: Sequence[str], *, domain: int = 0) -> Part:
         """Start a ROS program (`python -m ...`) on a host."""

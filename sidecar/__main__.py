@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from protos.errors import ConfigError
-from sidecar.config import SidecarConfig, config_schema, load_config
+from protos.tls_files import load_tls_files
+from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
 from sidecar.logging_setup import Logging
 
 if TYPE_CHECKING:
@@ -62,7 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.config is None:
         _parser().error("expected --config FILE")
     try:
-        config = load_config(options.config)
+        config = load_config(options.config, lambda folder: load_tls_files(folder).identity)
+        if not options.insecure_i_know:
+            refuse_exposed(config, str(options.config))
         if options.check_config:
             _check_interfaces(config, str(options.config))
             sys.stdout.write(f"{options.config}: ok\n")
@@ -86,6 +89,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--config", type=Path, metavar="FILE", help="configuration, YAML")
     parser.add_argument("--check-config", action="store_true", help="check the configuration and exit")
     parser.add_argument("--print-schema", action="store_true", help="print the configuration's JSON Schema and exit")
+    parser.add_argument(
+        "--insecure-i-know",
+        action="store_true",
+        help="allow insecure: true with a control plane on another machine: anybody between may read and change all",
+    )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {software_version()}")
     return parser
 

@@ -8,17 +8,27 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from protos.config_fields import IpAddress, ListenAddress, RemoteAddress, refuse_duplicates
+from protos.config_fields import (
+    IpAddress,
+    ListenAddress,
+    RemoteAddress,
+    TlsDir,
+    check_security,
+    is_loopback,
+    refuse_duplicates,
+)
 from protos.config_file import key_path, parse_yaml, read_text, validate
 from protos.errors import ConfigError
+from protos.identity import IdentityRole
 from protos.model import NodeName, Role, ServiceName
 from sidecar.config_fields import InterfacePattern, RepairShare, ServicePattern, SidecarName, is_glob
 from sidecar.core.priority import Priority
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
+    from protos.identity import Identity
     from sidecar.core.redundancy import Redundancy
 
 DEFAULT_CLOUD_UDP_PORT = 24700
@@ -120,11 +130,18 @@ class SidecarConfig(_Section):
     """Configuration of plr-sidecar."""
 
     name: SidecarName
-    """Name of this sidecar, unique in the mesh."""
+    """Name of this sidecar, unique in the mesh. With tls_dir the certificate's, and may be left out."""
     role: Annotated[Role, _converted]
-    """robot: its applications call services; cloud: its servers answer them."""
+    """robot: its applications call services; cloud: its servers answer them. With tls_dir the certificate's, and may
+    be left out."""
     control_plane: RemoteAddress
     """host:port of the control plane."""
+    tls_dir: Annotated[TlsDir, _converted] | None = None
+    """Absolute path of the folder with cert.pem, key.pem, ca.pem and perhaps crl.pem, as plr ca issue writes it; read
+    anew when they change. Required unless insecure."""
+    insecure: bool = False
+    """true: everybody is who they say. For trying out on one machine; refused with a control_plane elsewhere, unless
+    --insecure-i-know is on the command line."""
     services: Annotated[tuple[ServiceConfig, ...], Field(min_length=1), _converted]
     """What is carried; nothing else is."""
     interfaces: (
@@ -149,6 +166,11 @@ class SidecarConfig(_Section):
     log_level: Annotated[LogLevel, _converted] = LogLevel.INFO
     """debug, info, warning or error."""
 
+    @model_validator(mode="after")
+    def _secured_or_not(self) -> Self:
+        check_security(self.tls_dir, self.insecure)
+        return self
+
     @property
     def node_name(self) -> NodeName:
         """`name`, typed."""
@@ -159,22 +181,56 @@ class SidecarConfig(_Section):
         return tuple(_rule(self.role, service) for service in self.services)
 
 
-def load_config(path: Path) -> SidecarConfig:
-    """Read and check the file; raises ConfigError."""
-    return parse_config(read_text(path), str(path))
+def load_config(path: Path, identify: Callable[[Path], Identity] | None = None) -> SidecarConfig:
+    """Read and check the file; raises ConfigError. `identify` as of `parse_config`."""
+    return parse_config(read_text(path), str(path), identify)
 
 
-def parse_config(text: str, source: str) -> SidecarConfig:
-    """Check YAML text; `source` names it in the error. Raises ConfigError."""
-    config = validate(SidecarConfig, parse_yaml(text, source), source)
+def parse_config(text: str, source: str, identify: Callable[[Path], Identity] | None = None) -> SidecarConfig:
+    """Check YAML text; `source` names it in the error. Raises ConfigError.
+
+    `identify` tells (or raises ConfigError) whom the certificate in a tls_dir names; without it name and role have to
+    stand in the text.
+    """
+    data = parse_yaml(text, source)
+    folder = data.get("tls_dir")
+    if identify is not None and isinstance(folder, str):
+        if not Path(folder).is_absolute():
+            # Before name and role are missed that stand in there.
+            raise ConfigError(source, "tls_dir", f"expected an absolute path, got '{folder}'")
+        data = _with_identity(data, identify(Path(folder)), source)
+    config = validate(SidecarConfig, data, source)
     for location, problem in _cross_checks(config):
         raise ConfigError(source, key_path(location), problem)
     return config
 
 
+def _with_identity(data: dict[str, Any], identity: Identity, source: str) -> dict[str, Any]:
+    if identity.role not in (IdentityRole.ROBOT, IdentityRole.CLOUD):
+        problem = f"expected the certificate of a robot or a cloud, got that of {identity.name}, {identity.role.value}"
+        raise ConfigError(source, "tls_dir", problem)
+    known = {"name": identity.name, "role": identity.role.value}
+    for key, value in known.items():
+        if data.get(key, value) != value:
+            raise ConfigError(source, key, f"expected '{value}' as in the certificate, or nothing, got {data[key]!r}")
+    return {**data, **known}
+
+
+def refuse_exposed(config: SidecarConfig, source: str) -> None:
+    """Refuse to talk to others without TLS; raises ConfigError."""
+    if config.insecure and not is_loopback(config.control_plane):
+        problem = (
+            f"expected a loopback address with insecure: true, got '{config.control_plane}'; use tls_dir, or start "
+            "with --insecure-i-know"
+        )
+        raise ConfigError(source, "control_plane", problem)
+
+
 def config_schema() -> dict[str, Any]:
     """Return the JSON Schema of the configuration file."""
     schema = SidecarConfig.model_json_schema()
+    # With tls_dir the certificate has them.
+    schema["required"] = [key for key in schema["required"] if key not in ("name", "role")]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 

@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import grpc
 
+from protos import tls_advice
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
 from protos.errors import DecodeError
+from protos.identity import CONTROL_PLANE_DNS
 from protos.model import CandidateSet, PeerSet, Report, ResourceKind, ServiceSet, Welcome
 from protos.names import clean_text
 from protos.plr.v1 import control_pb2_grpc
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 
     from protos.model import Candidate, MappingSet, ServiceOffer, ServiceUse
     from protos.plr.v1 import control_pb2
+    from protos.tls_files import TlsFiles, TlsWatch
     from sidecar.core.control_session import ControlSession, ControlStats
 
     _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
@@ -46,7 +49,10 @@ KEEPALIVE_TIMEOUT_MS = 5_000
 GOODBYE_S = 0.5
 """How long `stop` waits for the control plane to take the goodbye."""
 
-_CHANNEL_OPTIONS: tuple[tuple[str, int], ...] = (
+WATCH_INTERVAL_S = 1.0
+"""How often to look for new certificate files: they are renewed weeks before they end."""
+
+_CHANNEL_OPTIONS: tuple[tuple[str, int | str], ...] = (
     ("grpc.keepalive_time_ms", KEEPALIVE_TIME_MS),
     ("grpc.keepalive_timeout_ms", KEEPALIVE_TIMEOUT_MS),
     ("grpc.http2.max_pings_without_data", 0),
@@ -55,6 +61,8 @@ _CHANNEL_OPTIONS: tuple[tuple[str, int], ...] = (
     ("grpc.use_local_subchannel_pool", 1),
     # Behaviour comes from the configuration, not from the environment.
     ("grpc.enable_http_proxy", 0),
+    # Whatever its address: the name in the certificate of every control plane of the fleet.
+    ("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),
 )
 
 _REFUSALS = frozenset(
@@ -90,24 +98,34 @@ class ControlHooks(Protocol):
     def connection_changed(self, connected: bool, reason: str) -> None:
         """The control plane came within reach, or went out of it."""
 
+    def certificate_changed(self, files: TlsFiles) -> None:
+        """New certificate files are in use from now on; the session tells the next registration of them."""
+
 
 class _StreamEndedError(Exception):
-    """The stream is over; `refused`: by a decision of the control plane."""
+    """The stream is over; `refused`: by a decision of the control plane, `wanted`: by ours, to open another."""
 
-    def __init__(self, reason: str, *, refused: bool = False) -> None:
+    def __init__(self, reason: str, *, refused: bool = False, wanted: bool = False) -> None:
         super().__init__(reason)
         self.reason = reason
         self.refused = refused
+        self.wanted = wanted
 
 
 class ControlClient:
-    """Keeps one sidecar connected to the control plane at `target` (host:port) until `stop`."""
+    """Keeps one sidecar connected to the control plane at `target` (host:port) until `stop`.
 
-    def __init__(self, target: str, session: ControlSession, hooks: ControlHooks) -> None:
+    `tls` holds the certificate to show; None in insecure mode.
+    """
+
+    def __init__(self, target: str, session: ControlSession, hooks: ControlHooks, tls: TlsWatch | None = None) -> None:
         self._target = target
+        self._tls = tls
         self._session = session
         self._hooks = hooks
         self._connected = False
+        self.last_failure: str | None = None
+        """Why the last attempt or stream ended; None before that, or when we ended it."""
         self._stopping = False
         self._outage = OutageLog(log, target)
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -204,15 +222,18 @@ class ControlClient:
 
     async def _one_stream(self) -> None:
         """Open a stream, serve it until it ends, and note why it did."""
+        self._look_for_new_files()
         self._session.opened(time.monotonic())
         ended = _StreamEndedError("stopped")
         try:
-            async with grpc.aio.insecure_channel(self._target, options=_CHANNEL_OPTIONS) as channel:
+            async with self._open_channel() as channel:
                 call = control_pb2_grpc.ControlPlaneStub(channel).Connect()
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(self._read(call))
                     tasks.create_task(self._write(call))
                     tasks.create_task(self._await_welcome())
+                    if self._tls is not None:
+                        tasks.create_task(self._watch_files())
         except* _StreamEndedError as group:
             ended = _most_telling(group)
         except* Exception:
@@ -222,8 +243,43 @@ class ControlClient:
             delay_s = self._session.closed(time.monotonic(), refused=ended.refused)
         was_connected = self._connected
         self._note_connection(False, "stopped" if self._stopping else ended.reason)
-        if not self._stopping:
+        self.last_failure = None if ended.wanted else ended.reason
+        if ended.wanted:
+            log.info("opening a new stream: %s", ended.reason)
+        elif not self._stopping:
             self._outage.failed(ended.reason, delay_s, time.monotonic(), was_connected=was_connected)
+
+    def _open_channel(self) -> grpc.aio.Channel:
+        if self._tls is None:
+            return grpc.aio.insecure_channel(self._target, options=_CHANNEL_OPTIONS)
+        files = self._tls.current
+        credentials = grpc.ssl_channel_credentials(files.ca_pem, files.key_pem, files.certificate_pem)
+        return grpc.aio.secure_channel(self._target, credentials, options=_CHANNEL_OPTIONS)
+
+    async def _watch_files(self) -> None:
+        """End the stream when there is another certificate to show."""
+        while True:
+            await asyncio.sleep(WATCH_INTERVAL_S)
+            if self._look_for_new_files():
+                raise _StreamEndedError("new certificate files", wanted=True)
+
+    def _look_for_new_files(self) -> bool:
+        files = self._tls.poll() if self._tls is not None else None
+        if files is None:
+            return False
+        try:
+            self._hooks.certificate_changed(files)
+        except Exception:
+            log.exception("certificate_changed failed")
+        return True
+
+    def _ended_by(self, error: grpc.aio.AioRpcError) -> _StreamEndedError:
+        code = error.code()
+        reason = clean_text(f"{code.name}: {error.details() or 'no details'}")
+        advice = None
+        if code is grpc.StatusCode.UNAVAILABLE and not self._connected:
+            advice = tls_advice.explain(reason, self._tls.current if self._tls is not None else None, time.time())
+        return _StreamEndedError(advice or reason, refused=code in _REFUSALS)
 
     async def _read(self, call: _Call) -> None:
         try:
@@ -231,7 +287,7 @@ class ControlClient:
                 self._on_message(message)
                 self._wake.set()
         except grpc.aio.AioRpcError as error:
-            raise _ended_by(error) from error
+            raise self._ended_by(error) from error
         except asyncio.CancelledError as error:
             task = asyncio.current_task()
             if task is None or task.cancelling():
@@ -321,11 +377,6 @@ class ControlClient:
 def _most_telling(group: BaseExceptionGroup[_StreamEndedError]) -> _StreamEndedError:
     endings = [error for error in group.exceptions if isinstance(error, _StreamEndedError)]
     return next((error for error in endings if error.refused), endings[0])
-
-
-def _ended_by(error: grpc.aio.AioRpcError) -> _StreamEndedError:
-    code = error.code()
-    return _StreamEndedError(clean_text(f"{code.name}: {error.details() or 'no details'}"), refused=code in _REFUSALS)
 
 
 def _what_it_was(message: control_pb2.ControlMessage) -> tuple[ResourceKind | None, int]:

@@ -5,6 +5,7 @@ No code of prometheus_client runs where datagrams move: a scrape reads, on its o
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,11 +24,13 @@ if TYPE_CHECKING:
 
     from prometheus_client import Metric
 
+    from protos.identity import Identity
     from protos.model import ServiceName
     from sidecar.core.control_session import ControlStats
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.ros.stats import BridgeStats
 
+SECONDS_PER_DAY = 86_400.0
 _OUTCOMES = ("ok", "deadline_missed", "failed", "rejected")
 
 
@@ -46,6 +49,8 @@ class MetricSources:
     bridge: Callable[[], BridgeStats] | None
     state_failures: Callable[[], Mapping[str, int]]
     """Files of the state folder that could not be read or written, by what failed."""
+    certificate: Callable[[], Identity | None]
+    """Whose certificate is in use; None in insecure mode."""
 
 
 class SidecarCollector(Collector):
@@ -65,6 +70,7 @@ class SidecarCollector(Collector):
         yield from _control(sources.control(), sources.connected(), sources.engine())
         if sources.bridge is not None:
             yield from _bridge(sources.bridge())
+        yield from _certificate(sources.certificate())
         yield counter(
             "plr_state_failures",
             "Files of the state folder that could not be read or written.",
@@ -80,6 +86,23 @@ def serve_metrics(listen: str, sources: MetricSources) -> MetricsServer:
     ProcessCollector(registry=registry)
     host, port = split_host_port(listen)
     return MetricsServer(host, port, registry)
+
+
+def _certificate(own: Identity | None) -> Iterator[Metric]:
+    if own is None:
+        return
+    yield gauge(
+        "plr_certificate_expiry_timestamp_seconds",
+        "When the certificate in use ends, in seconds since 1970.",
+        (),
+        {(): own.not_after},
+    )
+    yield gauge(
+        "plr_certificate_days_left",
+        "Days until the certificate in use ends; negative when it has.",
+        (),
+        {(): (own.not_after - time.time()) / SECONDS_PER_DAY},
+    )
 
 
 def _requests(stats: EngineStats) -> Iterator[Metric]:

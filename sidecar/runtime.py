@@ -14,6 +14,7 @@ import sdnotify
 from protos.config_fields import split_host_port
 from protos.errors import ConfigError
 from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, Version
+from protos.tls_files import TlsWatch, load_tls_files
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.core.engine import EngineConfig
@@ -21,7 +22,7 @@ from sidecar.metrics import MetricSources, serve_metrics
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
 from sidecar.ros.bridge import RosBridge
-from sidecar.start_session import start_session
+from sidecar.start_session import signed, start_session
 from sidecar.state_store import StateDirError, StateStore
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from protos.metrics_server import MetricsServer
     from protos.model import Assignment, InterfaceName, MappingSet, PeerSet, Report, ServiceName, Welcome
+    from protos.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
     from sidecar.core.stun_events import StunEvent
 
@@ -48,9 +50,14 @@ class Sidecar:
 
     def __init__(self, config: SidecarConfig, version: str) -> None:
         self._config = config
+        self._tls = TlsWatch(load_tls_files(config.tls_dir)) if config.tls_dir is not None else None
         self._store = _open_store(config)
         identity = self._store.identity
-        own = start_session(config.node_name, config.role, identity.incarnation, None)
+        tls = self._tls
+        own = start_session(
+            config.node_name, config.role, identity.incarnation, None if tls is None else lambda: tls.current
+        )
+        self._own = own
         rules = config.service_rules()
         self._bridge = RosBridge(name=config.node_name, role=config.role, rules=rules)
         self._data_plane = ThreadedDataPlane(
@@ -74,7 +81,7 @@ class Sidecar:
             ),
             random.SystemRandom(),
         )
-        self._control = ControlClient(config.control_plane, self._control_session, self)
+        self._control = ControlClient(config.control_plane, self._control_session, self, self._tls)
         self._interfaces = InterfaceManager(
             config,
             own,
@@ -137,6 +144,7 @@ class Sidecar:
             connected=lambda: self._control.connected,
             bridge=lambda: self._bridge.stats,
             state_failures=lambda: self._store.failures,
+            certificate=lambda: self._tls.current.identity if self._tls is not None else None,
         )
         try:
             self._metrics = serve_metrics(listen, sources)
@@ -197,6 +205,14 @@ class Sidecar:
         """Return what was measured since the last call."""
         return self._data_plane.take_report()
 
+    def certificate_changed(self, files: TlsFiles) -> None:
+        """New certificate files are in use: the credential of this session is signed anew with them."""
+        credential = signed(self._own.credential, files)
+        self._data_plane.renew_credential(credential)
+        self._control_session.set_credential(credential.encode())
+        self._data_plane.trust_changed()
+        log.info("took new certificate files from %s", files.directory)
+
     def connection_changed(self, connected: bool, reason: str) -> None:
         """The control plane came within reach, or went out of it."""
         if not connected:
@@ -216,6 +232,8 @@ def run(config: SidecarConfig, version: str, stopping: threading.Event) -> int:
     Raises:
         ConfigError: the configuration does not fit this machine.
     """
+    if config.insecure:
+        log.warning("insecure: true: the control plane and every peer are believed to be who they say")
     sidecar = Sidecar(config, version)
     notifier = sdnotify.SystemdNotifier()
     sidecar.start()

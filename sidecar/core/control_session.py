@@ -139,6 +139,10 @@ class ControlSession:
         """The version in force; 0 means none."""
         return self._in_force[resource]
 
+    def set_credential(self, credential: bytes) -> None:
+        """What the next registration says of us: the session's credential, signed anew."""
+        self._registration = replace(self._registration, credential=credential)
+
     def forget(self, resource: ResourceKind) -> None:
         """What the registration said we hold could not be put in force after all."""
         self._in_force[resource] = Version(0)

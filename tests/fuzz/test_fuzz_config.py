@@ -53,6 +53,7 @@ def test_one_wrong_value_in_a_good_file(key: str, value: object) -> None:
     good = {
         "name": "c",
         "role": "cloud",
+        "insecure": True,
         "control_plane": "a:1",
         "services": [{"name": "/*"}],
         key: value,

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from protos.model import SidecarStatus
+    from protos.tls_files import TlsFiles
 
 
 class Engine:
@@ -46,6 +47,9 @@ class Engine:
 
     def take_report(self) -> Report:
         return Report(paths=tuple(path(nic, server) for nic in ("wlan0", "wwan0") for server in self.known))
+
+    def certificate_changed(self, files: TlsFiles) -> None:
+        raise AssertionError("insecure here")
 
     def connection_changed(self, connected: bool, reason: str) -> None:
         """Nothing to do."""

@@ -53,6 +53,8 @@ from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedContro
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from protos.tls_files import TlsFiles
+
 WELCOME = Welcome(lease_s=0.6, report_interval_s=0.1, stun_servers=("192.0.2.9:3478",))
 CANDIDATE = Candidate(InterfaceId(0), InterfaceName("wlan0"), CandidateKind.HOST, ("192.0.2.2", 9))
 OFFER = ServiceOffer(ServiceName("/plan"), "nav_msgs/srv/GetPlan")
@@ -86,6 +88,9 @@ class Recorder:
         if self.crash:
             raise RuntimeError("broken engine")
         return self.report
+
+    def certificate_changed(self, files: TlsFiles) -> None:
+        raise AssertionError("insecure here")
 
     def connection_changed(self, connected: bool, reason: str) -> None:
         self.connection.put((connected, reason))

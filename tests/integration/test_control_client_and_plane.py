@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
     import pytest
 
+    from protos.tls_files import TlsFiles
+
 ROOT = Path(__file__).parents[2]
 PLAN = ServiceName("/plan_path")
 GET_PLAN = "nav_msgs/srv/GetPlan"
@@ -126,6 +128,9 @@ class Sidecar:
 
     def take_report(self) -> Report:
         return self.report
+
+    def certificate_changed(self, files: TlsFiles) -> None:
+        raise AssertionError("insecure here")
 
     def connection_changed(self, connected: bool, reason: str) -> None:
         self.connection.put(connected)

@@ -364,13 +364,13 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
         r.nack(r.expect(PeerSet, lambda message: bool(message.peers)), "not\nthis\tone")
         wait_for_state(plane, "robot", SyncState.REJECTED)
         table = subprocess.run(
-            [sys.executable, "-m", "controlplane.cli", "status", "--address", plane.address],
+            [sys.executable, "-m", "controlplane.cli", "status", "--insecure", "--address", plane.address],
             capture_output=True,
             text=True,
             check=True,
         ).stdout
         as_json = subprocess.run(
-            [sys.executable, "-m", "controlplane.cli", "status", "--address", plane.address, "--json"],
+            [sys.executable, "-m", "controlplane.cli", "status", "--insecure", "--address", plane.address, "--json"],
             capture_output=True,
             text=True,
             check=True,

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import socket
 import ssl
 import subprocess
 import time
-import urllib.request
 from typing import TYPE_CHECKING
 
 import grpc
@@ -22,7 +20,6 @@ from protos.model import MappingSet, RemovalReason, Report, Role, Welcome
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
 from tests.integration.control_plane_process import (
     PATIENCE_S,
-    ControlPlaneProcess,
     Secured,
     Sidecar,
     Stream,
@@ -30,64 +27,16 @@ from tests.integration.control_plane_process import (
     open_channel,
     robot,
 )
+from tests.integration.secured_control_plane import HOUR_S, SecuredControlPlane
 from tests.unit.controlplane.samples import registration
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
-
-HOUR_S = 3600.0
-
-
-class Plane(ControlPlaneProcess):
-    """A secured control plane with the CA of its fleet."""
-
-    def __init__(self, folder: Path) -> None:
-        self.authority = Authority.create()
-        self.tls_dir = folder / "tls"
-        self.authority.write_tls_dir(self.tls_dir, "control", IdentityRole.CONTROL_PLANE)
-        self._issued: dict[str, Secured] = {}
-        super().__init__(folder, tls_dir=str(self.tls_dir))
-
-    def member(self, name: str, role: IdentityRole = IdentityRole.ROBOT, validity: Validity | None = None) -> Secured:
-        """The certificate of this name, issued when it is first asked for."""
-        if name not in self._issued:
-            self._issued[name] = Secured(self.authority.issue(name, role, validity=validity), self.authority.ca_pem)
-        return self._issued[name]
-
-    def revoke(self, name: str) -> None:
-        self.authority.revoke(name)
-        self.install("crl.pem", self.authority.crl_pem())
-
-    def install(self, file: str, content: bytes) -> None:
-        """Put a file into its tls_dir and wait until it is in use."""
-        taken = len(self.lines)
-        part = self.tls_dir / "part"
-        part.write_bytes(content)
-        part.replace(self.tls_dir / file)
-        self.wait_for_line("took new certificate files", after=taken)
-
-    def count(self, metric: str) -> float:
-        with urllib.request.urlopen(f"http://{self.metrics}/metrics", timeout=PATIENCE_S) as answer:
-            found = re.search(rf"^{re.escape(metric)} (\S+)$", answer.read().decode(), re.MULTILINE)
-        assert found is not None, metric
-        return float(found[1])
-
-    @contextlib.contextmanager
-    def counted(self, reason: str, metric: str = "plr_refused_connections_total") -> Iterator[None]:
-        """Within it, something is refused for this reason."""
-        series = f'{metric}{{reason="{reason}"}}'
-        before = self.count(series)
-        yield
-        end = time.monotonic() + PATIENCE_S
-        while self.count(series) <= before:
-            assert time.monotonic() < end, f"no {reason} counted"
-            time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")
-def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plane]:
-    with Plane(tmp_path_factory.mktemp("plane")) as process:
+def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredControlPlane]:
+    with SecuredControlPlane(tmp_path_factory.mktemp("plane")) as process:
         yield process
         assert process.stop() == 0
         bad = [number for number, line in enumerate(process.lines) if "Traceback" in line or "ERROR" in line]
@@ -101,7 +50,7 @@ def refused(address: str, secured: Secured | None) -> grpc.RpcError:
     return error.value
 
 
-def test_members_are_let_in_under_their_names(plane: Plane) -> None:
+def test_members_are_let_in_under_their_names(plane: SecuredControlPlane) -> None:
     a, r = plane.member("cloud-a", IdentityRole.CLOUD), plane.member("robot-1")
     with cloud(plane.address, "cloud-a", a) as c, robot(plane.address, "robot-1", r) as r1:
         r1.peers("cloud-a")
@@ -109,7 +58,7 @@ def test_members_are_let_in_under_their_names(plane: Plane) -> None:
 
 
 @pytest.mark.parametrize("case", ["untrusted", "expired", "not_yet_valid"])
-def test_certificates_that_are_no_good_are_refused(plane: Plane, case: str) -> None:
+def test_certificates_that_are_no_good_are_refused(plane: SecuredControlPlane, case: str) -> None:
     now = time.time()
     match case:
         case "untrusted":
@@ -122,7 +71,7 @@ def test_certificates_that_are_no_good_are_refused(plane: Plane, case: str) -> N
         refused(plane.address, secured)
 
 
-def test_who_shows_no_certificate_or_speaks_no_tls_is_refused(plane: Plane) -> None:
+def test_who_shows_no_certificate_or_speaks_no_tls_is_refused(plane: SecuredControlPlane) -> None:
     host, port = plane.address.split(":")
     with plane.counted("no_certificate"), socket.create_connection((host, int(port))) as raw:
         context = ssl.create_default_context(cadata=plane.authority.ca_pem.decode())
@@ -133,14 +82,14 @@ def test_who_shows_no_certificate_or_speaks_no_tls_is_refused(plane: Plane) -> N
 
 
 @pytest.mark.filterwarnings("ignore:ssl.TLSVersion:DeprecationWarning")
-def test_tls_1_2_is_refused(plane: Plane) -> None:
+def test_tls_1_2_is_refused(plane: SecuredControlPlane) -> None:
     with plane.counted("old_tls"):
         argv = ["openssl", "s_client", "-tls1_2", "-connect", plane.address]
         done = subprocess.run(argv, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     assert "Cipher is (NONE)" in done.stdout
 
 
-def test_a_half_open_handshake_ends(plane: Plane) -> None:
+def test_a_half_open_handshake_ends(plane: SecuredControlPlane) -> None:
     host, port = plane.address.split(":")
     with plane.counted("handshake_timeout"), socket.create_connection((host, int(port)), PATIENCE_S) as raw:
         raw.settimeout(PATIENCE_S)
@@ -148,7 +97,7 @@ def test_a_half_open_handshake_ends(plane: Plane) -> None:
             assert raw.recv(1) == b""
 
 
-def test_many_half_open_handshakes_from_one_place_do_not_keep_others_out(plane: Plane) -> None:
+def test_many_half_open_handshakes_from_one_place_do_not_keep_others_out(plane: SecuredControlPlane) -> None:
     host, port = plane.address.split(":")
     with contextlib.ExitStack() as stack:
         with plane.counted("too_many_handshakes"):
@@ -159,7 +108,7 @@ def test_many_half_open_handshakes_from_one_place_do_not_keep_others_out(plane: 
             stream.expect(Welcome)
 
 
-def test_a_name_or_role_that_the_certificate_does_not_say_is_refused(plane: Plane) -> None:
+def test_a_name_or_role_that_the_certificate_does_not_say_is_refused(plane: SecuredControlPlane) -> None:
     secured, total = plane.member("robot-1"), "plr_registrations_refused_total"
     for reason, said in (
         ("name_mismatch", registration("robot-2")),
@@ -172,7 +121,7 @@ def test_a_name_or_role_that_the_certificate_does_not_say_is_refused(plane: Plan
             assert "certificate" in text
 
 
-def test_each_service_is_for_its_roles_only(plane: Plane) -> None:
+def test_each_service_is_for_its_roles_only(plane: SecuredControlPlane) -> None:
     operator, r = plane.member("alice", IdentityRole.OPERATOR), plane.member("robot-1")
     with plane.counted("wrong_role"):
         error = refused(plane.address, operator)
@@ -202,7 +151,7 @@ def reflect(channel: grpc.Channel) -> grpc.Call:
     return result
 
 
-def test_a_revoked_cloud_loses_its_stream_and_its_peers_are_told(plane: Plane) -> None:
+def test_a_revoked_cloud_loses_its_stream_and_its_peers_are_told(plane: SecuredControlPlane) -> None:
     bad, r = plane.member("cloud-bad", IdentityRole.CLOUD), plane.member("robot-1")
     with robot(plane.address, "robot-1", r) as r1, cloud(plane.address, "cloud-bad", bad) as c:
         r1.peers("cloud-bad")
@@ -220,7 +169,7 @@ def test_a_revoked_cloud_loses_its_stream_and_its_peers_are_told(plane: Plane) -
             assert "the certificate of cloud-bad is revoked" in str(error)
 
 
-def test_a_certificate_that_ends_takes_its_stream_with_it(plane: Plane) -> None:
+def test_a_certificate_that_ends_takes_its_stream_with_it(plane: SecuredControlPlane) -> None:
     now = time.time()
     short = plane.member("short", validity=Validity(now - HOUR_S, now + 3.0))
     with Sidecar(plane.address, registration("short"), short) as stream:
@@ -231,7 +180,7 @@ def test_a_certificate_that_ends_takes_its_stream_with_it(plane: Plane) -> None:
             assert "certificate" in text
 
 
-def test_new_files_are_taken_without_a_restart(plane: Plane) -> None:
+def test_new_files_are_taken_without_a_restart(plane: SecuredControlPlane) -> None:
     with Sidecar(plane.address, registration("robot-1"), plane.member("robot-1")) as before:
         before.expect(Welcome)
         other = Authority.create("next")
@@ -243,7 +192,7 @@ def test_new_files_are_taken_without_a_restart(plane: Plane) -> None:
     assert plane.count("plr_certificate_expiry_timestamp_seconds") > time.time()
 
 
-def test_a_stream_that_speaks_too_fast_is_ended(plane: Plane) -> None:
+def test_a_stream_that_speaks_too_fast_is_ended(plane: SecuredControlPlane) -> None:
     with Sidecar(plane.address, registration("robot-1"), plane.member("robot-1")) as stream:
         stream.expect(Welcome)
         with plane.counted("too_fast"):
@@ -254,14 +203,14 @@ def test_a_stream_that_speaks_too_fast_is_ended(plane: Plane) -> None:
             assert "too fast" in text
 
 
-def test_a_message_that_is_too_long_ends_the_stream(plane: Plane) -> None:
+def test_a_message_that_is_too_long_ends_the_stream(plane: SecuredControlPlane) -> None:
     with Sidecar(plane.address, registration("robot-1"), plane.member("robot-1")) as stream:
         stream.expect(Welcome)
         stream.send_raw(control_pb2.SidecarMessage(nack=control_pb2.Nack(error="x" * (5 << 20))))
         assert stream.end()[0] is grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
-def test_one_name_gets_few_streams(plane: Plane) -> None:
+def test_one_name_gets_few_streams(plane: SecuredControlPlane) -> None:
     secured = plane.member("robot-1")
     with contextlib.ExitStack() as stack:
         waiting = [stack.enter_context(Stream(plane.address, secured)) for _ in range(3)]

@@ -19,7 +19,7 @@ from controlplane.metrics import Metrics
 from protos.config_fields import split_host_port
 from protos.identity import Identity, IdentityRole
 from protos.model import NodeName, Role
-from sidecar.config import load_config
+from sidecar.config import SidecarConfig, load_config
 from sidecar.core.control_session import ControlStats
 from sidecar.core.stats import EngineStats
 from sidecar.metrics import MetricSources, SidecarCollector
@@ -137,9 +137,17 @@ def test_the_account_of_the_units_is_made(tmp_path: Path) -> None:
         assert settings(unit.stem, "User") == accounts
 
 
+def certified(role: Role) -> Identity:
+    return Identity(NodeName(f"{role.value}-7"), IdentityRole(role.value), 1, 0.0, 1.0)
+
+
+def sidecar_config(role: Role) -> SidecarConfig:
+    return load_config(DEPLOY / "config" / f"sidecar-{role.value}.yaml", lambda _: certified(role))
+
+
 @pytest.mark.parametrize("role", list(Role))
 def test_the_example_configurations_of_the_sidecar_load(role: Role) -> None:
-    config = load_config(DEPLOY / "config" / f"sidecar-{role.value}.yaml")
+    config = sidecar_config(role)
     assert config.role is role
     # Where the unit lets the sidecar write.
     assert config.state_dir == Path("/var/lib") / settings("plr-sidecar", "StateDirectory")[0]
@@ -153,7 +161,7 @@ def test_the_example_configuration_of_the_control_plane_loads() -> None:
 
 def test_the_example_configurations_belong_together() -> None:
     control = load_controlplane_config(DEPLOY / "config" / "controlplane.yaml")
-    sidecars = [load_config(DEPLOY / "config" / f"sidecar-{role.value}.yaml") for role in Role]
+    sidecars = [sidecar_config(role) for role in Role]
     assert {split_host_port(sidecar.control_plane)[1] for sidecar in sidecars} == {split_host_port(control.listen)[1]}
     listen = {"plr-sidecar": sidecars[0].metrics_listen, "plr-controlplane": control.metrics_listen}
     scrape = yaml.safe_load((DEPLOY / "prometheus" / "prometheus.yml").read_text())["scrape_configs"]
@@ -204,6 +212,7 @@ def family(name: str) -> str:
 
 def exported_metrics() -> dict[str, set[str]]:
     """What the two programs export, with labels."""
+    identity = certified(Role.ROBOT)
     sidecar = SidecarCollector(
         MetricSources(
             name="robot-7",
@@ -215,10 +224,11 @@ def exported_metrics() -> dict[str, set[str]]:
             connected=lambda: False,
             bridge=None,
             state_failures=dict,
+            certificate=lambda: identity,
         )
     )
     control = Metrics()
-    control.own_certificate(Identity(NodeName("control"), IdentityRole.CONTROL_PLANE, 1, 0.0, 1.0))
+    control.own_certificate(identity)
     config = load_controlplane_config(DEPLOY / "config" / "controlplane.yaml")
     control.update(ControlCore(config.settings(), version_epoch=1, now=0.0), (), 0, 0.0)
     families = [*sidecar.collect(), *control.registry.collect()]

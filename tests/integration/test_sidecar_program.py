@@ -60,6 +60,7 @@ class Program:
         self.config = {
             "name": "robot-1",
             "role": "robot",
+            "insecure": True,
             "control_plane": f"127.0.0.1:{free_port()}",
             "interfaces": ["lo"],
             "state_dir": str(folder / "state"),

@@ -68,6 +68,7 @@ def write_configurations(folder: Path) -> None:
             {
                 "name": "robot-7",
                 "role": "robot",
+                "insecure": True,
                 "control_plane": "127.0.0.1:50051",
                 "services": [{"name": "/plan_path", "deadline_ms": 100}],
                 "interfaces": ["wlan0"],

@@ -124,6 +124,7 @@ def _sidecar_metrics() -> Iterator[Metric]:
         connected=lambda: True,
         bridge=lambda: BridgeStats(unanswered=Counter({(ServiceName("/s"), "failed"): 1})),
         state_failures=dict,
+        certificate=lambda: Identity(NodeName("robot"), IdentityRole.ROBOT, 1, 0.0, 1.0),
     )
     yield from SidecarCollector(sources).collect()
 

@@ -76,7 +76,9 @@ class EngineProgram:
         """Open the interfaces of a sidecar's configuration; returns it as a peer, for the other side's `meet`."""
         if null_cipher:
             install()
-        parsed = SidecarConfig.model_validate({"control_plane": "127.0.0.1:1", "metrics_listen": None, **config})
+        parsed = SidecarConfig.model_validate(
+            {"control_plane": "127.0.0.1:1", "insecure": True, "metrics_listen": None, **config}
+        )
         self._role, self._answer_bytes = parsed.role, answer_bytes
         logging.basicConfig(level=parsed.log_level.name, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
         sys.setswitchinterval(SWITCH_INTERVAL_S)

@@ -9,7 +9,8 @@ import yaml
 from pydantic import ValidationError
 
 from protos.errors import ConfigError
-from protos.model import Role
+from protos.identity import Identity, IdentityRole
+from protos.model import NodeName, Role
 from sidecar.config import (
     DEFAULT_CLOUD_UDP_PORT,
     LogLevel,
@@ -17,6 +18,7 @@ from sidecar.config import (
     config_schema,
     load_config,
     parse_config,
+    refuse_exposed,
 )
 from sidecar.core.priority import Priority
 
@@ -24,12 +26,14 @@ SOURCE = "sidecar.yaml"
 ROBOT: dict[str, Any] = {
     "name": "robot-1",
     "role": "robot",
+    "insecure": True,
     "control_plane": "plr.example.org:50051",
     "services": [{"name": "/plan_path", "deadline_ms": 100}],
 }
 CLOUD: dict[str, Any] = {
     "name": "cloud-a",
     "role": "cloud",
+    "insecure": True,
     "control_plane": "[2001:db8::1]:50051",
     "services": [{"name": "/*"}],
 }
@@ -284,6 +288,7 @@ def test_merge_keys_of_yaml_work() -> None:
     text = """
 name: robot-1
 role: robot
+insecure: true
 control_plane: c:1
 services:
 - &first {name: /a, deadline_ms: 100}
@@ -325,3 +330,48 @@ def test_schema_describes_every_key_and_is_json() -> None:
     assert all("description" in entry or "$ref" in entry for entry in schema["properties"].values())
     service = schema["$defs"]["ServiceConfig"]
     assert all("description" in entry for entry in service["properties"].values())
+
+
+def certificate(name: str = "robot-1", role: IdentityRole = IdentityRole.ROBOT) -> Identity:
+    return Identity(NodeName(name), role, 1, 0.0, 1.0)
+
+
+def parse_certified(identity: Identity, **keys: Any) -> SidecarConfig:
+    base = {"control_plane": "plr.example.org:50051", "tls_dir": "/etc/plr/tls", "services": ROBOT["services"]}
+    return parse_config(yaml.safe_dump({**base, **keys}), SOURCE, lambda _: identity)
+
+
+def test_name_and_role_come_from_the_certificate() -> None:
+    config = parse_certified(certificate())
+    assert (config.name, config.role) == ("robot-1", Role.ROBOT)
+    assert parse_certified(certificate(), name="robot-1", role="robot") == config
+    assert config_schema()["required"] == ["control_plane", "services"]
+
+
+@pytest.mark.parametrize(
+    ("identity", "keys", "told"),
+    [
+        (
+            certificate(),
+            {"name": "robot-2"},
+            "name: expected 'robot-1' as in the certificate, or nothing, got 'robot-2'",
+        ),
+        (certificate(), {"role": "cloud"}, "role: expected 'robot' as in the certificate"),
+        (certificate("al", IdentityRole.OPERATOR), {}, "tls_dir: expected the certificate of a robot or a cloud"),
+        (certificate(), {"insecure": True}, "insecure: expected without tls_dir"),
+        (certificate(), {"tls_dir": "tls"}, "tls_dir: expected an absolute path, got 'tls'"),
+    ],
+)
+def test_what_does_not_fit_the_certificate_is_refused(identity: Identity, keys: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_certified(identity, **keys)
+    assert told in str(caught.value)
+
+
+def test_insecure_mode_is_for_the_same_machine() -> None:
+    refuse_exposed(parse_certified(certificate()), SOURCE)
+    for target in ("127.0.0.1:1", "[::1]:1", "localhost:1"):
+        refuse_exposed(parse(ROBOT, control_plane=target), SOURCE)
+    for target in ("192.0.2.1:1", "[2001:db8::1]:1", "control.example.org:1"):
+        with pytest.raises(ConfigError, match="control_plane: expected a loopback address with insecure: true"):
+            refuse_exposed(parse(ROBOT, control_plane=target), SOURCE)

@@ -62,6 +62,7 @@ class Counters:
             connected=lambda: True,
             bridge=lambda: self.bridge,
             state_failures=lambda: self.state_failures,
+            certificate=lambda: None,
         )
 
 

@@ -1,0 +1,48 @@
+"""What gRPC's words for a failed TLS connection mean, and what to do about it. Pure: text in, text out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from protos.identity import CONTROL_PLANE_DNS, CertificateError
+
+if TYPE_CHECKING:
+    from protos.tls_files import TlsFiles
+
+_SEE_LOG = "its log tells more"
+
+
+def explain(details: str, files: TlsFiles | None, now_wall: float) -> str | None:
+    """Return one line for the operator, or None if TLS has nothing to do with it.
+
+    `details` is how a connection failed that never came to be, `files` what the client shows (None: insecure) and
+    `now_wall` the time in seconds since 1970.
+    """
+    cut_off = "Socket closed" in details or "recvmsg:" in details
+    if files is None:
+        return (
+            f"the control plane cut the connection: it may expect TLS, while here is insecure: true; {_SEE_LOG}"
+            if (cut_off)
+            else None
+        )
+    if "WRONG_VERSION_NUMBER" in details:
+        return "the control plane speaks no TLS: it is insecure, or this is some other program's port"
+    if "CERTIFICATE_VERIFY_FAILED" in details:
+        if "expired" in details or "not yet valid" in details:
+            return "the control plane's certificate is not in force: compare the clocks, or renew it (plr ca renew)"
+        return (
+            f"the control plane's certificate is not of a CA in {files.directory}/ca.pem: copy the ca.pem of the "
+            "fleet's CA there"
+        )
+    if "Hostname Verification" in details or "is not in peer certificate" in details:
+        return f"who answers is no control plane: its certificate does not name {CONTROL_PLANE_DNS}"
+    if not cut_off:
+        return None
+    try:
+        files.trust.check(files.certificate_der, now_wall)
+    except CertificateError as error:
+        return f"{error}: the control plane does not let it in; do: plr ca renew {files.identity.name}"
+    return (
+        "the control plane cut the connection during the TLS handshake: it may not know our CA, its clock may differ, "
+        f"or it is insecure; {_SEE_LOG}"
+    )

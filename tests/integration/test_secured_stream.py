@@ -1,0 +1,157 @@
+"""The sidecar's control client and `plr` with certificates: what works, and what their users read when it does not."""
+
+from __future__ import annotations
+
+import queue
+import random
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from controlplane.ca import Authority, Validity
+from protos.identity import IdentityRole
+from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, Welcome
+from protos.tls_files import TlsWatch, load_tls_files
+from sidecar import control_client
+from sidecar.control_client import ControlClient
+from sidecar.core.control_session import ControlSession
+from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, cloud
+from tests.integration.secured_control_plane import HOUR_S, SecuredControlPlane
+from tests.unit.controlplane.samples import registration
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from protos.tls_files import TlsFiles
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredControlPlane]:
+    with SecuredControlPlane(tmp_path_factory.mktemp("plane")) as process:
+        yield process
+
+
+class Robot:
+    """A control client with the files of a folder; what happens waits in queues."""
+
+    def __init__(self, address: str, folder: Path | None) -> None:
+        self.session = ControlSession(registration("robot-1"), random.Random(1))
+        self.tls = TlsWatch(load_tls_files(folder)) if folder is not None else None
+        self.client = ControlClient(address, self.session, self, self.tls)
+        self.peers: queue.Queue[PeerSet] = queue.Queue()
+        self.connection: queue.Queue[tuple[bool, str]] = queue.Queue()
+        self.files: queue.Queue[TlsFiles] = queue.Queue()
+
+    def welcome(self, welcome: Welcome) -> None:
+        pass
+
+    def apply_peers(self, peers: PeerSet) -> str | None:
+        self.peers.put(peers)
+        return None
+
+    def apply_mapping(self, mapping: MappingSet) -> str | None:
+        return None
+
+    def take_report(self) -> Report:
+        return Report()
+
+    def connection_changed(self, connected: bool, reason: str) -> None:
+        self.connection.put((connected, reason))
+
+    def certificate_changed(self, files: TlsFiles) -> None:
+        self.files.put(files)
+
+    def __enter__(self) -> Robot:
+        self.client.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.client.stop()
+
+
+def test_a_renewed_certificate_is_shown_on_a_new_stream(
+    plane: SecuredControlPlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_client, "WATCH_INTERVAL_S", 0.05)
+    folder = tmp_path / "tls"
+    plane.authority.write_tls_dir(folder, "robot-1", IdentityRole.ROBOT)
+    with cloud(plane.address, "cloud-a", plane.member("cloud-a", IdentityRole.CLOUD)) as server:
+        with Robot(plane.address, folder) as robot:
+            assert robot.connection.get(timeout=PATIENCE_S) == (True, "registered")
+            first = robot.peers.get(timeout=PATIENCE_S)
+            server.peers("robot-1")
+            renewed = plane.authority.renew("robot-1")
+            replace_files(folder, renewed.key_pem, renewed.certificate_pem)
+            files = robot.files.get(timeout=PATIENCE_S)
+            assert files.certificate_der == renewed.certificate_der
+            assert robot.connection.get(timeout=PATIENCE_S) == (False, "new certificate files")
+            assert robot.connection.get(timeout=PATIENCE_S) == (True, "registered")
+            assert robot.session.version(ResourceKind.PEERS) == first.version
+
+
+def replace_files(folder: Path, key: bytes, certificate: bytes) -> None:
+    for name, content, mode in (("key.pem", key, 0o600), ("cert.pem", certificate, 0o644)):
+        part = folder / "part"
+        part.write_bytes(content)
+        part.chmod(mode)
+        part.replace(folder / name)
+
+
+def failure(address: str, folder: Path | None) -> str:
+    """Why the client cannot connect, as it is logged."""
+    with Robot(address, folder) as robot:
+        while robot.client.last_failure is None:
+            time.sleep(0.02)
+        return robot.client.last_failure
+
+
+def test_what_the_operator_reads_of_a_sidecar_that_does_not_get_in(plane: SecuredControlPlane, tmp_path: Path) -> None:
+    now = time.time()
+    stranger = Authority.create()
+    stranger.write_tls_dir(tmp_path / "other", "robot-1", IdentityRole.ROBOT)
+    assert f"is not of a CA in {tmp_path}/other/ca.pem" in failure(plane.address, tmp_path / "other")
+    (tmp_path / "other" / "ca.pem").write_bytes(stranger.ca_pem + plane.authority.ca_pem)
+    assert "it may not know our CA" in failure(plane.address, tmp_path / "other")
+    past = Validity(now - 2 * HOUR_S, now - HOUR_S)
+    plane.authority.write_tls_dir(tmp_path / "old", "robot-old", IdentityRole.ROBOT, validity=past)
+    assert "expired" in (told := failure(plane.address, tmp_path / "old"))
+    assert told.endswith("do: plr ca renew robot-old")
+    assert "it may expect TLS" in failure(plane.address, None)
+    plane.authority.write_tls_dir(tmp_path / "good", "robot-good", IdentityRole.ROBOT)
+    (tmp_path / "insecure").mkdir()
+    with ControlPlaneProcess(tmp_path / "insecure") as insecure:
+        assert "speaks no TLS" in failure(insecure.address, tmp_path / "good")
+    assert "Connection refused" in failure(insecure.address, tmp_path / "good")
+
+
+def test_a_name_that_is_not_the_certificates_is_refused_in_words(plane: SecuredControlPlane, tmp_path: Path) -> None:
+    plane.authority.write_tls_dir(tmp_path / "tls", "robot-2", IdentityRole.ROBOT)
+    assert "the certificate is another name's" in failure(plane.address, tmp_path / "tls")
+
+
+def plr(*arguments: str) -> subprocess.CompletedProcess[str]:
+    argv = [sys.executable, "-m", "controlplane.cli", *arguments]
+    return subprocess.run(argv, capture_output=True, text=True, check=False)
+
+
+def test_plr_asks_with_an_operators_certificate(plane: SecuredControlPlane, tmp_path: Path) -> None:
+    plane.authority.write_tls_dir(tmp_path / "alice", "alice", IdentityRole.OPERATOR)
+    plane.authority.write_tls_dir(tmp_path / "robot", "robot-7", IdentityRole.ROBOT)
+    with Sidecar(plane.address, registration("cloud-a", Role.CLOUD), plane.member("cloud-a", IdentityRole.CLOUD)) as c:
+        c.expect(Welcome)
+        shown = plr("status", "--address", plane.address, "--tls-dir", str(tmp_path / "alice"))
+        assert shown.returncode == 0, shown.stderr
+        assert "cloud-a" in shown.stdout
+    denied = plr("status", "--address", plane.address, "--tls-dir", str(tmp_path / "robot"))
+    assert denied.returncode == 1
+    assert "the certificate of robot-7 is a robot's: it may not use plr.v1.Admin" in denied.stderr
+    insecure = plr("status", "--address", plane.address, "--insecure")
+    assert insecure.returncode == 1
+    assert "it may expect TLS" in insecure.stderr
+    missing = plr("status", "--address", plane.address, "--tls-dir", str(tmp_path / "none"))
+    assert missing.returncode == 2
+    assert missing.stderr.count("\n") == 1
