@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.netns.unit_sandbox import allowed_calls
-from tests.netns.unit_world import WORKING
+from tests.netns.unit_world import DAYS_LEFT, FIRST_DAYS, WORKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -61,6 +61,11 @@ def test_nothing_it_does_is_refused(seen: dict[str, Any], program: str) -> None:
 def test_the_sidecar_reaches_the_control_plane_and_its_stun_server(seen: dict[str, Any]) -> None:
     measured = seen["controlplane"]["metrics"] | seen["sidecar"]["metrics"]
     assert all(measured.get(name) for name in WORKING), measured
+
+
+@pytest.mark.parametrize("program", ["controlplane", "sidecar"])
+def test_a_renewed_certificate_is_taken_up_without_a_restart(seen: dict[str, Any], program: str) -> None:
+    assert seen[program]["metrics"][DAYS_LEFT] > FIRST_DAYS, seen[program]["log"]
 
 
 def test_the_sidecar_may_bind_its_sockets_to_the_interface(seen: dict[str, Any]) -> None:

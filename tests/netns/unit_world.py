@@ -15,7 +15,14 @@ import sys
 import time
 import urllib.request
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from controlplane.ca import Authority
+from controlplane.ca.files import write_tls_files
+from protos.identity import IdentityRole
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -39,6 +46,11 @@ WORKING = (
 )
 """Metrics that are not 0 once the two have found each other and STUN has been answered."""
 
+NODES = {"controlplane": IdentityRole.CONTROL_PLANE, "sidecar": IdentityRole.ROBOT}
+FIRST_DAYS = 30.0
+RENEWED_DAYS = 60.0
+DAYS_LEFT = "plr_certificate_days_left"
+
 
 def make_network() -> None:
     for command in (
@@ -55,8 +67,8 @@ def write_configurations(folder: Path) -> None:
     (folder / "controlplane.json").write_text(
         json.dumps(
             {
-                "insecure": True,
-                "listen": "127.0.0.1:50051",
+                "tls_dir": str(folder / "controlplane-tls"),
+                "listen": "10.77.0.1:50051",
                 "stun_listen": "[::]:3478",
                 "stun_servers": ["10.77.0.1:3478"],
                 "metrics_listen": PROGRAMS["controlplane"][2],
@@ -66,10 +78,8 @@ def write_configurations(folder: Path) -> None:
     (folder / "sidecar.json").write_text(
         json.dumps(
             {
-                "name": "robot-7",
-                "role": "robot",
-                "insecure": True,
-                "control_plane": "127.0.0.1:50051",
+                "tls_dir": str(folder / "sidecar-tls"),
+                "control_plane": "10.77.0.1:50051",
                 "services": [{"name": "/plan_path", "deadline_ms": 100}],
                 "interfaces": ["wlan0"],
                 "state_dir": str(folder / "state"),
@@ -79,6 +89,23 @@ def write_configurations(folder: Path) -> None:
     )
     (folder / "state").mkdir()
     os.chown(folder / "state", PROGRAMS["sidecar"][0], PROGRAMS["sidecar"][0])
+
+
+def issue_certificates(folder: Path) -> Authority:
+    """Give each program a tls_dir that belongs to its user."""
+    authority = Authority.create()
+    for name, role in NODES.items():
+        tls = folder / f"{name}-tls"
+        tls.mkdir(mode=0o700)
+        os.chown(tls, PROGRAMS[name][0], PROGRAMS[name][0])
+        authority.write_tls_dir(tls, f"{name}-7", role, days=FIRST_DAYS)
+    return authority
+
+
+def renew_certificates(folder: Path, authority: Authority) -> None:
+    for name in NODES:
+        renewed = authority.renew(f"{name}-7", days=RENEWED_DAYS)
+        write_tls_files(folder / f"{name}-tls", renewed, authority.ca_pem, authority.crl_pem())
 
 
 def start(name: str, folder: Path) -> tuple[subprocess.Popen[bytes], socket.socket]:
@@ -126,21 +153,27 @@ def metrics(name: str) -> dict[str, float]:
     return {key: float(value) for key, _, value in (line.rpartition(" ") for line in lines if not line.startswith("#"))}
 
 
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Wait for the condition, but not for ever: what has become of it shows in the metrics."""
+    patience = time.monotonic() + CONNECTED_S
+    while time.monotonic() < patience and not condition():
+        time.sleep(0.2)
+
+
 def main(folder: Path) -> dict[str, Any]:
     make_network()
     write_configurations(folder)
+    authority = issue_certificates(folder)
     running: dict[str, tuple[subprocess.Popen[bytes], socket.socket]] = {}
     seen: dict[str, Any] = {}
     try:
         for name in PROGRAMS:
             running[name] = start(name, folder)
             seen[name] = {"ready": wait_for(running[name][1], "READY=1", READY_S)}
-        patience = time.monotonic() + CONNECTED_S
-        while time.monotonic() < patience and all(program["ready"] for program in seen.values()):
-            now = {**metrics("controlplane"), **metrics("sidecar")}
-            if all(now.get(name) for name in WORKING):
-                break
-            time.sleep(0.2)
+        if all(program["ready"] for program in seen.values()):
+            wait_until(lambda: all((metrics("controlplane") | metrics("sidecar")).get(name) for name in WORKING))
+            renew_certificates(folder, authority)
+            wait_until(lambda: all(metrics(name).get(DAYS_LEFT, 0.0) > FIRST_DAYS for name in PROGRAMS))
         for name in PROGRAMS:
             seen[name]["metrics"] = metrics(name) if seen[name]["ready"] else {}
         for name in reversed(PROGRAMS):
