@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from protos.tls_files import TlsFiles
 
 PRIVATE_KEY_BYTES = 32
+CPUINFO = Path("/proc/cpuinfo")
 
 
 def start_session(name: NodeName, role: Role, incarnation: int, tls: Callable[[], TlsFiles] | None) -> OwnSession:
@@ -54,7 +55,7 @@ def signed(credential: SessionCredential, tls: TlsFiles) -> SessionCredential:
 def preferred_aead() -> Aead:
     """Return what this machine is quicker at: AES where the processor has instructions for it."""
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = CPUINFO.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return Aead.CHACHA20_POLY1305
     words = {word for line in lines if line.startswith(("flags", "Features")) for word in line.split()}

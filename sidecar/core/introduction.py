@@ -81,6 +81,8 @@ def open_introduction(header: Header, datagram: memoryview, token: bytes, receiv
         UnauthenticError: it is not of one who knows the token.
         DecodeError: its content breaks the layout, or is of another session.
     """
+    if len(datagram) < _SEALED_FROM:
+        raise DecodeError("introduction cut off")
     clear = bytes(datagram[:_SEALED_FROM])
     try:
         cipher = _cipher(header, token, receiver)

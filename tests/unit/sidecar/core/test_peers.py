@@ -2,7 +2,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
+from protos.errors import DecodeError
 from protos.model import (
     NO_POLICY,
     POLICY_PENDING,
@@ -23,8 +26,12 @@ from protos.model import (
 )
 from sidecar.core.link_events import PeerRestarted
 from sidecar.core.peers import MAX_PEERS, RESTART_GAP_S, Peers
-from tests.sessions import credential_of, session_of, with_credential
+from sidecar.core.session import OwnSession
+from tests.sessions import credential_of, private_key, session_of, with_credential
 from tests.unit.sidecar.core.builders import ECHO, A, B, peer
+
+if TYPE_CHECKING:
+    from protos.credential import SessionCredential
 
 OWN = session_of("robot-1", Role.ROBOT, 99)
 HELD = peer(A, session=1), peer(B, session=2)
@@ -179,3 +186,46 @@ def test_links_get_each_address_of_an_interface_once() -> None:
     )  # fmt: skip
     (link_peer,) = known(with_credential(subject)).for_links()
     assert link_peer.addresses == ((0, (("a", 1),)), (1, (("b", 1), ("c", 1))))
+
+
+def test_a_peer_whose_credential_is_bad_is_no_peer_and_one_held_for_its_paths_is_one_no_more() -> None:
+    peers = known(*HELD)
+    bad = replace(HELD[0], credential=HELD[1].credential)
+    assert peers.apply(view(bad, HELD[1]), everybody) is None
+    assert peers.names() == [B]
+    assert set(peers.refused) == {A}
+    assert peers._dropped == {"bad_credential": 1}
+    assert [link_peer.name for link_peer in peers.for_links()] == [B]
+
+
+def test_a_restart_whose_credential_is_refused_changes_nothing_and_keeps_others_waiting() -> None:
+    refused: list[str] = []
+
+    def judge(credential: SessionCredential) -> None:
+        if credential.session == 9:
+            refused.append(credential.name)
+            raise DecodeError("forged")
+
+    peers = Peers(OwnSession(OWN.credential, private_key("robot-1", 99), judge), Counter())
+    peers.apply(view(*HELD), nobody)
+    for step in range(10):
+        assert not peers.restarted(restart(), 1.0 + step * RESTART_GAP_S / 10)
+    assert refused == [A], "one look in this time, however many ask for it"
+    assert peers.session(A) == 1
+    assert peers.restarted(restart(session=10, incarnation=3), 1.0 + RESTART_GAP_S)
+
+
+def test_peers_are_judged_anew_when_trust_changes() -> None:
+    revoked: set[str] = set()
+
+    def judge(credential: SessionCredential) -> None:
+        if credential.name in revoked:
+            raise DecodeError("revoked")
+
+    peers = Peers(OwnSession(OWN.credential, private_key("robot-1", 99), judge), Counter())
+    peers.apply(view(*HELD), nobody)
+    assert peers.recheck() == []
+    revoked.add(A)
+    assert peers.recheck() == [A]
+    assert peers.names() == [B]
+    assert peers.refused == {A: "revoked"}

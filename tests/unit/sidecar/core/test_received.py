@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from sidecar.core.frame import MAX_ACK_RANGES
 from sidecar.core.received import MAX_ACK_DELAY_S, STALE_PACKETS, ReceivedPackets
 
@@ -81,3 +84,36 @@ def test_a_duplicate_owes_nothing_new() -> None:
     packets.add(3, 1.0)
     packets.owe_ack(1.0)
     assert packets.ack_at == 1.0 + MAX_ACK_DELAY_S
+
+
+near = st.integers(0, 200)
+numbers = st.lists(near | near.map(lambda number: number * 37) | st.integers(0, 2**64 - 1), max_size=400)
+
+
+@given(numbers)
+@settings(max_examples=300)
+def test_no_number_is_ever_taken_twice_whatever_is_forgotten(arrivals: list[int]) -> None:
+    """The replay window: what was forgotten is refused (RFC 6479 in effect)."""
+    packets, taken = ReceivedPackets(), set[int]()
+    for number in arrivals + arrivals[::-1]:
+        if packets.add(number, 1.0):
+            assert number not in taken
+            taken.add(number)
+    assert len(packets._ranges) <= MAX_ACK_RANGES
+    largest = max(arrivals, default=0)
+    assert not any(packets.add(number, 1.0) for number in arrivals)
+    assert packets.add(largest + 1, 1.0)
+
+
+@given(st.lists(st.tuples(st.integers(0, 40), st.integers(1, 64)), max_size=60), numbers)
+def test_runs_and_single_ones_together_are_never_taken_twice(runs: list[tuple[int, int]], singles: list[int]) -> None:
+    packets, taken = ReceivedPackets(), set[int]()
+    for (gap, length), single in zip(runs, singles, strict=False):
+        low = packets.largest + 1 + gap
+        packets.add_run(low, low + length - 1, 1.0)
+        assert taken.isdisjoint(range(low, low + length))
+        taken.update(range(low, low + length))
+        number = single % (packets.largest + 3)
+        if packets.add(number, 1.0):
+            assert number not in taken
+            taken.add(number)
