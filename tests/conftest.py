@@ -17,3 +17,27 @@ def ros_domain() -> Iterator[int]:
     """A ROS domain that no other test on this machine has at the moment."""
     with leased_domain() as domain:
         yield domain
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of our own."""
+    parser.addoption(
+        "--fuzz-datagrams", type=int, default=20_000, help="datagrams that each fuzzing test sends (default 20000)"
+    )
+    parser.addoption(
+        "--rotation-seconds", type=float, default=15.0, help="length of the run that rotates all keys (default 15)"
+    )
+
+
+@pytest.fixture(scope="session")
+def rotation_seconds(pytestconfig: pytest.Config) -> float:
+    """How long the run shall take in which every key is changed."""
+    seconds: float = pytestconfig.getoption("--rotation-seconds")
+    return seconds
+
+
+@pytest.fixture(scope="session")
+def fuzz_datagrams(pytestconfig: pytest.Config) -> int:
+    """How many datagrams a fuzzing test shall send."""
+    count: int = pytestconfig.getoption("--fuzz-datagrams")
+    return count

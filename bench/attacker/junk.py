@@ -28,6 +28,8 @@ class JunkKind(enum.StrEnum):
     """A datagram seen on the way, one bit of it changed."""
     REPLAYED = "replayed"
     """A datagram seen on the way, as it is."""
+    MANGLED = "mangled"
+    """A datagram seen on the way, cut, stretched, changed."""
 
 
 def make_junk(kind: JunkKind, seen: Sequence[bytes], count: int, rng: random.Random) -> list[bytes]:
@@ -45,6 +47,8 @@ def _one(kind: JunkKind, seen: Sequence[bytes], rng: random.Random) -> bytes:
             return flipped(rng.choice(seen), rng)
         case JunkKind.REPLAYED:
             return rng.choice(seen)
+        case JunkKind.MANGLED:
+            return mangled(rng.choice(seen), rng)
 
 
 def noise(rng: random.Random) -> bytes:

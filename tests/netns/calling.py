@@ -24,8 +24,8 @@ class Call:
     def wait_until_sending(self) -> None:
         self._system.wait("the client to call", lambda: " sent " in self._part.log.read_text())
 
-    def result(self) -> dict[str, Any]:
-        self._part.process.wait(90)
+    def result(self, timeout_s: float = 90.0) -> dict[str, Any]:
+        self._part.process.wait(timeout_s)
         assert self._out.exists(), self._part.tail()
         return read_json(self._out)
 

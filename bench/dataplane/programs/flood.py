@@ -3,38 +3,69 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import random
 import socket
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bench.attacker.junk import JunkKind, make_junk
 from bench.attacker.send_many import flood
 from bench.dataplane.remote import serve
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 POOL = 4096
-"""Different datagrams, sent over and over."""
+"""Different datagrams of a flood, sent over and over."""
+SOURCES = 16
+ROUND = 20_000
+"""Datagrams of a fuzzer that are made before they are sent."""
 
 
 class FloodProgram:
-    """One attacker."""
+    """One attacker, who knows some real datagrams (`seen`, in base64)."""
 
     def flood(
-        self, address: str, port: int, kind: str, seen: list[str], rate_hz: float, seconds: float, sources: int = 16
+        self, address: str, port: int, kind: str, seen: list[str], rate_hz: float, seconds: float
     ) -> dict[str, Any]:
-        """Flood an address (IPv4); `seen` are real datagrams in base64. Returns what it sent and what that cost."""
-        pool = make_junk(JunkKind(kind), [base64.b64decode(one) for one in seen], POOL, random.Random(1))
-        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(sources)]
-        for sock in sockets:
-            sock.connect((address, port))
-        cpu = time.process_time()
-        sent = flood(sockets, pool, rate_hz, seconds)
-        for sock in sockets:
-            sock.close()
-        return {"sent": sent, "cpu_s": time.process_time() - cpu}
+        """Flood an address with junk of a kind; returns how much it sent and what that cost."""
+        pool = make_junk(JunkKind(kind), _decoded(seen), POOL, random.Random(1))
+        with _sockets(address, port) as sockets:
+            cpu = time.process_time()
+            sent = flood(sockets, pool, rate_hz, seconds)
+            return {"sent": sent, "cpu_s": time.process_time() - cpu}
+
+    def fuzz(self, address: str, port: int, seen: list[str], rate_hz: float, count: int, seed: int) -> int:
+        """Send junk of all kinds, each datagram another one; returns how many there were."""
+        rng = random.Random(seed)
+        known = _decoded(seen)
+        sent = 0
+        with _sockets(address, port) as sockets:
+            while sent < count:
+                kinds = list(JunkKind) if known else [JunkKind.NOISE]
+                pool = [junk for kind in kinds for junk in make_junk(kind, known, ROUND // len(kinds), rng)]
+                rng.shuffle(pool)
+                sent += flood(sockets, pool, rate_hz, len(pool) / rate_hz)
+        return sent
 
     def close(self) -> None:
         """Nothing to end."""
+
+
+def _decoded(seen: list[str]) -> list[bytes]:
+    return [base64.b64decode(one) for one in seen]
+
+
+@contextlib.contextmanager
+def _sockets(address: str, port: int) -> Iterator[list[socket.socket]]:
+    """Sockets of different ports of ours, connected."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket(family, socket.SOCK_DGRAM)) for _ in range(SOURCES)]
+        for sock in sockets:
+            sock.connect((address, port))
+        yield sockets
 
 
 if __name__ == "__main__":
