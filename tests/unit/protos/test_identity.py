@@ -200,6 +200,8 @@ def pem(recipe: Recipe) -> bytes:
         CA.ca_pem + pem(Recipe()),
         CA.ca_pem * (MAX_CA_CERTIFICATES + 1),
     ],
+    # Workers of one run must agree on names, and keys are made anew in each.
+    ids=map(str, range(10)),
 )
 def test_what_is_no_ca_is_not_trusted(ca_pem: bytes) -> None:
     with pytest.raises(CertificateError) as caught:
@@ -211,7 +213,11 @@ def test_a_ca_by_a_recipe_is_one() -> None:
     Trust(pem(Recipe(ca=True, usage=CA_USAGE)))
 
 
-@pytest.mark.parametrize("crl", [b"", b"nothing", CA.ca_pem, CA.crl_pem()[:60] + CA.crl_pem()[-30:]])
+@pytest.mark.parametrize(
+    "crl",
+    [b"", b"nothing", CA.ca_pem, CA.crl_pem()[:60] + CA.crl_pem()[-30:]],
+    ids=["empty", "no PEM", "another kind", "cut"],
+)
 def test_what_is_no_revocation_list_is_refused(crl: bytes) -> None:
     with pytest.raises(CertificateError) as caught:
         Trust(CA.ca_pem, crl)
