@@ -118,7 +118,8 @@ class Path:
         self._probe_gap = FIRST_PROBE_S
         self._probed_at = now - FIRST_PROBE_S
         self._next_probe_id = 0
-        self._probes_out: dict[int, float] = {}
+        self._probes_out: dict[int, tuple[float, bool]] = {}
+        """When each unanswered probe left, and whether it was sealed with this path's keys."""
         self._waiting_since: float | None = None
         self._rebound = False
         self._was_up = False
@@ -139,7 +140,7 @@ class Path:
     def next_probe(self, now: float, rng: random.Random) -> int:
         """Return the id of a probe that leaves now, and plan the next one."""
         self._probed_at = now
-        probe_id = self.counter_probe(now)
+        probe_id = self._note_probe(now, sealed=self.state is not PathState.DOWN)
         self.waits_for_answer(now)
         if self.state is PathState.UP:
             gap = IDLE_PROBE_S
@@ -153,9 +154,12 @@ class Path:
         return probe_id
 
     def counter_probe(self, now: float) -> int:
-        """Return the id of a probe that leaves now besides those that are planned."""
+        """Return the id of a sealed probe that leaves now besides those that are planned."""
+        return self._note_probe(now, sealed=True)
+
+    def _note_probe(self, now: float, *, sealed: bool) -> int:
         probe_id = self.take_probe_id()
-        self._probes_out[probe_id] = now
+        self._probes_out[probe_id] = now, sealed
         if len(self._probes_out) > MAX_PROBES_OUT:
             del self._probes_out[next(iter(self._probes_out))]
         return probe_id
@@ -189,11 +193,13 @@ class Path:
 
     def answered_probe(self, probe_id: int, now: float) -> bool:
         """A PROBE_REPLY came; False when it answers nothing we asked."""
-        sent_at = self._probes_out.pop(probe_id, None)
-        if sent_at is None:
+        probe = self._probes_out.pop(probe_id, None)
+        if probe is None:
             return False
+        sent_at, sealed = probe
         self.recovery.rtt.sample(now - sent_at, now)
-        self.sealing.delivered(sent_at)
+        if sealed:
+            self.sealing.delivered(sent_at)
         self.note_rtt()
         return True
 

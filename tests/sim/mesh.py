@@ -171,6 +171,8 @@ class Mesh:
         self.version = 0
         self.calls = 0
         self.key_limits = DEFAULT_LIMITS
+        self.tap: Callable[[Address, Address, bytes], None] | None = None
+        """Sees every datagram that leaves: from where, where to."""
 
     def add(self, name: str, role: Role, interfaces: list[str], rules: tuple[ServiceRule, ...]) -> Node:
         node = self.nodes[name] = Node(self, name, role, interfaces, rules)
@@ -312,6 +314,8 @@ class Mesh:
             node.engine.set_carried(frozenset(node.engine._offers.offered))
 
     def _carry(self, source: Address, destination: Address, data: bytes) -> None:
+        if self.tap is not None:
+            self.tap(source, destination, data)
         wire = self.wire(source[0], destination[0])
         wire.carried += len(data)
         copies = 2 if self.rng.random() < wire.duplicate else 1
@@ -328,6 +332,10 @@ class Mesh:
                 wire.busy_until = start = start + len(data) / wire.bytes_per_s
             arrival = start - self.now + wire.delay_s + self.rng.uniform(0, wire.jitter_s)
             self.at(arrival, lambda: self._arrive(source, destination, data))
+
+    def inject(self, source: Address, destination: Address, data: bytes) -> None:
+        """Let a datagram arrive that nobody sent, or that somebody else did."""
+        self._arrive(source, destination, data)
 
     def _arrive(self, source: Address, destination: Address, data: bytes) -> None:
         name, interface = destination[0].rsplit(".", 1)
