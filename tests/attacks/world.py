@@ -10,16 +10,21 @@ The attacker sees what passes the internet and puts what it likes on any cable t
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bench.attacker.wire import Tap
 from bench.netlab import Lab, LabConfig, LinkProfile, robot, server
+from bench.system import CONTROL_METRICS_PORT
+from controlplane.ca.files import write_atomically
+from protos.tls_files import CRL_FILE
 from tests.netns.calling import Call, assert_flawless
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
     from bench.attacker.wire import Captured
     from bench.system import Part, System
@@ -59,21 +64,18 @@ class World:
     def lab(self) -> Lab:
         return self.system.lab
 
-    def start(self) -> None:
-        """Everything a user would start."""
+    def start(self, policy: dict[str, Any] | None = None, **sidecars: Any) -> None:
+        """Everything a user would start; `sidecars` go to the configuration of all of them."""
         for name, profile in (("wlan0", WLAN), ("wwan0", WWAN)):
             self.lab.link(name, host="robot").set(profile)
-        self.system.start_control_plane()
+        self.system.start_control_plane(**({} if policy is None else {"policy": policy}))
         for cloud in CLOUDS:
-            self.start_cloud(cloud)
-        self.system.wait_for_offer(self.start_robot())
+            self.system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
+            self.system.start_cloud(cloud, OFFERS, **sidecars)
+        self.system.wait_for_offer(self.start_robot(**sidecars))
 
-    def start_cloud(self, cloud: str) -> None:
-        self.system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
-        self.system.start_cloud(cloud, OFFERS)
-
-    def start_robot(self) -> Part:
-        return self.system.start_robot(SERVICES)
+    def start_robot(self, **changes: Any) -> Part:
+        return self.system.start_robot(SERVICES, **changes)
 
     # -- the wire -------------------------------------------------------------------------------------------------
 
@@ -132,6 +134,40 @@ class World:
                 return
             assert time.monotonic() < end, f"{host}: {count} refusals as {reasons} expected, more than before: {more}"
             time.sleep(0.1)
+
+    def control_counter(self, name: str, **labels: str) -> float:
+        """The sum of the control plane's series of this name and labels."""
+        return sum(
+            value
+            for series, value in self.system.metrics("control", CONTROL_METRICS_PORT).items()
+            if series.partition("{")[0] == name and all(f'{key}="{wanted}"' in series for key, wanted in labels.items())
+        )
+
+    def wait_until_counted(self, name: str, count: float, **labels: str) -> None:
+        """Wait until the control plane counted so many."""
+        self.system.wait(
+            f"{name} {labels} >= {count}", lambda: self.control_counter(name, **labels) >= count, COUNTED_S
+        )
+
+    # -- what operators do ----------------------------------------------------------------------------------------
+
+    def revoke(self, name: str) -> None:
+        """Revoke a node's certificates and give the control plane the new list."""
+        self.system.authority.revoke(name)
+        write_atomically(self.tls_dir("control") / CRL_FILE, self.system.authority.crl_pem(), 0o644)
+
+    def tls_dir(self, name: str) -> Path:
+        """The folder of certificates of one who was started."""
+        return self.system.folder / f"{name}.tls"
+
+    @staticmethod
+    @contextlib.contextmanager
+    def later(seconds: float, act: Callable[[], None]) -> Iterator[None]:
+        """Do something while the block runs."""
+        timer = threading.Timer(seconds, act)
+        timer.start()
+        yield
+        timer.join()
 
     # -- legitimate traffic ---------------------------------------------------------------------------------------
 

@@ -1,0 +1,36 @@
+"""What a sidecar says first to the control plane, under whatever name, role and certificate the test likes."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from protos.convert import sidecar_message_to_proto
+from protos.credential import Aead, SessionCredential
+from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, SessionId, Version
+
+if TYPE_CHECKING:
+    from controlplane.ca import Issued
+
+SESSION = SessionId(0xA77AC)
+
+
+def registration(issued: Issued, name: str, role: Role, incarnation: int | None = None) -> bytes:
+    """An encoded registration with a credential signed by this certificate's key."""
+    incarnation = int(time.time() * 1000.0) if incarnation is None else incarnation
+    credential = SessionCredential(
+        NodeName(name), role, SESSION, incarnation, bytes(range(32)), Aead.AES_256_GCM, issued.certificate_der
+    ).sign(issued.key)
+    said = Registration(
+        protocol_version=PROTOCOL_VERSION,
+        name=NodeName(name),
+        role=role,
+        session=SESSION,
+        token=bytes(range(16)),
+        incarnation=incarnation,
+        software_version="attack",
+        peers_version=Version(0),
+        mapping_version=Version(0),
+        credential=credential.encode(),
+    )
+    return sidecar_message_to_proto(said).SerializeToString()
