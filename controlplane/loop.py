@@ -8,7 +8,7 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from controlplane.core.claims import check_claims
+from controlplane.core.claims import check_claims, check_unproven_claims
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import (
     Close,
@@ -87,7 +87,10 @@ class ControlLoop:
 
     def register(self, registration: Registration, caller: Caller | None) -> tuple[StreamId, Mailbox] | Refusal:
         """Begin a stream; returns what to write to it, or why it is refused. `caller` is None in insecure mode."""
-        refusal = None if caller is None else check_claims(registration, caller.identity)
+        if caller is None:
+            refusal = check_unproven_claims(registration)
+        else:
+            refusal = check_claims(registration, caller.identity, caller.certificate)
         if refusal is not None:
             return self._core.refuse(refusal)
         result = self._core.register(registration, self._loop.time())

@@ -40,6 +40,7 @@ _REFUSAL_CODES = {
     Refusal.FULL: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Refusal.NAME_MISMATCH: grpc.StatusCode.PERMISSION_DENIED,
     Refusal.WRONG_ROLE: grpc.StatusCode.PERMISSION_DENIED,
+    Refusal.BAD_CREDENTIAL: grpc.StatusCode.PERMISSION_DENIED,
 }
 
 _CLOSE_CODES = {

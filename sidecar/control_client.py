@@ -14,7 +14,7 @@ import contextlib
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import grpc
 
@@ -31,9 +31,10 @@ from sidecar.outage_log import OutageLog
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Candidate, MappingSet, ServiceOffer, ServiceUse
+    from protos.model import Candidate, ServiceOffer, ServiceUse
     from protos.plr.v1 import control_pb2
-    from protos.tls_files import TlsFiles, TlsWatch
+    from protos.tls_files import TlsWatch
+    from sidecar.control_hooks import ControlHooks
     from sidecar.core.control_session import ControlSession, ControlStats
 
     _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
@@ -78,28 +79,6 @@ _REFUSALS = frozenset(
     }
 )
 """The control plane decided so, and will decide so again a moment later."""
-
-
-class ControlHooks(Protocol):
-    """What the control client calls, on its own thread; it may wait there for the engine's lock."""
-
-    def welcome(self, welcome: Welcome) -> None:
-        """A stream is accepted; also the place of the STUN servers."""
-
-    def apply_peers(self, peers: PeerSet) -> str | None:
-        """Put the peers in force; returns why not, or None."""
-
-    def apply_mapping(self, mapping: MappingSet) -> str | None:
-        """Put the mapping in force; returns why not, or None."""
-
-    def take_report(self) -> Report:
-        """Return what was measured since the last call."""
-
-    def connection_changed(self, connected: bool, reason: str) -> None:
-        """The control plane came within reach, or went out of it."""
-
-    def certificate_changed(self, files: TlsFiles) -> None:
-        """New certificate files are in use from now on; the session tells the next registration of them."""
 
 
 class _StreamEndedError(Exception):

@@ -5,16 +5,40 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from controlplane.core.registry import Refusal
+from protos.credential import decode_credential, verify
+from protos.errors import DecodeError
 
 if TYPE_CHECKING:
     from protos.identity import Identity
     from protos.model import Registration
 
 
-def check_claims(registration: Registration, identity: Identity) -> Refusal | None:
-    """Return why the registration is not what the holder of this certificate may say, or None."""
+def check_claims(registration: Registration, identity: Identity, certificate: bytes) -> Refusal | None:
+    """Return why the registration is not what the holder of this certificate (DER) may say, or None."""
     if registration.name != identity.name:
         return Refusal.NAME_MISMATCH
     if registration.role.value != identity.role.value:
         return Refusal.WRONG_ROLE
+    if not _is_own(registration, certificate, identity):
+        return Refusal.BAD_CREDENTIAL
     return None
+
+
+def check_unproven_claims(registration: Registration) -> Refusal | None:
+    """The same where nobody has certificates: the credential, if any, has at least to agree with the registration."""
+    if registration.credential and not _is_own(registration):
+        return Refusal.BAD_CREDENTIAL
+    return None
+
+
+def _is_own(registration: Registration, certificate: bytes = b"", identity: Identity | None = None) -> bool:
+    """The peers check it themselves; here it is about a clear answer to a sidecar that presents another's."""
+    try:
+        credential = decode_credential(registration.credential)
+        if identity is not None:
+            verify(credential, lambda _: identity)
+    except DecodeError:
+        return False
+    said = (credential.name, credential.role, credential.session, credential.incarnation, credential.certificate)
+    known = (registration.name, registration.role, registration.session, registration.incarnation, certificate)
+    return said == known

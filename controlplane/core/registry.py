@@ -47,6 +47,7 @@ class Refusal(enum.Enum):
     FULL = f"{MAX_SIDECARS} sidecars are registered, which is the limit"
     NAME_MISMATCH = "the certificate is another name's: set name to the certificate's, or leave it out"
     WRONG_ROLE = "the certificate is for another role: set role to the certificate's, or leave it out"
+    BAD_CREDENTIAL = "the credential is not this run's, or not signed with this certificate"
 
 
 @dataclass(frozen=True, slots=True)

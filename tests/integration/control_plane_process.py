@@ -9,13 +9,14 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import grpc
 import yaml
 
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
+from protos.credential import Aead, SessionCredential
 from protos.identity import CONTROL_PLANE_DNS
 from protos.model import (
     Ack,
@@ -39,6 +40,8 @@ from tests.unit.controlplane.samples import interfaces, offer, registration, use
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
     from controlplane.ca import Issued
 
@@ -129,6 +132,19 @@ class Secured:
 
     issued: Issued
     ca_pem: bytes
+
+    def claim(self, said: Registration) -> Registration:
+        """The registration with the credential that belongs to it."""
+        return replace(said, credential=credential_of(said, self.issued.certificate_der, self.issued.key))
+
+
+def credential_of(said: Registration, certificate: bytes, key: EllipticCurvePrivateKey) -> bytes:
+    """What a sidecar that registers so says of its session; of no use for datagrams."""
+    public_key = bytes(32)
+    own = SessionCredential(
+        said.name, said.role, said.session, said.incarnation, public_key, Aead.AES_256_GCM, certificate
+    )
+    return own.sign(key).encode()
 
 
 def open_channel(address: str, secured: Secured | None) -> grpc.Channel:
@@ -231,6 +247,7 @@ class Sidecar(Stream):
 
     def __init__(self, address: str, said: Registration, secured: Secured | None = None) -> None:
         super().__init__(address, secured)
+        said = said if secured is None else secured.claim(said)
         self.registration = said
         self.send(said)
 

@@ -195,7 +195,7 @@ def raw_register(**changes: object) -> control_pb2.SidecarMessage:
 @pytest.mark.parametrize(
     ("message", "code", "details"),
     [
-        (raw_register(protocol_version=2), grpc.StatusCode.FAILED_PRECONDITION, "protocol version 2 is not 1"),
+        (raw_register(protocol_version=1), grpc.StatusCode.FAILED_PRECONDITION, "protocol version 1 is not 2"),
         (raw_register(protocol_version=99, name="\x00"), grpc.StatusCode.FAILED_PRECONDITION, "protocol version 99"),
         (raw_register(name="no spaces, please"), grpc.StatusCode.INVALID_ARGUMENT, "name 'no spaces, please' is not"),
         (raw_register(name="../../etc"), grpc.StatusCode.INVALID_ARGUMENT, "name"),

@@ -7,6 +7,7 @@ import socket
 import ssl
 import subprocess
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import grpc
@@ -53,7 +54,7 @@ def refused(address: str, secured: Secured | None) -> grpc.RpcError:
 def test_members_are_let_in_under_their_names(plane: SecuredControlPlane) -> None:
     a, r = plane.member("cloud-a", IdentityRole.CLOUD), plane.member("robot-1")
     with cloud(plane.address, "cloud-a", a) as c, robot(plane.address, "robot-1", r) as r1:
-        r1.peers("cloud-a")
+        assert r1.peers("cloud-a").peers[0].credential == c.registration.credential
         c.peers("robot-1")
 
 
@@ -115,10 +116,23 @@ def test_a_name_or_role_that_the_certificate_does_not_say_is_refused(plane: Secu
         ("wrong_role", registration("robot-1", Role.CLOUD)),
     ):
         with plane.counted(reason, total), Stream(plane.address, secured) as stream:
-            stream.send(said)
+            stream.send(secured.claim(said))
             code, text = stream.end()
             assert code is grpc.StatusCode.PERMISSION_DENIED
             assert "certificate" in text
+
+
+def test_a_credential_of_another_run_or_badly_signed_is_refused(plane: SecuredControlPlane) -> None:
+    secured, total = plane.member("robot-1"), "plr_registrations_refused_total"
+    said = registration("robot-1")
+    other_run = secured.claim(registration("robot-1", incarnation=2)).credential
+    forged = bytearray(secured.claim(said).credential)
+    forged[-1] ^= 1
+    for credential in (b"", b"\xff" * 100, other_run, bytes(forged)):
+        with plane.counted("bad_credential", total), Stream(plane.address, secured) as stream:
+            stream.send(replace(said, credential=credential))
+            code, _ = stream.end()
+            assert code is grpc.StatusCode.PERMISSION_DENIED
 
 
 def test_each_service_is_for_its_roles_only(plane: SecuredControlPlane) -> None:

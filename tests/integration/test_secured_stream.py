@@ -18,7 +18,7 @@ from protos.tls_files import TlsWatch, load_tls_files
 from sidecar import control_client
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
-from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, cloud
+from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, credential_of
 from tests.integration.secured_control_plane import HOUR_S, SecuredControlPlane
 from tests.unit.controlplane.samples import registration
 
@@ -39,12 +39,18 @@ class Robot:
     """A control client with the files of a folder; what happens waits in queues."""
 
     def __init__(self, address: str, folder: Path | None) -> None:
-        self.session = ControlSession(registration("robot-1"), random.Random(1))
+        self.said = registration("robot-1")
+        self.session = ControlSession(self.said, random.Random(1))
         self.tls = TlsWatch(load_tls_files(folder)) if folder is not None else None
+        if self.tls is not None:
+            self.claim(self.tls.current)
         self.client = ControlClient(address, self.session, self, self.tls)
         self.peers: queue.Queue[PeerSet] = queue.Queue()
         self.connection: queue.Queue[tuple[bool, str]] = queue.Queue()
         self.files: queue.Queue[TlsFiles] = queue.Queue()
+
+    def claim(self, files: TlsFiles) -> None:
+        self.session.set_credential(credential_of(self.said, files.certificate_der, files.private_key))
 
     def welcome(self, welcome: Welcome) -> None:
         pass
@@ -63,6 +69,7 @@ class Robot:
         self.connection.put((connected, reason))
 
     def certificate_changed(self, files: TlsFiles) -> None:
+        self.claim(files)
         self.files.put(files)
 
     def __enter__(self) -> Robot:

@@ -1,0 +1,31 @@
+"""What the control client asks of the sidecar around it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from protos.model import MappingSet, PeerSet, Report, Welcome
+    from protos.tls_files import TlsFiles
+
+
+class ControlHooks(Protocol):
+    """What the control client calls, on its own thread; it may wait there for the engine's lock."""
+
+    def welcome(self, welcome: Welcome) -> None:
+        """A stream is accepted; also the place of the STUN servers."""
+
+    def apply_peers(self, peers: PeerSet) -> str | None:
+        """Put the peers in force; returns why not, or None."""
+
+    def apply_mapping(self, mapping: MappingSet) -> str | None:
+        """Put the mapping in force; returns why not, or None."""
+
+    def take_report(self) -> Report:
+        """Return what was measured since the last call."""
+
+    def connection_changed(self, connected: bool, reason: str) -> None:
+        """The control plane came within reach, or went out of it."""
+
+    def certificate_changed(self, files: TlsFiles) -> None:
+        """New certificate files are in use from now on; the session tells the next registration of them."""
