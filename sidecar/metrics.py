@@ -177,6 +177,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     late: dict[tuple[str, ...], float] = {}
     path_bytes: dict[tuple[str, ...], float] = {}
     path_mtu: dict[tuple[str, ...], float] = {}
+    phase: dict[tuple[str, ...], float] = {}
     offload: dict[tuple[str, ...], float] = {}
     for link in links:
         datagrams |= {(link.interface, *key): count for key, count in dict(link.datagrams).items()}
@@ -193,6 +194,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
             late[labels] = path.spurious_losses
             path_bytes[labels] = path.bytes_sent
             path_mtu[labels] = path.max_datagram
+            phase[labels] = path.key_phase
     of_path = ("interface", "peer")
     yield counter("plr_datagrams", "UDP datagrams.", ("interface", "direction", "kind"), datagrams)
     yield counter("plr_datagrams_dropped", "Datagrams not believed or not sendable.", ("interface", "reason"), dropped)
@@ -213,6 +215,7 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
     yield counter("plr_path_spurious_losses", "Those found lost that had arrived.", of_path, late)
     yield counter("plr_path_bytes_sent", "UDP payload bytes sent over the best path.", of_path, path_bytes)
     yield gauge("plr_path_mtu_bytes", "Longest datagram the best path is known to carry.", of_path, path_mtu)
+    yield gauge("plr_path_key_phase", "Changes of the keys that seal what is sent over the best path.", of_path, phase)
 
 
 def _control(stats: ControlStats, connected: bool, engine: EngineStats) -> Iterator[Metric]:

@@ -36,7 +36,6 @@ from sidecar.core.link_events import (
     PeerClosed,
     PeerRestarted,
     Seek,
-    SetCredential,
     SetPeers,
 )
 from sidecar.core.mapping import MappingTable
@@ -184,12 +183,7 @@ class Engine:
 
     def uses(self) -> tuple[ServiceUse, ...]:
         """What this sidecar carries."""
-        uses = []
-        for name, kind in self._offers.offered.items():
-            rule = find_rule(self._config.rules, name)
-            if rule is not None and name in self._carried:
-                uses.append(ServiceUse(name, kind, rule.deadline_s, rule.idempotent))
-        return tuple(uses)
+        return self._offers.uses(self._carried)
 
     def set_interfaces(self, interfaces: Iterable[InterfaceName], now: float) -> None:
         """The interfaces that have a link now."""
@@ -220,17 +214,12 @@ class Engine:
         return None
 
     def recheck_peers(self, now: float) -> None:
-        """Whom to trust has changed: the sessions of peers that are not to be trusted any more end at once."""
+        """Whom to trust has changed: the sessions of peers not to be trusted any more end at once."""
         gone = self.peers.recheck()
         self._offers.set_peers(self.peers.all())
         for name in gone:
             self._end_session(name, now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
-        self._update_offers(now)
-
-    def set_credential(self, credential: bytes) -> None:
-        """Introduce this session by this credential from now on: it was signed anew."""
-        self._commands.append((None, SetCredential(credential)))
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         """Take a mapping; returns why it is refused, or None."""
@@ -240,11 +229,6 @@ class Engine:
             return error
         self.stats.mapping_version = self.mapping.version
         return None
-
-    @property
-    def refused_peers(self) -> dict[NodeName, str]:
-        """Peers that are left out since their credentials are bad, and why."""
-        return dict(self.peers.refused)
 
     @property
     def offer_conflicts(self) -> frozenset[tuple[ServiceName, NodeName, str]]:
@@ -281,22 +265,18 @@ class Engine:
                 self._outbox.on_finished(peer, number)
             case FinishedLost(path, numbers) if path.peer in self.peers:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
-            case FinishedLost():
-                pass
             case FragmentsLost():
                 self._outbox.on_lost(event, now)
             case PathMeasured() if self._knows(event.path):
                 self.routes.set_rtt(event.path, event.smoothed_rtt_s)
                 self.routes.note_fates(event.path, event.arrived, event.missed)
                 self._measurements.path(event)
-            case PathMeasured():
-                pass  # of a peer that left, or an interface that went, a moment ago
             case PathChanged():
                 self._on_path_changed(event, now)
             case PathMtuChanged(path, max_datagram) if self._knows(path):
                 self.routes.set_max_datagram(path, max_datagram)
-            case PathMtuChanged():
-                pass
+            case FinishedLost() | PathMeasured() | PathMtuChanged():
+                pass  # of a peer that left, or an interface that went, a moment ago
             case PeerRestarted():
                 if self.peers.restarted(event, now):
                     self._serving.on_session_over(event.peer)

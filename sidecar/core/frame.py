@@ -55,11 +55,11 @@ if TYPE_CHECKING:
 
 FIRST_BYTE = 0xD0 | PROTOCOL_VERSION
 SEALED_FLAG, PHASE_FLAG, INTRODUCTION_FLAG = 1, 2, 4
+_KNOWN_FLAGS = frozenset({SEALED_FLAG, SEALED_FLAG | PHASE_FLAG, SEALED_FLAG | INTRODUCTION_FLAG})
 HEADER = struct.Struct(">BBBBQQ")
 HEADER_BYTES = HEADER.size
 NONCE_OFFSET = HEADER_BYTES - NONCE_BYTES
 """Where the nonce begins in the header: the lower half of the session, and the packet number."""
-PACKET_NUMBER_BYTES = 8
 CLEAR = struct.Struct(">IQQ")
 """The header with its first four bytes as one number: head, session, packet number."""
 MIN_DATAGRAM_BYTES = HEADER_BYTES + 1 + TAG_BYTES
@@ -186,8 +186,7 @@ def clear_head(sender: InterfaceId, receiver: InterfaceId, flags: int = SEALED_F
 
 def encode_header(header: Header) -> bytes:
     """Return the 20 clear bytes."""
-    sender, receiver, session, packet_number, flags = header
-    return HEADER.pack(FIRST_BYTE, flags, sender, receiver, session, packet_number)
+    return HEADER.pack(FIRST_BYTE, header.flags, *header[:4])
 
 
 def decode_header(data: bytes | memoryview) -> Header:
@@ -210,9 +209,6 @@ def decode_header(data: bytes | memoryview) -> Header:
     if flags not in _KNOWN_FLAGS:
         raise DecodeError("unknown flags")
     return Header(InterfaceId(sender), InterfaceId(receiver), SessionId(session), packet_number, flags)
-
-
-_KNOWN_FLAGS = frozenset({SEALED_FLAG, SEALED_FLAG | PHASE_FLAG, SEALED_FLAG | INTRODUCTION_FLAG})
 
 
 def encode_probe(frame: Probe) -> bytes:

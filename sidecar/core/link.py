@@ -253,6 +253,7 @@ class Link:
                 spurious_losses=path.recovery.reordering.spurious,
                 bytes_sent=path.bytes_sent,
                 max_datagram=path.mtu.size,
+                key_phase=path.sealing.phase,
             )
             for name, path in best.items()
         }

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from protos.model import ServiceUse
 from sidecar.core.events import OfferService, WithdrawService
 from sidecar.core.rules import find_rule
 
@@ -67,6 +68,15 @@ class Offers:
         del self._offered[name]
         self._dark_since.pop(name, None)
         return WithdrawService(name, reason)
+
+    def uses(self, carried: frozenset[ServiceName]) -> tuple[ServiceUse, ...]:
+        """Return the offered services of these, as the control plane is told of them."""
+        uses = []
+        for name, kind in self._offered.items():
+            rule = find_rule(self._rules, name)
+            if rule is not None and name in carried:
+                uses.append(ServiceUse(name, kind, rule.deadline_s, rule.idempotent))
+        return tuple(uses)
 
     def set_peers(self, peers: list[Peer]) -> None:
         """Take what the peers offer; servers that drain count only where there is no other."""

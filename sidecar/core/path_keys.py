@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sidecar.core import aead as ciphers
-from sidecar.core.frame import PACKET_NUMBER_BYTES, PHASE_FLAG, clear_head
+from sidecar.core.frame import PHASE_FLAG, clear_head
 from sidecar.core.key_schedule import next_phase, phase_key
 from sidecar.core.received import ReceivedPackets
 
@@ -117,7 +117,8 @@ class OpeningKeys:
 
     def open_other(self, nonce: Buffer, sealed: Buffer, associated_data: Buffer, out: Buffer, /) -> int:
         """As `decrypt_into`, for a datagram of the other parity than `head`: of the phase before, or of the next."""
-        number = int.from_bytes(nonce[-PACKET_NUMBER_BYTES:], "big")
+        # The packet number.
+        number = int.from_bytes(nonce[-8:], "big")
         if self._previous is not None and number < self._first:
             return self._previous.decrypt_into(nonce, sealed, associated_data, out)
         size = self._next.decrypt_into(nonce, sealed, associated_data, out)

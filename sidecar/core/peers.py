@@ -136,8 +136,7 @@ class Peers:
         return True
 
     def recheck(self) -> list[NodeName]:
-        """Whom to trust has changed: judge every peer anew; returns those that are no peers any more."""
-        self._own.forget_admitted()
+        """Whom to trust has changed; returns those that are no peers any more. See `OwnSession.forget_admitted`."""
         gone = []
         for name, peer in list(self._known.items()):
             try:

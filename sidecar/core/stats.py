@@ -28,6 +28,8 @@ class PathStats:
     bytes_sent: int = 0
     max_datagram: int = 0
     """Bytes of UDP payload."""
+    key_phase: int = 0
+    """How often the keys that seal what we send have changed."""
 
 
 @dataclass(slots=True)

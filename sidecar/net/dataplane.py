@@ -17,18 +17,19 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link_events import ResetPaths, SendClose
+from sidecar.core.link_events import ResetPaths, SendClose, SetCredential
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from protos.credential import SessionCredential
     from protos.model import (
         InterfaceName,
         MappingSet,
         NodeName,
+        Peer,
         PeerSet,
         Report,
         ServiceMapping,
@@ -89,8 +90,14 @@ class ThreadedDataPlane:
         with self._lock:
             self._links = dict(links)
             self._use_links_that_run(self._clock())
+            self._post_credential()  # it may have been signed anew since they were made
             woken = self._queue_outputs()
         self._wake(woken)
+
+    def _post_credential(self) -> None:
+        credential = self._own.credential.encode()
+        for link in self._links.values():
+            link.post(SetCredential(credential))
 
     def drain(self) -> None:
         """Take no new requests."""
@@ -164,15 +171,12 @@ class ThreadedDataPlane:
 
     def apply_peers(self, peer_set: PeerSet) -> str | None:
         """Take a view of the peers; returns why it is refused, or None."""
-        for peer in peer_set.peers:
-            # What public-key work costs, it costs here: the engine, under its lock, finds it done.
-            with contextlib.suppress(DecodeError):
-                self._own.admit(peer)
+        self._judge(peer_set.peers)
         with self._lock:
             error = self._engine.apply_peers(peer_set, self._clock())
             woken = self._queue_outputs()
             conflicts = self._engine.offer_conflicts
-            refused = self._engine.refused_peers
+            refused = self._engine.peers.refused
         self._wake(woken)
         for name, reason in refused.items():
             if self._logged_refusals.get(name) != reason:
@@ -183,8 +187,18 @@ class ThreadedDataPlane:
         self._logged_conflicts = conflicts
         return error
 
+    def _judge(self, peers: Iterable[Peer]) -> None:
+        """Do the public-key work for these peers before the engine, under its lock, asks what came of it."""
+        for peer in peers:
+            with contextlib.suppress(DecodeError):
+                self._own.admit(peer)
+
     def trust_changed(self) -> None:
         """CAs or revocations are others now: peers that are not to be trusted any more lose their sessions at once."""
+        self._own.forget_admitted()
+        with self._lock:
+            peers = self._engine.peers.all()
+        self._judge(peers)
         with self._lock:
             self._engine.recheck_peers(self._clock())
             woken = self._queue_outputs()
@@ -198,9 +212,7 @@ class ThreadedDataPlane:
         """
         with self._lock:
             self._own.renew(credential)
-            self._engine.set_credential(credential.encode())
-            woken = self._queue_outputs()
-        self._wake(woken)
+            self._post_credential()
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         """Take a mapping; returns why it is refused, or None."""

@@ -222,10 +222,12 @@ def test_peers_are_judged_anew_when_trust_changes() -> None:
         if credential.name in revoked:
             raise DecodeError("revoked")
 
-    peers = Peers(OwnSession(OWN.credential, private_key("robot-1", 99), judge), Counter())
+    own = OwnSession(OWN.credential, private_key("robot-1", 99), judge)
+    peers = Peers(own, Counter())
     peers.apply(view(*HELD), nobody)
-    assert peers.recheck() == []
     revoked.add(A)
+    assert peers.recheck() == []
+    own.forget_admitted()
     assert peers.recheck() == [A]
     assert peers.names() == [B]
     assert peers.refused == {A: "revoked"}
