@@ -138,7 +138,7 @@ class LinkOpener:
             return None  # an answer would bring us back to life over there
         if len(path.introductions) >= MAX_INTRODUCTIONS:
             return "introductions_full"
-        path.introductions.append((source, probe_id))
+        path.note_introduction(source, probe_id)
         if path.state is PathState.DOWN:
             path.hasten_probe(now)
         table.dirty[path.id] = path

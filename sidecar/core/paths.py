@@ -47,6 +47,8 @@ class Path:
     """Sender's and receiver's state of one path. Owned by its link."""
 
     __slots__ = (
+        "_introduced",
+        "_introducer",
         "_next_probe_id",
         "_probe_gap",
         "_probed_at",
@@ -120,6 +122,8 @@ class Path:
         self._next_probe_id = 0
         self._probes_out: dict[int, tuple[float, bool]] = {}
         """When each unanswered probe left, and whether it was sealed with this path's keys."""
+        self._introduced = False
+        self._introducer: Address | None = None
         self._waiting_since: float | None = None
         self._rebound = False
         self._was_up = False
@@ -130,12 +134,22 @@ class Path:
         return self.id.peer
 
     def destinations(self) -> tuple[Address, ...]:
-        """Where a probe goes now: the known address, or every candidate while the path is down or just rebound."""
+        """Where a probe goes now: the known address, or all that may be it while the path is down or just rebound."""
         if self.remote is not None and self.state is not PathState.DOWN and not self._rebound:
             return (self.remote,)
-        if self.remote is not None and self.remote not in self.candidates:
-            return (self.remote, *self.candidates)
-        return self.candidates
+        others = dict.fromkeys((self.remote, self._introducer))
+        return (*(one for one in others if one and one not in self.candidates), *self.candidates)
+
+    def note_introduction(self, source: Address, probe_id: int) -> None:
+        """The peer introduced itself from here, and wants a probe answered.
+
+        When it does so again although it was answered, it can not read the answer: it does not know yet that we were
+        restarted. Behind a NAT it may be reachable there only, so that our own introduction has to go there too.
+        """
+        self.introductions.append((source, probe_id))
+        if self.state is PathState.DOWN:
+            self._introducer = source if self._introduced else None
+            self._introduced = True
 
     def next_probe(self, now: float, rng: random.Random) -> int:
         """Return the id of a probe that leaves now, and plan the next one."""
@@ -271,6 +285,7 @@ class Path:
                 self.probe_at = now + IDLE_PROBE_S
             return False
         self.state = PathState.UP
+        self._introduced, self._introducer = False, None
         self._was_up = True
         self._probe_gap = FIRST_PROBE_S
         self.probe_at = now + IDLE_PROBE_S

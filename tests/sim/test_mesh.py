@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 
 import pytest
@@ -245,6 +246,19 @@ def test_a_restarted_robot_and_a_restarted_cloud_are_known_again_without_a_contr
     calls = call_at(mesh, robot, 20, 1)
     assert_each_answered_once(robot, calls)
     assert_at_most_once(one, two)
+
+
+def test_a_restarted_cloud_is_known_again_by_a_robot_that_it_knows_no_address_of() -> None:
+    """Without a control plane, and with the robot behind a NAT that gives it another address towards each cloud."""
+    mesh, robot, one, _ = two_by_two()
+    nowhere = [dataclasses.replace(peer, candidates=()) for peer in one.engine.peers.all()]
+    one.start()
+    _restore(mesh, one, nowhere)
+    mesh.run(5.0)
+    assert robot.engine.routes.reaches(one.name)
+    calls = call_at(mesh, robot, 20, 1)
+    assert_each_answered_once(robot, calls)
+    assert one.executed
 
 
 def _restore(mesh: Mesh, node: Node, peers: list[Peer]) -> None:

@@ -247,6 +247,15 @@ def test_an_introduction_is_answered_where_it_came_from_in_fewer_bytes_and_moves
     assert not bench.link.in_use(ELSEWHERE)
 
 
+def test_who_introduces_itself_again_after_an_answer_is_introduced_to_at_that_place() -> None:
+    """It can not read the answer of a session that it does not know yet."""
+    bench = up()
+    for number in (0, 1):
+        bench.receive_datagram(bench.introduction(number=number, interface=NEW_INTERFACE), ELSEWHERE)
+        answers = bench.frames(bench.sent() + bench.wait(FIRST_PROBE_S))
+        assert any(isinstance(item, Introduction) for item in answers) is (number == 1)
+
+
 def test_an_introduction_that_comes_again_is_not_answered_once_something_newer_was_authentic() -> None:
     bench = up()
     again = bench.introduction(number=5)
