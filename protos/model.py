@@ -49,6 +49,10 @@ MAX_CREDENTIAL_BYTES = 2048
 """Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
 
 
+MAX_JOINTS = 1024
+"""Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers."""
+
+
 class Role(enum.Enum):
     """What a sidecar is for."""
 
@@ -263,13 +267,19 @@ class Nack:
 
 @dataclass(frozen=True, slots=True)
 class LatencyReport:
-    """Latency of one interface to one server for one service since the last report."""
+    """Latency of one interface to one server for one service since the last report.
+
+    Beside the histogram, which knows a latency when it is over: how many of `requests` missed the service's deadline,
+    known when that is over.
+    """
 
     interface: InterfaceName
     server: NodeName
     service: ServiceName
     latency: Histogram
     processing: Histogram
+    requests: int = 0
+    missed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,12 +305,24 @@ class OutcomeReport:
 
 
 @dataclass(frozen=True, slots=True)
+class JointReport:
+    """Requests sent over two paths at once since the last report, and how many missed the deadline on both."""
+
+    service: ServiceName
+    first: Assignment
+    second: Assignment
+    requests: int
+    both_missed: int
+
+
+@dataclass(frozen=True, slots=True)
 class Report:
     """Everything a robot sidecar measured since its last report."""
 
     latencies: tuple[LatencyReport, ...] = ()
     paths: tuple[PathReport, ...] = ()
     outcomes: tuple[OutcomeReport, ...] = ()
+    joints: tuple[JointReport, ...] = ()
 
 
 SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain

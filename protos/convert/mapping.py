@@ -26,7 +26,7 @@ def mapping_set_to_proto(mapping: MappingSet) -> control_pb2.MappingSet:
 
 def service_mapping_from_proto(message: control_pb2.ServiceMapping) -> ServiceMapping:
     """Check the mapping of one service."""
-    assignments = each(message.assignments, MAX_ASSIGNMENTS, "assignments", _assignment_from_proto)
+    assignments = each(message.assignments, MAX_ASSIGNMENTS, "assignments", assignment_from_proto)
     unique(((a.interface, a.server) for a in assignments), "assignments")
     return ServiceMapping(
         service=service_name(message.service, "service"),
@@ -40,13 +40,19 @@ def service_mapping_to_proto(mapping: ServiceMapping) -> control_pb2.ServiceMapp
     """Encode the mapping of one service."""
     return control_pb2.ServiceMapping(
         service=mapping.service,
-        assignments=(control_pb2.Assignment(interface=a.interface, server=a.server) for a in mapping.assignments),
+        assignments=map(assignment_to_proto, mapping.assignments),
         predicted_miss=mapping.predicted_miss,
         reason=clean_text(mapping.reason),
     )
 
 
-def _assignment_from_proto(message: control_pb2.Assignment) -> Assignment:
+def assignment_from_proto(message: control_pb2.Assignment) -> Assignment:
+    """Check a pair of an interface and a server."""
     return Assignment(
         interface=interface_name(message.interface, "interface"), server=node_name(message.server, "server")
     )
+
+
+def assignment_to_proto(assignment: Assignment) -> control_pb2.Assignment:
+    """Encode a pair of an interface and a server."""
+    return control_pb2.Assignment(interface=assignment.interface, server=assignment.server)

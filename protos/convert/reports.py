@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from protos.convert.fields import MAX_EVENTS, MAX_LATENCIES, MAX_OUTCOMES, MAX_PATHS, at_most, each
+from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
-from protos.model import LatencyReport, OutcomeReport, PathReport, Report
+from protos.errors import DecodeError
+from protos.model import MAX_JOINTS, JointReport, LatencyReport, OutcomeReport, PathReport, Report
 from protos.names import interface_name, node_name, service_name
 from protos.plr.v1 import control_pb2
 
@@ -15,6 +17,7 @@ def report_from_proto(message: control_pb2.Report) -> Report:
         latencies=each(message.latencies, MAX_LATENCIES, "latencies", _latency_from_proto),
         paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
         outcomes=each(message.outcomes, MAX_OUTCOMES, "outcomes", _outcome_from_proto),
+        joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
     )
 
 
@@ -24,16 +27,20 @@ def report_to_proto(report: Report) -> control_pb2.Report:
         latencies=map(_latency_to_proto, report.latencies),
         paths=map(path_to_proto, report.paths),
         outcomes=map(_outcome_to_proto, report.outcomes),
+        joints=map(_joint_to_proto, report.joints),
     )
 
 
 def _latency_from_proto(message: control_pb2.LatencyReport) -> LatencyReport:
+    requests = at_most(message.requests, MAX_EVENTS, "requests")
     return LatencyReport(
         interface=interface_name(message.interface, "interface"),
         server=node_name(message.server, "server"),
         service=service_name(message.service, "service"),
         latency=histogram_from_proto(message.latency),
         processing=histogram_from_proto(message.processing),
+        requests=requests,
+        missed=at_most(message.missed, requests, "missed"),
     )
 
 
@@ -44,6 +51,8 @@ def _latency_to_proto(latency: LatencyReport) -> control_pb2.LatencyReport:
         service=latency.service,
         latency=histogram_to_proto(latency.latency),
         processing=histogram_to_proto(latency.processing),
+        requests=latency.requests,
+        missed=latency.missed,
     )
 
 
@@ -83,4 +92,28 @@ def _outcome_from_proto(message: control_pb2.OutcomeReport) -> OutcomeReport:
 def _outcome_to_proto(outcome: OutcomeReport) -> control_pb2.OutcomeReport:
     return control_pb2.OutcomeReport(
         service=outcome.service, ok=outcome.ok, deadline_missed=outcome.deadline_missed, failed=outcome.failed
+    )
+
+
+def _joint_from_proto(message: control_pb2.JointReport) -> JointReport:
+    first, second = assignment_from_proto(message.first), assignment_from_proto(message.second)
+    if not (first.interface, first.server) < (second.interface, second.server):
+        raise DecodeError("joints: the first path does not come before the second")
+    requests = at_most(message.requests, MAX_EVENTS, "requests")
+    return JointReport(
+        service=service_name(message.service, "service"),
+        first=first,
+        second=second,
+        requests=requests,
+        both_missed=at_most(message.both_missed, requests, "both_missed"),
+    )
+
+
+def _joint_to_proto(joint: JointReport) -> control_pb2.JointReport:
+    return control_pb2.JointReport(
+        service=joint.service,
+        first=assignment_to_proto(joint.first),
+        second=assignment_to_proto(joint.second),
+        requests=joint.requests,
+        both_missed=joint.both_missed,
     )

@@ -42,6 +42,8 @@ class Copy:
     message: OutboundMessage
     state: CopyState = CopyState.PENDING
     certainly_not_run: bool = False
+    in_time: bool = False
+    """It was answered before the deadline."""
 
 
 @dataclass(slots=True)
@@ -60,6 +62,8 @@ class Request:
     done: bool = False
     """The application got its response, or the request failed."""
     missed: bool = False
+    outcomes_measured: bool = False
+    """Which of its copies missed the deadline has been counted."""
 
     @property
     def deadline_at(self) -> float:

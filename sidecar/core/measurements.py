@@ -6,11 +6,11 @@ from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.histogram import Histogram
-from protos.model import LatencyReport, OutcomeReport, PathReport, Report
+from protos.model import MAX_JOINTS, JointReport, LatencyReport, OutcomeReport, PathReport, Report
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName, NodeName, ServiceName
+    from protos.model import Assignment, InterfaceName, NodeName, ServiceName
     from sidecar.core.link_events import PathMeasured
     from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
@@ -32,7 +32,8 @@ class _PathCounts:
 
 
 class Measurements:
-    """Latencies per (interface, server, service), round-trip times per path, outcomes per service."""
+    """Latencies per (interface, server, service), round-trip times per path, outcomes per service and, joint ones, per
+    pair of paths."""
 
     def __init__(self) -> None:
         self._clear()
@@ -42,6 +43,10 @@ class Measurements:
         self._processing: dict[_Pair, Histogram] = {}
         self._paths: dict[PathId, _PathCounts] = {}
         self._outcomes: Counter[tuple[ServiceName, str]] = Counter()
+        self._judged: Counter[_Pair] = Counter()
+        self._missed: Counter[_Pair] = Counter()
+        self._compared: Counter[tuple[ServiceName, Assignment, Assignment]] = Counter()
+        self._both_missed: Counter[tuple[ServiceName, Assignment, Assignment]] = Counter()
 
     def answered(self, path: PathId, service: ServiceName, latency_s: float, processing_s: float) -> None:
         """One copy was answered `latency_s` after it was sent."""
@@ -66,11 +71,34 @@ class Measurements:
         """A request ended."""
         self._outcomes[service, outcome] += 1
 
+    def judged(self, path: PathId, service: ServiceName, *, missed: bool) -> None:
+        """Whether a copy missed the deadline is known."""
+        pair = _Pair(path.interface, path.peer, service)
+        self._judged[pair] += 1
+        self._missed[pair] += missed
+
+    def judged_together(
+        self, service: ServiceName, first: Assignment, second: Assignment, *, both_missed: bool
+    ) -> bool:
+        """Whether two copies of a request both missed is known; False if the report is full of other pairs of paths."""
+        key = (service, first, second)
+        if key not in self._compared and len(self._compared) >= MAX_JOINTS:
+            return False
+        self._compared[key] += 1
+        self._both_missed[key] += both_missed
+        return True
+
     def take(self, routes: Routes, servers: list[NodeName]) -> Report:
         """Return everything since the last call, and the state of every path to these servers."""
         latencies = tuple(
-            LatencyReport(*pair, latency, self._processing.get(pair, Histogram()))
-            for pair, latency in self._latency.items()
+            LatencyReport(
+                *pair,
+                self._latency.get(pair, Histogram()),
+                self._processing.get(pair, Histogram()),
+                self._judged[pair],
+                self._missed[pair],
+            )
+            for pair in sorted(self._latency.keys() | self._judged.keys())
         )
         paths = tuple(
             self._path_report(interface, server, routes)
@@ -87,8 +115,9 @@ class Measurements:
             )
             for service in sorted(services)
         )
+        joints = tuple(JointReport(*key, count, self._both_missed[key]) for key, count in self._compared.items())
         self._clear()
-        return Report(latencies, paths, outcomes)
+        return Report(latencies, paths, outcomes, joints)
 
     def _path_report(self, interface: InterfaceName, server: NodeName, routes: Routes) -> PathReport:
         """One report for all paths between the two: the mapping knows interfaces and servers only."""

@@ -19,6 +19,7 @@ from protos.histogram import Histogram
 from protos.model import Assignment
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Copy, CopyState, Request
+from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.events import (
     ApplicationEvent,
     DeadlineMissed,
@@ -175,6 +176,7 @@ class RequestTable:
             self._parts.stats.duplicate_responses += 1
             return
         measure = request.observed and copy.state is CopyState.PENDING
+        copy.in_time = copy.state is CopyState.PENDING and now <= request.deadline_at
         copy.state = CopyState.ANSWERED
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
         self._parts.outbox.on_answered(copy.message)
@@ -314,6 +316,7 @@ class RequestTable:
                 self._hedge(request, now)
                 continue
             heapq.heappush(self._timers, (request.expires_at, request_id))
+            measure_outcomes(request, self._parts.measurements, self._parts.stats)
             if request.done:
                 self._settle(request, now)
             elif not request.missed:
@@ -370,3 +373,4 @@ class RequestTable:
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
             self._requests.pop(request.id, None)
+            measure_outcomes(request, self._parts.measurements, self._parts.stats)

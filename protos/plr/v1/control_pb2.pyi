@@ -229,9 +229,16 @@ class LatencyReport(_message.Message):
     SERVICE_FIELD_NUMBER: _builtins.int
     LATENCY_FIELD_NUMBER: _builtins.int
     PROCESSING_FIELD_NUMBER: _builtins.int
+    REQUESTS_FIELD_NUMBER: _builtins.int
+    MISSED_FIELD_NUMBER: _builtins.int
     interface: _builtins.str
     server: _builtins.str
     service: _builtins.str
+    requests: _builtins.int
+    """Requests whose outcome by the service's deadline is known since the last report, and those of them that missed it.
+    The latency of a late one comes in a later report, or as lost at the end of its lifetime.
+    """
+    missed: _builtins.int
     @_builtins.property
     def latency(self) -> _types_pb2.Histogram: ...
     @_builtins.property
@@ -246,14 +253,53 @@ class LatencyReport(_message.Message):
         service: _builtins.str = ...,
         latency: _types_pb2.Histogram | None = ...,
         processing: _types_pb2.Histogram | None = ...,
+        requests: _builtins.int = ...,
+        missed: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["latency", b"latency", "processing", b"processing"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["interface", b"interface", "latency", b"latency", "processing", b"processing", "server", b"server", "service", b"service"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["interface", b"interface", "latency", b"latency", "missed", b"missed", "processing", b"processing", "requests", b"requests", "server", b"server", "service", b"service"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___LatencyReport: _TypeAlias = LatencyReport  # noqa: Y015
+
+@_typing.final
+class JointReport(_message.Message):
+    """What became of requests that went over two paths at once: whether both missed the service's deadline. Counts only
+    requests that were chosen to be counted before anything of their outcome was known.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SERVICE_FIELD_NUMBER: _builtins.int
+    FIRST_FIELD_NUMBER: _builtins.int
+    SECOND_FIELD_NUMBER: _builtins.int
+    REQUESTS_FIELD_NUMBER: _builtins.int
+    BOTH_MISSED_FIELD_NUMBER: _builtins.int
+    service: _builtins.str
+    requests: _builtins.int
+    both_missed: _builtins.int
+    @_builtins.property
+    def first(self) -> Global___Assignment: ...
+    @_builtins.property
+    def second(self) -> Global___Assignment: ...
+    def __init__(
+        self,
+        *,
+        service: _builtins.str = ...,
+        first: Global___Assignment | None = ...,
+        second: Global___Assignment | None = ...,
+        requests: _builtins.int = ...,
+        both_missed: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["first", b"first", "second", b"second"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["both_missed", b"both_missed", "first", b"first", "requests", b"requests", "second", b"second", "service", b"service"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___JointReport: _TypeAlias = JointReport  # noqa: Y015
 
 @_typing.final
 class PathReport(_message.Message):
@@ -329,22 +375,26 @@ class Report(_message.Message):
     LATENCIES_FIELD_NUMBER: _builtins.int
     PATHS_FIELD_NUMBER: _builtins.int
     OUTCOMES_FIELD_NUMBER: _builtins.int
+    JOINTS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def latencies(self) -> _containers.RepeatedCompositeFieldContainer[Global___LatencyReport]: ...
     @_builtins.property
     def paths(self) -> _containers.RepeatedCompositeFieldContainer[Global___PathReport]: ...
     @_builtins.property
     def outcomes(self) -> _containers.RepeatedCompositeFieldContainer[Global___OutcomeReport]: ...
+    @_builtins.property
+    def joints(self) -> _containers.RepeatedCompositeFieldContainer[Global___JointReport]: ...
     def __init__(
         self,
         *,
         latencies: _abc.Iterable[Global___LatencyReport] | None = ...,
         paths: _abc.Iterable[Global___PathReport] | None = ...,
         outcomes: _abc.Iterable[Global___OutcomeReport] | None = ...,
+        joints: _abc.Iterable[Global___JointReport] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

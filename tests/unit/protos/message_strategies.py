@@ -27,6 +27,7 @@ from protos.model import (
     Heartbeat,
     InterfaceId,
     InterfaceName,
+    JointReport,
     LatencyReport,
     MappingSet,
     Nack,
@@ -141,11 +142,32 @@ registrations = st.builds(
     versions,
     credentials,
 )
-latencies = st.builds(LatencyReport, interface_names, node_names, service_names, histograms(), histograms())
+counts_of = events.flatmap(lambda total: st.tuples(st.just(total), st.integers(0, total)))
+latencies = st.builds(
+    lambda interface, server, service, latency, processing, counts: LatencyReport(
+        interface, server, service, latency, processing, *counts
+    ),
+    interface_names,
+    node_names,
+    service_names,
+    histograms(),
+    histograms(),
+    counts_of,
+)
 paths = st.builds(PathReport, interface_names, node_names, st.booleans(), histograms(), events, events)
 outcomes = st.builds(OutcomeReport, service_names, events, events, events)
-reports = st.builds(Report, _tuples(latencies), _tuples(paths), _tuples(outcomes))
 assignments = st.builds(Assignment, interface_names, node_names)
+
+
+@st.composite
+def joint_reports(draw: st.DrawFn) -> JointReport:
+    first, second = sorted(
+        draw(st.lists(assignments, min_size=2, max_size=2, unique=True)), key=lambda path: (path.interface, path.server)
+    )
+    return JointReport(draw(service_names), first, second, *draw(counts_of))
+
+
+reports = st.builds(Report, _tuples(latencies), _tuples(paths), _tuples(outcomes), _tuples(joint_reports()))
 service_mappings = st.builds(
     ServiceMapping,
     service_names,

@@ -138,8 +138,20 @@ def latency(**changes: Any) -> control_pb2.SidecarMessage:
     return control_pb2.SidecarMessage(report=report)
 
 
+def joint(**changes: Any) -> control_pb2.SidecarMessage:
+    fields: dict[str, Any] = {
+        "service": "/plan",
+        "first": control_pb2.Assignment(interface="wlan0", server="cloud-a"),
+        "second": control_pb2.Assignment(interface="wwan0", server="cloud-a"),
+        "requests": 3,
+        "both_missed": 3,
+    }
+    report = control_pb2.Report(joints=[control_pb2.JointReport(**(fields | changes))])
+    return control_pb2.SidecarMessage(report=report)
+
+
 def test_the_samples_that_the_next_test_breaks_are_good() -> None:
-    for message in (register(), candidates({}), services(uses=[use()]), latency()):
+    for message in (register(), candidates({}), services(uses=[use()]), latency(), joint()):
         sidecar_message_from_proto(message)
 
 
@@ -191,6 +203,10 @@ def test_the_samples_that_the_next_test_breaks_are_good() -> None:
         (latency(latency=types_pb2.Histogram(layout=2, index=[1], count=[1])), "layout"),
         (latency(latency=types_pb2.Histogram(layout=1, index=[1], count=[])), "histogram"),
         (latency(processing=types_pb2.Histogram(lost=1)), "layout"),
+        (latency(requests=2, missed=3), "missed"),
+        (joint(first=control_pb2.Assignment(interface="wwan0", server="cloud-a")), "joints"),
+        (joint(second=control_pb2.Assignment(interface="wwan0")), "server"),
+        (joint(both_missed=4), "both_missed"),
         (control_pb2.SidecarMessage(ack=control_pb2.Ack(version=1)), "resource"),
         (control_pb2.SidecarMessage(nack=control_pb2.Nack(resource=PEERS, error="a\nb")), "error"),
     ],

@@ -1,11 +1,17 @@
 from __future__ import annotations
 
-from protos.model import OutcomeReport
+from typing import TYPE_CHECKING
+
+from protos.model import Assignment, JointReport, OutcomeReport
+from sidecar.core import measurements as measurements_module
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.measurements import Measurements
 from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, path
+from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
+
+if TYPE_CHECKING:
+    import pytest
 
 
 def test_latencies_are_kept_by_interface_server_and_service_with_what_was_lost() -> None:
@@ -51,3 +57,25 @@ def test_outcomes_are_counted_and_a_rejection_is_a_failure() -> None:
     for outcome in ("ok", "ok", "deadline_missed", "failed", "rejected"):
         measurements.outcome(ECHO, outcome)
     assert measurements.take(Routes(), []).outcomes == (OutcomeReport(ECHO, ok=2, deadline_missed=1, failed=2),)
+
+
+def test_joint_outcomes_are_counted_by_pair_of_paths_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurements_module, "MAX_JOINTS", 1)
+    measurements = Measurements()
+    first, second = Assignment(WLAN, A), Assignment(WWAN, B)
+    for missed in (True, False, False):
+        assert measurements.judged_together(ECHO, first, second, both_missed=missed)
+    assert not measurements.judged_together(ECHO, first, Assignment(WWAN, A), both_missed=True)
+    assert measurements.take(Routes(), []).joints == (JointReport(ECHO, first, second, 3, 1),)
+    assert measurements.take(Routes(), []).joints == ()
+
+
+def test_what_is_judged_at_the_deadline_is_told_before_its_latency_is_known() -> None:
+    measurements = Measurements()
+    measurements.judged(path(WLAN), ECHO, missed=True)
+    measurements.judged(path(WLAN), ECHO, missed=False)
+    (early,) = measurements.take(Routes(), []).latencies
+    assert (early.requests, early.missed, early.latency.total) == (2, 1, 0)
+    measurements.lost(path(WLAN), ECHO)
+    (late,) = measurements.take(Routes(), []).latencies
+    assert (late.requests, late.missed, late.latency.lost) == (0, 0, 1)

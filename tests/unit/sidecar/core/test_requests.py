@@ -233,6 +233,28 @@ def test_the_first_response_calls_the_other_copies_off() -> None:
     assert table.latencies() == {}, "to measure the winner alone would flatter its path"
 
 
+def test_common_misses_are_counted_at_the_deadline_and_once() -> None:
+    table = Table()
+
+    def joints() -> list[tuple[int, int]]:
+        return [(joint.requests, joint.both_missed) for joint in table.measurements.take(table.routes, []).joints]
+
+    table.submit(1)
+    table.respond(A, copy=0)
+    assert joints() == [(1, 0)], "settled before its deadline"
+    table.submit(2)
+    assert joints() == []
+    table.table.handle_timer(1.0)
+    assert joints() == [(1, 1)]
+    table.respond(B, copy=1, number=2, now=1.5)
+    table.table.handle_timer(10.0)
+    table.submit(RACE, now=20.0)
+    table.respond(A, copy=0, number=RACE, now=20.1)
+    assert joints() == [], "the other copy of a race is awaited, and late answers change nothing"
+    table.table.handle_timer(21.0)
+    assert joints() == [(1, 0)]
+
+
 def test_a_cancel_takes_the_best_path_to_its_server_and_none_when_there_is_none() -> None:
     table = Table()
     other = path(WWAN, A)
