@@ -12,7 +12,7 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test fuzz lint format protos interfaces lock bench bench-dataplane bench-churn clean distclean
+.PHONY: help setup demo test fuzz lint format protos interfaces lock bench bench-dataplane bench-churn bench-matcher clean distclean
 
 help: ## this list
 	@echo 'usage: make TARGET'
@@ -59,6 +59,9 @@ bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP,
 
 bench-churn: setup ## interfaces, servers, control plane come and go for ten minutes: nothing is lost, nothing grows
 	@$(PY) -m bench churn $(BENCH_ARGS)
+
+bench-matcher: setup ## the matcher's predictions against recorded networks (ten minutes, no lab)
+	@$(PY) -m bench matcher $(BENCH_ARGS)
 
 clean: ## remove caches and build output
 	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis *.egg-info

@@ -4,6 +4,7 @@ examples:
   make bench-dataplane                                     the data plane against its targets, with a page of plots
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
   make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
+  make bench-matcher BENCH_ARGS='--traces ~/traces'        are the matcher's predictions true?
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 
 from bench.churn import command as churn
 from bench.dataplane import command as dataplane
+from bench.matcher import command as matcher
 
 
 def main() -> int:
@@ -23,8 +25,10 @@ def main() -> int:
     commands = parser.add_subparsers(dest="command", metavar="MEASUREMENT")
     dataplane.add_arguments(commands.add_parser("dataplane", help="the data plane against its targets"))
     churn.add_arguments(commands.add_parser("churn", help="minutes of trouble: requests lost or doubled, memory grown"))
+    matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
     options = parser.parse_args(sys.argv[1:] or ["dataplane"])
-    return churn.run(options) if options.command == "churn" else dataplane.run(options)
+    runs = {"churn": churn.run, "dataplane": dataplane.run, "matcher": matcher.run}
+    return runs[options.command](options)
 
 
 if __name__ == "__main__":

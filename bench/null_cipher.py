@@ -1,7 +1,6 @@
 """A cipher that only copies, for measuring what sealing costs. No program of ours imports it but benchmarks.
 
-It takes the place of the AEAD where that is made, in this process; no configuration leads here. It is itself a call
-into Python for each datagram at either end, 0.2 us each: by so much sealing looks cheaper than it is.
+It takes the place of the AEAD where that is made, in this process; no configuration leads here.
 """
 
 from __future__ import annotations
@@ -19,21 +18,23 @@ if TYPE_CHECKING:
     from protos.credential import Aead
     from sidecar.core.aead import Cipher
 
+_NO_TAG = bytes(aead.TAG_BYTES)
+
 
 class NullCipher:
-    """Copies, in place of encrypting and authenticating; the tag is whatever the buffer held."""
+    """Copies, in place of encrypting and authenticating."""
 
-    @staticmethod
-    def encrypt_into(nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
+    def encrypt_into(self, nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
         """As a Cipher's."""
-        buf[: -aead.TAG_BYTES] = data  # type: ignore[index]  # a bytearray or memoryview
-        return 0
+        view = memoryview(buf)
+        view[: -aead.TAG_BYTES] = data
+        view[-aead.TAG_BYTES :] = _NO_TAG
+        return len(view)
 
-    @staticmethod
-    def decrypt_into(nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
+    def decrypt_into(self, nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
         """As a Cipher's, but of whatever comes."""
-        buf[:] = data[: -aead.TAG_BYTES]  # type: ignore[index]  # a bytearray or memoryview
-        return 0
+        memoryview(buf)[:] = memoryview(data)[: -aead.TAG_BYTES]
+        return len(buf)
 
 
 def install() -> None:

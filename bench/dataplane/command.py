@@ -77,12 +77,13 @@ def _write(report: Report, folder: Path) -> None:
 
 def _show(console: Console, section: Section, findings: Findings) -> None:
     for table in findings.tables:
-        console.print(_rich(table))
+        console.print(rich_table(table))
     for note in findings.notes:
         console.print(f"{section.name}: {note}", soft_wrap=True)
 
 
-def _rich(table: Table) -> RichTable:
+def rich_table(table: Table) -> RichTable:
+    """A table for the terminal."""
     shown = RichTable(title=table.title, title_justify="left")
     for column in table.columns:
         shown.add_column(column, justify="right" if column else "left")

@@ -48,13 +48,14 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Bars (a number for each name) or lines (points for each name)."""
+    """Bars (a number for each name), lines or single points (several for each name)."""
 
     title: str
     x_label: str
     y_label: str
     bars: dict[str, float | None] = field(default_factory=dict)
     lines: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    points: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     log_y: bool = False
 
 

@@ -1,7 +1,9 @@
-"""Probability that a request misses its deadline, for every (robot, interface, server, service).
+"""Probability that a request misses its deadline, for every (robot, interface, server, service), and how much more
+often than by chance two of a robot's paths miss together.
 
 Requests that really ran are the best witness. For pairs that carried few or none, the round trips of the path and
-the server's processing times (whoever measured them) stand in: see `Estimator.miss_probability`.
+the server's processing times (whoever measured them) stand in: see `Estimator.estimate`.
+What is computed, and why: docs/theory.md.
 """
 
 from __future__ import annotations
@@ -12,27 +14,32 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from controlplane.core.fading import FadedCount, FadedHistogram, sum_exceeds
+from controlplane.core.posterior import Estimate, FadedTrials
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import InterfaceName, NodeName, PathReport, Report, ServiceName
+    from protos.model import Assignment, InterfaceName, NodeName, PathReport, Report, ServiceName
 
     Pair = tuple[InterfaceName, NodeName, ServiceName]
     PathKey = tuple[InterfaceName, NodeName]
+    JointKey = tuple[ServiceName, Assignment, Assignment]
 
 K = TypeVar("K")
 V = TypeVar("V")
 
-PRIOR_MISSES = 0.5
-PRIOR_REQUESTS = 1.0
-"""Jeffreys' prior, Beta(1/2, 1/2): a pair of which nothing is known misses one request in two."""
+IGNORANCE = Estimate(0.5, 0.5)
+"""Jeffreys' prior: a pair of which nothing is known misses one request in two."""
 
-FEW_REQUESTS = 100.0
-"""From this many real requests on, the estimate from round trips has no say; below, ever more."""
+MODEL_REQUESTS = 5.0
+"""What the estimate from round trips is worth in real requests, however many probes back it: probes are small, so it
+errs by what the size of a request costs."""
 
-MODEL_MAX_REQUESTS = 100.0
-"""The estimate from round trips never counts for more real requests than this, however many probes back it."""
+MODEL_MAX_PROBES = 100.0
+"""Probes beyond which more of them do not bring the estimate from round trips any nearer to 0 or 1."""
+
+INDEPENDENCE_REQUESTS = 20.0
+"""What the belief that paths fail independently is worth in requests sent over both."""
 
 OVERHEAD_MIN_REQUESTS = 20.0
 """Requests a pair must have carried before it tells how much slower requests are than probes."""
@@ -42,6 +49,9 @@ MAX_PAIRS_PER_ROBOT = 1024
 
 MAX_PATHS_PER_ROBOT = 1024
 """Paths kept of one robot, the least recently reported goes."""
+
+MAX_JOINTS_PER_ROBOT = 1024
+"""Pairs of paths of one robot whose common misses are kept, the least recently reported goes."""
 
 MAX_OUTCOMES_PER_ROBOT = 1024
 """Services kept of one robot, the least recently reported goes: as many as it can carry."""
@@ -68,13 +78,24 @@ class PathState:
         return max(found, default=0.0)
 
 
+class _PairLatency:
+    """Requests that ran on one pair: their latencies, and which of them missed the deadline."""
+
+    __slots__ = ("histogram", "outcomes")
+
+    def __init__(self, half_life_s: float, now: float) -> None:
+        self.histogram = FadedHistogram(half_life_s, now)
+        self.outcomes = FadedTrials(half_life_s, now)
+
+
 class _Robot:
     """Tables fed by one robot."""
 
-    __slots__ = ("latencies", "outcomes", "paths")
+    __slots__ = ("joints", "latencies", "outcomes", "paths")
 
     def __init__(self) -> None:
-        self.latencies: OrderedDict[Pair, FadedHistogram] = OrderedDict()
+        self.latencies: OrderedDict[Pair, _PairLatency] = OrderedDict()
+        self.joints: OrderedDict[JointKey, FadedTrials] = OrderedDict()
         self.paths: OrderedDict[PathKey, PathState] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
 
@@ -102,11 +123,24 @@ class Estimator:
         self._histograms -= tables.histograms()
         for latency in report.latencies:
             pair = (latency.interface, latency.server, latency.service)
-            if latency.latency.total:
-                self._histogram(tables.latencies, pair, MAX_PAIRS_PER_ROBOT, now).add(latency.latency, now)
+            if latency.latency.total or latency.requests:
+                found = tables.latencies.get(pair) or _PairLatency(self._half_life_s, now)
+                tables.latencies[pair] = found
+                self._trim(tables.latencies, pair, MAX_PAIRS_PER_ROBOT)
+                found.histogram.add(latency.latency, now)
+                found.outcomes.add(latency.requests, latency.missed, now)
             if latency.processing.total:
                 key = (latency.server, latency.service)
-                self._histogram(self._processing, key, MAX_PROCESSING, now).add(latency.processing, now)
+                processing = self._processing.get(key) or FadedHistogram(self._half_life_s, now)
+                self._processing[key] = processing
+                self._trim(self._processing, key, MAX_PROCESSING)
+                processing.add(latency.processing, now)
+        for joint in report.joints:
+            joint_key = (joint.service, joint.first, joint.second)
+            together = tables.joints.get(joint_key) or FadedTrials(self._half_life_s, now)
+            tables.joints[joint_key] = together
+            self._trim(tables.joints, joint_key, MAX_JOINTS_PER_ROBOT)
+            together.add(joint.requests, joint.both_missed, now)
         changed = False
         for path in report.paths:
             changed |= self._merge_path(tables, path, now)
@@ -122,13 +156,6 @@ class Estimator:
             self._histograms -= forgotten.histograms()
             self.dropped += forgotten.histograms()
         return changed
-
-    def _histogram(self, table: OrderedDict[K, FadedHistogram], key: K, limit: int, now: float) -> FadedHistogram:
-        histogram = table.get(key)
-        if histogram is None:
-            histogram = table[key] = FadedHistogram(self._half_life_s, now)
-        self._trim(table, key, limit)
-        return histogram
 
     def _trim(self, table: OrderedDict[K, V], key: K, limit: int) -> None:
         """Mark `key` as used last, and evict the least recently used beyond `limit`."""
@@ -178,7 +205,7 @@ class Estimator:
         """Share of the robot's recent requests that missed their deadline or failed; None without any."""
         tables = self._robots.get(robot)
         count = tables.outcomes.get(service) if tables is not None else None
-        if count is None or count.weight(now) < PRIOR_MISSES:
+        if count is None or count.weight(now) < IGNORANCE.misses:
             return None
         return count.ratio()
 
@@ -192,10 +219,11 @@ class Estimator:
         if tables is None:
             return 0.0
         total = weights = 0.0
-        for (interface, server, of_service), latency in tables.latencies.items():
+        for (interface, server, of_service), found in tables.latencies.items():
             if of_service != service:
                 continue
             path = tables.paths.get((interface, server))
+            latency = found.histogram
             weight = latency.weight(now)
             if path is None or weight < OVERHEAD_MIN_REQUESTS:
                 continue
@@ -208,7 +236,7 @@ class Estimator:
                 weights += weight
         return total / weights if weights else 0.0
 
-    def miss_probability(
+    def estimate(
         self,
         robot: NodeName,
         interface: InterfaceName,
@@ -218,31 +246,37 @@ class Estimator:
         now: float,
         *,
         overhead_s: float = 0.0,
-    ) -> float:
-        """epsilon_ij = P(L_ij > deadline), never quite 0 nor 1.
+    ) -> Estimate:
+        """epsilon_ij = P(L_ij > deadline), as the posterior of the requests that ran on this pair.
 
-        With n requests that ran on this pair, m of them too late, and a model that gives p:
-        (m + w p + PRIOR_MISSES) / (n + w + PRIOR_REQUESTS), the posterior mean of a Beta prior, where w is the
-        model's worth in requests; it falls to 0 as n reaches `FEW_REQUESTS`.
+        The prior comes from round trips and processing times, and is worth `MODEL_REQUESTS`. Without those it is
+        `IGNORANCE`.
         """
         tables = self._robots.get(robot)
         if tables is None:
-            return PRIOR_MISSES / PRIOR_REQUESTS
-        requests = misses = 0.0
-        latency = tables.latencies.get((interface, server, service))
-        if latency is not None:
-            requests = latency.weight(now)
-            misses = requests * latency.fraction_over(deadline_s) if requests else 0.0
-        model_weight = model = 0.0
+            return IGNORANCE
+        prior = IGNORANCE
         path = tables.paths.get((interface, server))
-        if path is not None and requests < FEW_REQUESTS:
+        if path is not None:
             model = self._model(path, self._processing.get((server, service)), deadline_s - overhead_s)
             if math.isfinite(model):
-                backing = min(path.rtt.weight(now), MODEL_MAX_REQUESTS)
-                model_weight = backing * (1.0 - requests / FEW_REQUESTS)
-            else:
-                model = 0.0
-        return (misses + model_weight * model + PRIOR_MISSES) / (requests + model_weight + PRIOR_REQUESTS)
+                probes = min(path.rtt.weight(now), MODEL_MAX_PROBES)
+                mean = (probes * model + IGNORANCE.misses) / (probes + IGNORANCE.weight)
+                prior = Estimate.of(mean, min(MODEL_REQUESTS, probes + IGNORANCE.weight))
+        latency = tables.latencies.get((interface, server, service))
+        return latency.outcomes.posterior(prior, now) if latency is not None else prior
+
+    def both_miss(
+        self, robot: NodeName, service: ServiceName, first: Assignment, second: Assignment, product: float, now: float
+    ) -> Estimate:
+        """P(requests over both paths miss on both), where `product` is that probability if they fail independently.
+
+        `first` comes before `second` in the order of their names. Without common requests it is the product.
+        """
+        prior = Estimate.of(product, INDEPENDENCE_REQUESTS)
+        tables = self._robots.get(robot)
+        together = tables.joints.get((service, first, second)) if tables is not None else None
+        return together.posterior(prior, now) if together is not None else prior
 
     @staticmethod
     def _model(path: PathState, processing: FadedHistogram | None, deadline_s: float) -> float:

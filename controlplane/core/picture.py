@@ -112,9 +112,9 @@ def _block(
     def epsilon(interface: InterfaceName, server: NodeName) -> float | None:
         if (interface, server) not in up:
             return None
-        return estimator.miss_probability(
+        return estimator.estimate(
             robot.name, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s
-        )
+        ).mean
 
     block = Block(
         key=BlockKey(robot.name, use.name),

@@ -86,13 +86,17 @@ def latency(
     *,
     processing: Histogram | None = None,
     service: str = PLAN,
+    deadline_s: float = 0.1,
 ) -> LatencyReport:
+    """Of requests whose latency and outcome by the deadline became known at once."""
     return LatencyReport(
         InterfaceName(interface),
         NodeName(server),
         ServiceName(service),
         measured,
         processing if processing is not None else Histogram(),
+        requests=measured.total,
+        missed=round(measured.count_over(deadline_s)),
     )
 
 

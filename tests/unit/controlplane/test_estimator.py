@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from controlplane.core import estimator as estimator_module
 from controlplane.core.estimator import Estimator
-from protos.model import InterfaceName, NodeName, OutcomeReport, PathReport, Report, ServiceName
+from protos.model import (
+    Assignment,
+    InterfaceName,
+    JointReport,
+    LatencyReport,
+    NodeName,
+    OutcomeReport,
+    PathReport,
+    Report,
+    ServiceName,
+)
 from tests.unit.controlplane.samples import PLAN, histogram, latency, path
+
+if TYPE_CHECKING:
+    from controlplane.core.posterior import Estimate
 
 ROBOT = NodeName("robot")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")
@@ -21,8 +36,12 @@ def estimator() -> Estimator:
 
 
 def miss(estimator: Estimator, server: NodeName = A, now: float = 0.0, interface: InterfaceName = WLAN) -> float:
+    return believe(estimator, server, now, interface).mean
+
+
+def believe(estimator: Estimator, server: NodeName = A, now: float = 0.0, interface: InterfaceName = WLAN) -> Estimate:
     overhead = estimator.overhead(ROBOT, PLAN, now)
-    return estimator.miss_probability(ROBOT, interface, server, PLAN, DEADLINE_S, now, overhead_s=overhead)
+    return estimator.estimate(ROBOT, interface, server, PLAN, DEADLINE_S, now, overhead_s=overhead)
 
 
 def test_a_pair_never_heard_of_is_a_coin_toss(estimator: Estimator) -> None:
@@ -40,7 +59,7 @@ def test_many_real_requests_decide_alone(estimator: Estimator) -> None:
         paths=(path("wlan0", "cloud-a", rtt=histogram(0.01, times=500)),),
     )
     estimator.merge(ROBOT, reported, 0.0)
-    assert miss(estimator) == pytest.approx((100 + 0.5) / (1000 + 1))
+    assert miss(estimator) == pytest.approx((100 + 5 * 0.005) / (1000 + 5), rel=0.001)
 
 
 def test_no_requests_let_round_trips_and_processing_decide(estimator: Estimator) -> None:
@@ -64,8 +83,8 @@ def test_few_requests_are_blended_with_the_round_trips(estimator: Estimator) -> 
     estimator.merge(ROBOT, Report(latencies=(latency("wlan0", "cloud-a", histogram(0.2, times=90)),)), 0.0)
     many = miss(estimator)
     assert unused < 0.01
-    assert few == pytest.approx(10.5 / (10 + 90 + 1), abs=0.01)
-    assert many > 0.99
+    assert few == pytest.approx(10 / (10 + 5), abs=0.01)
+    assert many > 0.94
 
 
 def test_loss_costs_a_round_trip(estimator: Estimator) -> None:
@@ -97,6 +116,32 @@ def test_old_evidence_fades_back_to_doubt(estimator: Estimator) -> None:
     fresh, hour_later = miss(estimator), miss(estimator, now=3600.0)
     assert fresh < 0.001
     assert hour_later == pytest.approx(0.5)
+    assert believe(estimator).weight > 100.0
+    assert believe(estimator, now=3600.0).weight == pytest.approx(1.0)
+
+
+def test_misses_count_when_the_deadline_is_over_though_the_latency_is_not_known_yet(estimator: Estimator) -> None:
+    judged = LatencyReport(WLAN, A, PLAN, histogram(), histogram(), requests=95, missed=50)
+    estimator.merge(ROBOT, Report(latencies=(judged,)), 0.0)
+    assert miss(estimator) == pytest.approx(50.5 / 96)
+
+
+def together(requests: int, both_missed: int, *, second: str = B) -> JointReport:
+    return JointReport(PLAN, Assignment(WLAN, A), Assignment(WWAN, NodeName(second)), requests, both_missed)
+
+
+def both_miss(estimator: Estimator, product: float, now: float = 0.0) -> float:
+    return estimator.both_miss(ROBOT, PLAN, Assignment(WLAN, A), Assignment(WWAN, B), product, now).mean
+
+
+def test_paths_fail_independently_until_seen_to_fail_together(estimator: Estimator) -> None:
+    assert both_miss(estimator, 0.01) == pytest.approx(0.01)
+    estimator.merge(ROBOT, Report(joints=(together(20, 2),)), 0.0)
+    assert both_miss(estimator, 0.01) == pytest.approx((2 + 20 * 0.01) / 40)
+    estimator.merge(ROBOT, Report(joints=(together(2000, 200),)), 0.0)
+    assert both_miss(estimator, 0.01) == pytest.approx(0.1, rel=0.02)
+    assert both_miss(estimator, 0.01, now=3600.0) == pytest.approx(0.01)
+    assert estimator.both_miss(ROBOT, PLAN, Assignment(WLAN, B), Assignment(WWAN, A), 0.01, 0.0).mean == 0.01
 
 
 def test_going_up_or_down_is_news(estimator: Estimator) -> None:
@@ -123,6 +168,7 @@ def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypa
     monkeypatch.setattr(estimator_module, "MAX_PATHS_PER_ROBOT", 4)
     monkeypatch.setattr(estimator_module, "MAX_OUTCOMES_PER_ROBOT", 4)
     monkeypatch.setattr(estimator_module, "MAX_PROCESSING", 4)
+    monkeypatch.setattr(estimator_module, "MAX_JOINTS_PER_ROBOT", 4)
     for number in range(6):
         measured = histogram(0.01)
         estimator.merge(
@@ -131,10 +177,11 @@ def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypa
                 latencies=(latency("wlan0", f"cloud-{number}", measured, processing=measured),),
                 paths=(path("wlan0", f"cloud-{number}"),),
                 outcomes=(OutcomeReport(ServiceName(f"/service_{number}"), ok=1),),
+                joints=(together(1, 0, second=f"cloud-{number}"),),
             ),
             float(number),
         )
-    assert estimator.dropped == 4 * 2
+    assert estimator.dropped == 5 * 2
     assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-1")) is None
     assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-5")) is True
 

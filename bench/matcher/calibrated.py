@@ -1,0 +1,124 @@
+"""Section `calibration`: are predicted miss ratios those observed?"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ProcessPoolExecutor
+from statistics import fmean
+from typing import TYPE_CHECKING
+
+from bench.dataplane.section import Figure, Findings, Plot, Table
+from bench.matcher.calibration import DEADLINES_S, FEWEST_MISSES, KINDS, Cell, cells_of, paired, share_calibrated
+from bench.matcher.races import replay, workloads_for
+from bench.matcher.sources import load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from bench.netlab.traces import Trace
+
+SHOWN_MISFITS = 12
+
+
+def measure(folder: Path | None, say: Callable[[str], None], *, quick: bool) -> Findings:
+    """Replay every trace (of many of a family, one, if `quick`)."""
+    traces, note = load(folder)
+    if quick:
+        traces = list({trace.name.rpartition("-")[0]: (trace, kind) for trace, kind in traces}.values())
+    cells: list[Cell] = []
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        for (trace, _), found in zip(traces, pool.map(_cells, traces), strict=True):
+            say(f"calibration: {trace.name}")
+            cells += found
+    findings = Findings(notes=[note] if note else [])
+    findings.figures = _figures(cells, len(traces))
+    findings.tables = [_by_deadline(cells), _by_family(cells), _misfits(cells)]
+    findings.plots = [_plot(cells)]
+    return findings
+
+
+def _cells(source: tuple[Trace, str]) -> list[Cell]:
+    trace, kind = source
+    return [cell for workload in workloads_for(kind) for cell in cells_of(replay(trace, workload))]
+
+
+def _figures(cells: Sequence[Cell], traces: int) -> dict[str, Figure]:
+    pairs = paired(cells)
+    figures: dict[str, Figure] = {
+        "calibration_traces": traces,
+        "calibration_cells": sum(cell.expected >= FEWEST_MISSES for cell in cells),
+        "calibration_share": share_calibrated([cell for cell in cells if cell.kind != "product"]),
+        "calibration_log_error_product": fmean(one.log_error for one, _ in pairs) if pairs else None,
+        "calibration_log_error_joint": fmean(other.log_error for _, other in pairs) if pairs else None,
+    }
+    for kind, names in (("single", ("a", "b")), ("product", ("product",)), ("joint", ("joint",))):
+        figures[f"calibration_share_{kind}"] = share_calibrated([cell for cell in cells if cell.kind in names])
+    return figures
+
+
+def _row(name: str, cells: Sequence[Cell]) -> tuple[str | Figure, ...]:
+    requests = sum(cell.requests for cell in cells)
+    judged = [cell for cell in cells if cell.expected >= FEWEST_MISSES]
+    return (
+        name,
+        sum(cell.expected for cell in cells) / requests,
+        sum(cell.observed for cell in cells) / requests,
+        sum(cell.low for cell in cells) / requests,
+        sum(cell.high for cell in cells) / requests,
+        len(judged),
+        sum(cell.inside for cell in judged) / len(judged) if judged else None,
+        sum(cell.near for cell in judged) / len(judged) if judged else None,
+        share_calibrated(judged),
+    )
+
+
+_COLUMNS = ("", "predicted", "observed", "from", "to", "cells", "inside", "near", "either")
+
+
+def _by_deadline(cells: Sequence[Cell]) -> Table:
+    rows = [
+        _row(f"{deadline_s * 1e3:.0f} ms, {kind}", [c for c in cells if (c.deadline_s, c.kind) == (deadline_s, kind)])
+        for deadline_s in DEADLINES_S
+        for kind in KINDS
+    ]
+    return Table("miss ratios by deadline, all traces", _COLUMNS, tuple(rows))
+
+
+def _by_family(cells: Sequence[Cell]) -> Table:
+    families = list(dict.fromkeys(_family(cell) for cell in cells))
+    rows = [
+        _row(f"{family}, {kind}", [cell for cell in cells if (_family(cell), cell.kind) == (family, kind)])
+        for family in families
+        for kind in KINDS
+    ]
+    return Table("miss ratios by family of traces, all deadlines", _COLUMNS, tuple(rows))
+
+
+def _family(cell: Cell) -> str:
+    name = cell.trace.rstrip("0123456789-")
+    return f"{name} {cell.workload}"
+
+
+def _misfits(cells: Sequence[Cell]) -> Table:
+    wrong = [cell for cell in cells if cell.expected >= FEWEST_MISSES and not (cell.inside or cell.near)]
+    wrong.sort(key=lambda cell: -cell.log_error)
+    rows = tuple(
+        (
+            f"{cell.trace} {cell.workload} {cell.deadline_s * 1e3:.0f} ms {cell.kind}",
+            cell.requests,
+            cell.expected,
+            cell.observed,
+        )
+        for cell in wrong[:SHOWN_MISFITS]
+    )
+    return Table(f"worst of {len(wrong)} cells that do not fit", ("", "requests", "expected", "observed"), rows)
+
+
+def _plot(cells: Sequence[Cell]) -> Plot:
+    judged = [cell for cell in cells if cell.expected >= FEWEST_MISSES]
+    points = {
+        name: [(cell.expected / cell.requests, cell.observed / cell.requests) for cell in judged if cell.kind in kinds]
+        for name, kinds in (("single", ("a", "b")), ("product", ("product",)), ("joint", ("joint",)))
+    }
+    return Plot("predicted and observed miss ratio, a point for each cell", "predicted", "observed", points=points)

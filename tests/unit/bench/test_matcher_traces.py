@@ -1,0 +1,135 @@
+"""The offline replay: what a message on a recorded path takes, what a sidecar reports when, and the judge."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from bench.matcher.calibration import Cell, cells_of, paired, share_calibrated
+from bench.matcher.feed import LIFETIME_S, Reporter
+from bench.matcher.fifo import FifoLink, FifoPath
+from bench.matcher.races import Probe, Race, Workload, replay
+from bench.matcher.sources import synthetic
+from bench.netlab.profile import LinkProfile
+from bench.netlab.traces import TraceStep
+from protos.convert import report_from_proto, report_to_proto
+from sidecar.core.copies import OBSERVED_ONE_IN
+
+KBPS = 1000.0
+"""125 bytes a millisecond."""
+
+
+class Full(random.Random):
+    """Makes every request a full race, or none."""
+
+    def __init__(self, *, full: bool) -> None:
+        super().__init__(0)
+        self.full = full
+
+    def randrange(self, *_: object, **__: object) -> int:
+        return 0 if self.full else 1
+
+
+def steps(*rates: float, delay_ms: float = 10.0, loss: float = 0.0, queue: int = 100_000) -> tuple[TraceStep, ...]:
+    profiles = [LinkProfile(delay_ms=delay_ms, loss=loss, rate_kbps=rate, queue_bytes=queue) for rate in rates]
+    return tuple(TraceStep(float(at), profile, profile) for at, profile in enumerate(profiles))
+
+
+def sent(link: FifoLink, *messages: tuple[float, int]) -> list[float]:
+    rng = random.Random(0)
+    return [link.send(at, size, rng) for at, size in messages]
+
+
+def test_messages_take_their_size_at_the_rate_and_wait_for_those_before() -> None:
+    link = FifoLink(steps(KBPS, KBPS), up=True)
+    assert sent(link, (0.0, 12_500), (0.05, 12_500)) == pytest.approx([0.11, 0.21])
+
+
+def test_an_outage_holds_messages_back_and_a_full_queue_drops_the_newest() -> None:
+    link = FifoLink(steps(KBPS, 0.0, KBPS, queue=16_000), up=True)
+    arrivals = sent(link, (0.95, 12_500), (1.5, 12_500), (1.6, 1250))
+    assert arrivals == pytest.approx([2.06, math.inf, 2.07])
+
+
+def test_the_end_of_the_trace_in_an_outage_loses_what_waits() -> None:
+    assert sent(FifoLink(steps(KBPS, 0.0), up=True), (1.5, 1000)) == [math.inf]
+
+
+def test_loss_costs_a_round_trip_or_twice_lost_the_message() -> None:
+    always = FifoLink(steps(KBPS, loss=1.0), up=True)
+    assert sent(always, (0.0, 1250)) == [math.inf]
+
+    class Once(random.Random):
+        draws = 0
+
+        def random(self) -> float:
+            self.draws += 1
+            return 0.0 if self.draws == 1 else 0.99
+
+    link = FifoLink(steps(KBPS, loss=0.5), up=True)
+    assert link.send(0.0, 1250, Once()) == pytest.approx(0.01 + 0.01 + 2 * 0.01)
+
+
+def test_a_request_goes_up_is_processed_and_comes_down() -> None:
+    path = FifoPath(steps(KBPS, KBPS))
+    assert path.request(0.0, 12_500, 1250, 0.02, random.Random(0)) == pytest.approx(0.11 + 0.02 + 0.02)
+
+
+def race(a: float, b: float) -> Race:
+    return Race(0.0, (a, b), (0.01, 0.01))
+
+
+def test_a_miss_is_told_at_the_deadline_and_its_latency_when_it_is_known() -> None:
+    reporter = Reporter(0.1, Full(full=True))
+    reporter.raced(race(0.05, math.inf))
+    assert reporter.take(0.06).latencies[0].latency.total == 1
+    told = reporter.take(0.1)
+    assert {report.interface: (report.requests, report.missed) for report in told.latencies} == {
+        "a": (1, 0),
+        "b": (1, 1),
+    }
+    assert [(joint.requests, joint.both_missed) for joint in told.joints] == [(1, 0)]
+    reporter.raced(race(math.inf, 0.3))
+    assert [(joint.requests, joint.both_missed) for joint in reporter.take(0.1).joints] == [(1, 1)]
+    late = reporter.take(LIFETIME_S)
+    assert [(report.latency.answered, report.latency.lost) for report in late.latencies] == [(0, 1), (1, 0)]
+
+
+def test_of_a_request_that_is_no_full_race_only_the_pair_is_told() -> None:
+    reporter = Reporter(0.1, Full(full=False))
+    reporter.raced(race(0.05, 0.2))
+    reporter.probed(Probe(0.0, 1, 0.02))
+    report = reporter.take(1.0)
+    assert report.latencies == ()
+    assert [(joint.requests, joint.both_missed) for joint in report.joints] == [(1, 0)]
+    assert [path.rtt.total for path in report.paths] == [0, 1]
+    assert report_from_proto(report_to_proto(report)) == report
+
+
+def test_predictions_meet_what_is_observed_on_random_paths() -> None:
+    races = replay(synthetic(3), Workload("20 kB", 20_000, 10.0))
+    assert races == replay(synthetic(3), Workload("20 kB", 20_000, 10.0)), "the same every time"
+    cells = list(cells_of(races))
+    share = share_calibrated(cells)
+    assert share is not None
+    assert share > 0.75
+    assert len({(cell.deadline_s, cell.kind) for cell in cells}) == len(cells)
+    for product, joint in paired(cells):
+        assert joint.kind == "joint"
+        assert product.observed == joint.observed
+    for cell in cells:
+        assert cell.low <= cell.expected <= cell.high or cell.expected < 1.0
+        assert cell.requests == len(races.races)
+
+
+def test_the_judge_counts_what_is_near_or_inside() -> None:
+    def cell(observed: int, expected: float = 100.0, half: float = 10.0) -> Cell:
+        return Cell("t", "w", 0.1, "a", 1000, expected, expected - half, expected + half, observed)
+
+    assert share_calibrated([cell(149), cell(67), cell(151), cell(66), cell(9, expected=10.0)]) == 0.5
+    assert share_calibrated([cell(160, half=60.0)]) == 1.0
+    assert share_calibrated([cell(5, expected=20.0)]) is None
+    assert cell(100).log_error == 0.0
+    assert OBSERVED_ONE_IN > 1

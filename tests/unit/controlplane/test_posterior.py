@@ -1,0 +1,70 @@
+"""What trials are worth: independent ones in full, streaks of misses less."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from controlplane.core.posterior import BATCH_S, Estimate, FadedTrials
+
+PRIOR = Estimate(0.5, 0.5)
+STEP_S = 0.5
+
+
+def fed(outcomes: list[bool], *, each_report: int = 5, half_life_s: float = 1e6) -> tuple[FadedTrials, float]:
+    trials = FadedTrials(half_life_s, 0.0)
+    now = 0.0
+    for start in range(0, len(outcomes), each_report):
+        report = outcomes[start : start + each_report]
+        now += STEP_S
+        trials.add(len(report), sum(report), now)
+    return trials, now
+
+
+def streaks(rng: random.Random, total: int, length: int) -> list[bool]:
+    found: list[bool] = []
+    while len(found) < total:
+        found += [rng.random() < 0.2] * length
+    return found[:total]
+
+
+def test_mean_and_weight_of_an_estimate() -> None:
+    estimate = Estimate.of(0.2, 10.0)
+    assert (estimate.misses, estimate.hits) == pytest.approx((2.0, 8.0))
+    assert (estimate.mean, estimate.weight) == pytest.approx((0.2, 10.0))
+
+
+def test_independent_misses_are_worth_what_they_count() -> None:
+    trials, now = fed(streaks(random.Random(1), 20_000, 1))
+    assert trials.design_effect() == pytest.approx(1.0, abs=0.25)
+    posterior = trials.posterior(PRIOR, now)
+    assert posterior.mean == pytest.approx(0.2, abs=0.01)
+    assert posterior.weight > 15_000
+
+
+@pytest.mark.parametrize("length", [20, 100, 400])
+def test_streaks_are_worth_about_as_many_as_there_are_streaks(length: int) -> None:
+    trials, now = fed(streaks(random.Random(length), 60_000, length))
+    # A run of equal outcomes tells once; the correlation beyond neighbouring batches is only guessed at.
+    assert 0.4 * length < trials.design_effect() < 2.5 * length
+    assert trials.posterior(PRIOR, now).mean == pytest.approx(0.2, abs=0.06)
+
+
+def test_few_trials_take_the_usual_streaks_for_granted() -> None:
+    trials, now = fed([False] * 10)
+    assert now < BATCH_S
+    assert trials.posterior(PRIOR, now).weight == pytest.approx(1.0 + 10 / 5)
+    assert FadedTrials(60.0, 0.0).posterior(PRIOR, 0.0) == PRIOR
+
+
+def test_trials_fade_and_the_prior_comes_back() -> None:
+    trials, now = fed([True] * 1000, half_life_s=10.0)
+    count, misses = trials.counts(now + 10.0)
+    assert count == misses == pytest.approx(trials.counts(now)[0] / 2)
+    assert trials.posterior(PRIOR, now + 1000.0).mean == pytest.approx(0.5)
+
+
+def test_a_steady_miss_ratio_has_no_design_effect_below_one() -> None:
+    trials, _ = fed([False, True] * 5000, each_report=10)
+    assert trials.design_effect() == 1.0
