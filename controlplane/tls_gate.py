@@ -243,12 +243,10 @@ class TlsGate:
 
     def _check(self, certificate: bytes) -> Caller:
         """Return the caller with its refusal, if any; raises CertificateError for one that is not even of our CA."""
-        identity = self._trust.identify(certificate)
         try:
-            self._trust.check(certificate, time.time())
+            return Caller(self._trust.check(certificate, time.time()), certificate)
         except CertificateError as error:
-            return Caller(identity, certificate, error)
-        return Caller(identity, certificate)
+            return Caller(self._trust.identify(certificate), certificate, error)
 
     def _review(self, connection: _Connection) -> None:
         """End the connection if its certificate is not good any more."""

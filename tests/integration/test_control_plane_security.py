@@ -33,6 +33,7 @@ from tests.unit.controlplane.samples import registration
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 
 @pytest.fixture(scope="module")
@@ -222,6 +223,27 @@ def test_a_message_that_is_too_long_ends_the_stream(plane: SecuredControlPlane) 
         stream.expect(Welcome)
         stream.send_raw(control_pb2.SidecarMessage(nack=control_pb2.Nack(error="x" * (5 << 20))))
         assert stream.end()[0] is grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+def test_who_pings_without_pause_is_cut_off(plane: SecuredControlPlane, tmp_path: Path) -> None:
+    member = plane.member("robot-1")
+    shown = tmp_path / "shown.pem"
+    shown.write_bytes(member.issued.certificate_pem + member.issued.key_pem)
+    context = ssl.create_default_context(cadata=member.ca_pem.decode())
+    context.load_cert_chain(shown)
+    context.set_alpn_protocols(["h2"])
+    host, port = plane.address.split(":")
+    with socket.create_connection((host, int(port)), PATIENCE_S) as raw:
+        with context.wrap_socket(raw, server_hostname=CONTROL_PLANE_DNS) as tls:
+            # RFC 9113: the preface with empty settings, then PING frames.
+            tls.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0)))
+            received = b""
+            while b"too_many_pings" not in received:
+                with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                    tls.sendall(bytes((0, 0, 8, 6, 0, 0, 0, 0, 0)) + bytes(8))
+                data = tls.recv(1 << 16)
+                assert data, received
+                received += data
 
 
 def test_one_name_gets_few_streams(plane: SecuredControlPlane) -> None:
