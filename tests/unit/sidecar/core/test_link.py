@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -25,6 +26,7 @@ from sidecar.core.link_events import (
     SendClose,
     SendFinished,
     SetCarrier,
+    SetCredential,
     SetPeers,
     SetReady,
 )
@@ -254,6 +256,16 @@ def test_who_introduces_itself_again_after_an_answer_is_introduced_to_at_that_pl
         bench.receive_datagram(bench.introduction(number=number, interface=NEW_INTERFACE), ELSEWHERE)
         answers = bench.frames(bench.sent() + bench.wait(FIRST_PROBE_S))
         assert any(isinstance(item, Introduction) for item in answers) is (number == 1)
+
+
+def test_a_credential_signed_anew_is_introduced_from_then_on() -> None:
+    bench = Bench()
+    (before,) = bench.frames(bench.sent())
+    renewed = replace(bench.own.credential, certificate=b"renewed", signature=b"again")
+    bench.execute(SetCredential(renewed.encode()))
+    (after,) = bench.frames(bench.wait(FIRST_PROBE_S * 1.2))
+    assert before == OUR_INTRODUCTION
+    assert after == Introduction(1, renewed)
 
 
 def test_an_introduction_that_comes_again_is_not_answered_once_something_newer_was_authentic() -> None:

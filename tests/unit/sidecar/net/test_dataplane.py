@@ -7,10 +7,12 @@ import random
 import socket
 import threading
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
+from protos.errors import DecodeError
 from protos.model import (
     ALL_CALLS,
     Candidate,
@@ -34,16 +36,19 @@ from sidecar.core.events import (
     OfferService,
     RequestId,
     ResponseArrived,
+    WithdrawService,
 )
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
-from tests.sessions import session_of, with_credential
+from tests.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from protos.credential import SessionCredential
 
 SERVICE, TYPE = ServiceName("/echo"), "t/srv/Echo"
 PATIENCE_S = 20.0
@@ -61,7 +66,7 @@ class Node:
         self.news = threading.Condition()
         config = EngineConfig(role, (ServiceRule(SERVICE, 5.0, 20.0, idempotent=True),))
         hooks = DataPlaneHooks(self, lambda *_: None, lambda: None)
-        own = session_of(name, role, session)
+        own = self.own = session_of(name, role, session)
         self.plane = ThreadedDataPlane(config, own, hooks)
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         sock.setblocking(False)
@@ -81,9 +86,8 @@ class Node:
 
     def as_peer(self) -> Peer:
         candidate = Candidate(InterfaceId(0), InterfaceName("lo"), CandidateKind.HOST, ("127.0.0.1", self.thread.port))
-        return with_credential(
-            Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers, may_call=ALL_CALLS)
-        )
+        peer = Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers, may_call=ALL_CALLS)
+        return replace(peer, credential=self.own.credential.encode())
 
     def start(self, other: Node) -> None:
         self.plane.start()
@@ -188,3 +192,30 @@ def test_timers_do_not_spin_while_the_socket_takes_nothing() -> None:
     thread._unsent.append(Batch(("127.0.0.1", 9), b"x", 1))
     assert thread._due() == overdue + BLOCKED_TIMER_S
     thread._socket.close()
+
+
+def test_a_peer_that_trust_no_longer_covers_loses_its_session_at_once(nodes: tuple[Node, Node]) -> None:
+    robot, cloud = nodes
+    submit(robot, 1, b"before")
+    robot.wait_for(ResponseArrived)
+
+    def judge(credential: SessionCredential) -> None:
+        raise DecodeError(f"{credential.name} is revoked")
+
+    robot.own._verify = judge
+    robot.plane.trust_changed()
+    robot.wait_for(WithdrawService)
+    assert robot.plane.engine_stats.dropped["bad_credential"] == 1
+    assert cloud.name not in robot.plane._engine.peers
+
+
+def test_requests_go_on_while_the_credential_is_signed_anew(nodes: tuple[Node, Node]) -> None:
+    robot, cloud = nodes
+    for number in range(10):
+        for node in (robot, cloud):
+            renewed = replace(node.own.credential, certificate=bytes([number]), signature=b"again")
+            node.plane.renew_credential(renewed)
+        robot.plane.apply_peers(PeerSet(Version(number + 2), 1, (cloud.as_peer(),)))
+        submit(robot, number, b"still here")
+    assert len(robot.wait_for(ResponseArrived, 10)) == 10
+    assert "unauthentic" not in cloud.thread.link.stats.dropped
