@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from controlplane.core.control_events import Settings
+from controlplane.core.problem import Objective
 from controlplane.policy_config import PolicyConfig, one_or_list
 from protos.config_fields import (
     ListenAddress,
@@ -93,6 +94,12 @@ class ControlPlaneConfig(BaseModel):
         description="How many interfaces of one robot may share a server for one service; 0 means no limit. The "
         "paper's value is 1. Exceeded by the least amount where there are too few servers.",
     )
+    objective: Objective = Field(
+        default=Objective.JOINT,
+        description="What the mapping minimises: the probability that all copies miss the deadline, with paths that "
+        "fail together (joint) or as if they never did (product), or the sum of the copies' miss probabilities "
+        "(sum, the paper's).",
+    )
     solver_time_limit_ms: int = Field(
         default=2000, ge=10, le=60_000, description="Longest time for one solving; then the best plan found is taken."
     )
@@ -124,6 +131,7 @@ class ControlPlaneConfig(BaseModel):
             warm_up_s=self.warm_up_ms / 1000,
             half_life_s=self.histogram_half_life_s,
             default_capacity_interfaces=self.default_capacity_interfaces,
+            objective=self.objective,
             stun_servers=self.stun_servers,
             policy=self.policy.policy() if self.policy is not None else None,
         )

@@ -62,7 +62,7 @@ def _few(services: Sequence[ServiceName]) -> str:
 
 def _solve(problem: Problem, time_limit_s: float, hint: Plan) -> Plan:
     # OR-Tools takes one to two seconds to import: the streams need not wait for it after a restart.
-    from controlplane.solver import solve
+    from controlplane.matcher import solve
 
     return solve(problem, time_limit_s=time_limit_s, hint=hint)
 

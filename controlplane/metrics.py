@@ -204,6 +204,12 @@ def _plan(core: ControlCore, now: float) -> Iterable[Metric]:
         [],
         {(): core.plan.relaxed},
     )
+    yield _gauge(
+        "plr_plan_gap_ratio",
+        "How far the running plan's cost is above the bound that the solver proved, relative to the bound.",
+        [],
+        {(): core.plan.gap},
+    )
     yield _counter(
         "plr_relaxations_total",
         "Plans taken that exceed capacities by another number of interfaces than the one before.",
@@ -212,7 +218,7 @@ def _plan(core: ControlCore, now: float) -> Iterable[Metric]:
     )
     yield _counter(
         "plr_solves_unproven_total",
-        "Groups of assignments whose optimum was not proven within the time limit.",
+        "Groups of assignments left further from their bound than wanted by the time limit.",
         [],
         {(): core.counters.unproven},
     )

@@ -263,6 +263,7 @@ class ControlCore:
             self.estimator,
             now,
             default_capacity_interfaces=self._settings.default_capacity_interfaces,
+            objective=self._settings.objective,
         )
 
     def solved(self, picture: Picture, plan: Plan, now: float) -> None:

@@ -7,6 +7,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from controlplane.core.problem import Objective
+
 if TYPE_CHECKING:
     from controlplane.core.policy import Policy
     from controlplane.core.registry import StreamId
@@ -22,6 +24,7 @@ class Settings:
     warm_up_s: float = 12.0
     half_life_s: float = 60.0
     default_capacity_interfaces: int = 1
+    objective: Objective = Objective.JOINT
     stun_servers: tuple[str, ...] = ()
     policy: Policy | None = None
 
@@ -71,7 +74,7 @@ class Counters:
     relaxations: int = 0
     """Plans taken that exceed a capacity."""
     unproven: int = 0
-    """Groups of blocks whose optimum was not proven in time."""
+    """Groups of blocks left further from their bound than wanted by the time limit."""
 
 
 @dataclass(frozen=True, slots=True)

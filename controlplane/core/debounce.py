@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import enum
+import math
 from typing import TYPE_CHECKING
 
 from controlplane.core.grouping import independent_groups
+from controlplane.core.objectives import joint_miss
 from controlplane.core.plan import Plan, choice_of, make_plan, price
+from controlplane.core.problem import Objective
 
 if TYPE_CHECKING:
-    from controlplane.core.plan import BlockPlan, Price
+    from collections.abc import Mapping
+
+    from controlplane.core.plan import BlockPlan
     from controlplane.core.problem import BlockKey, Choice, FleetKey, Problem
 
 URGENT_DELAY_S = 0.05
@@ -24,8 +29,14 @@ ROUTINE_TIMES = 4.0
 
 IMPROVEMENT_SHARE = 0.1
 IMPROVEMENT_MIN = 0.002
-"""What a new plan must save of a group's cost, as a share and in all: below, it is the noise of the reports, and a
-change itself costs the requests in flight a detour."""
+"""What a new plan must save of a group's sum of miss probabilities, as a share and in all: below, it is the noise of
+the reports, and a change itself costs the requests in flight a detour."""
+
+IMPROVEMENT_LOG = -math.log(1 - IMPROVEMENT_SHARE)
+"""The same share where logarithms are summed, for each block that changes."""
+
+IMPROVEMENT_MIN_ALL_MISS = 1e-4
+"""What it must save of the expected number of requests that miss, one of each block: products are smaller."""
 
 
 class Change(enum.Enum):
@@ -83,7 +94,7 @@ def settle(problem: Problem, new: Plan, running: Plan | None) -> Plan:
 
     Group by group (blocks that share a limit change together): the new choice is taken if the running one is not
     valid any more (a path or a server of it is gone, an interface came), exceeds the capacities by more, or costs,
-    at today's epsilons, more by `IMPROVEMENT_SHARE` and `IMPROVEMENT_MIN`.
+    at today's epsilons, too much more: see `IMPROVEMENT_SHARE` and what follows it.
     """
     blocks: dict[BlockKey, BlockPlan] = {}
     excess: dict[FleetKey, int] = {}
@@ -93,11 +104,11 @@ def settle(problem: Problem, new: Plan, running: Plan | None) -> Plan:
         if newer is None:
             # The new plan answers this very problem, so it has a choice for every block.
             raise ValueError("the plan does not fit the problem")
-        taken = older if older is not None and not _is_worth_it(price(group, newer), price(group, older)) else newer
+        taken = older if older is not None and not _is_worth_it(group, newer, older) else newer
         part = make_plan(group, taken)
         blocks.update(part.blocks)
         excess.update(part.fleet_excess)
-    return Plan(blocks, excess, new.unproven)
+    return Plan(blocks, excess, new.bound, new.unproven)
 
 
 def _choices(group: Problem, plan: Plan) -> dict[BlockKey, Choice] | None:
@@ -110,7 +121,13 @@ def _choices(group: Problem, plan: Plan) -> dict[BlockKey, Choice] | None:
     return choices
 
 
-def _is_worth_it(new: Price, old: Price) -> bool:
-    if new.excess != old.excess:
-        return new.excess < old.excess
-    return old.cost - new.cost > max(IMPROVEMENT_MIN, IMPROVEMENT_SHARE * old.cost)
+def _is_worth_it(group: Problem, new: Mapping[BlockKey, Choice], old: Mapping[BlockKey, Choice]) -> bool:
+    now, then = price(group, new), price(group, old)
+    if now.excess != then.excess:
+        return now.excess < then.excess
+    saved = then.cost - now.cost
+    if group.objective is Objective.SUM:
+        return saved > max(IMPROVEMENT_MIN, IMPROVEMENT_SHARE * then.cost)
+    changed = [block for block in group.blocks if new[block.key] != old[block.key]]
+    fewer = sum(joint_miss(block, old[block.key]) - joint_miss(block, new[block.key]) for block in changed)
+    return saved > IMPROVEMENT_LOG * len(changed) and fewer > IMPROVEMENT_MIN_ALL_MISS

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem import FleetKey, Problem
+from controlplane.core.problem import FleetKey
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from collections.abc import Set as AbstractSet
 
-    from controlplane.core.problem import Block
+    from controlplane.core.problem import Block, Problem
 
 
 def independent_groups(problem: Problem) -> list[Problem]:
-    """Split into problems that share no limit over all robots which could bind; each is solved on its own."""
+    """Split into problems that share no limit over all robots which could bind; each is solved on its own.
+
+    Each part names the limits that could bind, so none for a block on its own.
+    """
     wanted: dict[FleetKey, int] = {}
     for block in problem.blocks:
         for key in _limits(problem, block):
@@ -33,7 +38,7 @@ def independent_groups(problem: Problem) -> list[Problem]:
                 if lead == other:
                     leader[key] = target
         leader.update(dict.fromkeys(shared, target))
-    return [_part(problem, members) for members in groups.values()]
+    return [_part(problem, members, binding) for members in groups.values()]
 
 
 def _limits(problem: Problem, block: Block) -> list[FleetKey]:
@@ -41,6 +46,6 @@ def _limits(problem: Problem, block: Block) -> list[FleetKey]:
     return [key for key in keys if key in problem.fleet_capacity]
 
 
-def _part(problem: Problem, blocks: Sequence[Block]) -> Problem:
-    keys = {key for block in blocks for key in _limits(problem, block)}
-    return Problem(tuple(blocks), {key: problem.fleet_capacity[key] for key in keys})
+def _part(problem: Problem, blocks: Sequence[Block], binding: AbstractSet[FleetKey]) -> Problem:
+    keys = dict.fromkeys(key for block in blocks for key in _limits(problem, block) if key in binding)
+    return replace(problem, blocks=tuple(blocks), fleet_capacity={key: problem.fleet_capacity[key] for key in keys})

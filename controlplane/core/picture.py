@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.permits import Permits
+    from controlplane.core.problem import Objective
     from controlplane.core.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceName, ServiceUse
 
@@ -46,6 +47,7 @@ def draw(
     now: float,
     *,
     default_capacity_interfaces: int,
+    objective: Objective,
 ) -> Picture:
     """Build the problem. Only paths that are up are candidates, unless none of a robot's is for a service."""
     robots: list[Sidecar] = []
@@ -75,7 +77,7 @@ def draw(
             block, notes[key] = _block(robot, use, found, estimator, now, default_capacity_interfaces)
             if block is not None:
                 blocks.append(block)
-    return Picture(Problem(tuple(blocks), fleet_capacity), notes)
+    return Picture(Problem(tuple(blocks), fleet_capacity, objective), notes)
 
 
 def interfaces_of(sidecar: Sidecar) -> tuple[InterfaceName, ...]:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from controlplane.core.objectives import block_cost, joint_miss
 from controlplane.core.problem import block_excess, fleet_excess, is_valid
 
 if TYPE_CHECKING:
@@ -22,9 +23,9 @@ class BlockPlan:
     key: BlockKey
     assignments: tuple[tuple[InterfaceName, NodeName], ...]
     cost: float
-    """The sum that is minimised: of epsilon_ij, with 1 for an interface without a server."""
+    """The block's share of what is minimised, see `objectives`."""
     predicted_miss: float
-    """Probability that all copies miss, if the paths fail independently: the product of epsilon_ij."""
+    """Probability that all copies miss, see `objectives.joint_miss`."""
     excess: int = 0
     """By how many interfaces the block's own capacity is exceeded."""
 
@@ -36,13 +37,32 @@ class Plan:
     blocks: Mapping[BlockKey, BlockPlan]
     fleet_excess: Mapping[FleetKey, int] = field(default_factory=dict)
     """By how many interfaces a server's limit over all robots is exceeded; only those that are."""
+    bound: float = -math.inf
+    """No plan that exceeds capacities by no more costs less."""
     unproven: int = 0
-    """Groups of blocks whose optimum could not be proven in the time given."""
+    """Groups of blocks whose gap stayed wider than wanted in the time given."""
+
+    @property
+    def cost(self) -> float:
+        """Of all blocks, as the objective has it."""
+        return sum(block.cost for block in self.blocks.values())
+
+    @property
+    def gap(self) -> float:
+        """By which share of the bound the cost is above it, at most 1."""
+        return relative_gap(self.cost, self.bound) if self.blocks else 0.0
 
     @property
     def relaxed(self) -> int:
         """By how many interfaces capacities are exceeded in all."""
         return sum(block.excess for block in self.blocks.values()) + sum(self.fleet_excess.values())
+
+
+def relative_gap(cost: float, bound: float) -> float:
+    """By which share of the bound a cost is above it, at most 1; rounding aside, it is never below."""
+    if math.isinf(bound):
+        return 1.0
+    return min(1.0, max(0.0, cost - bound) / max(abs(bound), 1e-9))
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -53,23 +73,16 @@ class Price:
     cost: float
 
 
-def block_cost(block: Block, choice: Choice) -> float:
-    """The sum of epsilon_ij over the chosen pairs, with 1 for an interface without a server."""
-    total = 0.0
-    for row, server in zip(block.epsilon, choice, strict=True):
-        epsilon = row[server] if server is not None else None
-        total += 1.0 if epsilon is None else epsilon
-    return total
-
-
 def price(problem: Problem, choices: Mapping[BlockKey, Choice]) -> Price:
     """What choices cost, of which each must be valid."""
     excess = sum(block_excess(block, choices[block.key]) for block in problem.blocks)
     excess += sum(fleet_excess(problem, choices).values())
-    return Price(excess, sum(block_cost(block, choices[block.key]) for block in problem.blocks))
+    return Price(excess, sum(block_cost(problem.objective, block, choices[block.key]) for block in problem.blocks))
 
 
-def make_plan(problem: Problem, choices: Mapping[BlockKey, Choice], *, unproven: int = 0) -> Plan:
+def make_plan(
+    problem: Problem, choices: Mapping[BlockKey, Choice], *, bound: float = -math.inf, unproven: int = 0
+) -> Plan:
     """Write choices down as a plan."""
     plans: dict[BlockKey, BlockPlan] = {}
     for block in problem.blocks:
@@ -78,11 +91,11 @@ def make_plan(problem: Problem, choices: Mapping[BlockKey, Choice], *, unproven:
         plans[block.key] = BlockPlan(
             key=block.key,
             assignments=tuple((block.interfaces[i], block.servers[j]) for i, j in pairs),
-            cost=block_cost(block, choice),
-            predicted_miss=math.prod(block.epsilon[i][j] or 0.0 for i, j in pairs) if pairs else 1.0,
+            cost=block_cost(problem.objective, block, choice),
+            predicted_miss=joint_miss(block, choice),
             excess=block_excess(block, choice),
         )
-    return Plan(plans, fleet_excess(problem, choices), unproven)
+    return Plan(plans, fleet_excess(problem, choices), bound, unproven)
 
 
 def choice_of(block: Block, plan: BlockPlan | None) -> Choice | None:

@@ -2,7 +2,7 @@
 
 A block is one robot's use of one service: its interfaces i, the servers j, and epsilon_ij, the probability that a
 request sent over i to j misses the deadline. Binary x_ij; every interface gets exactly one server; at most
-`capacity` interfaces of the block share a server (the paper's is 1); minimise the sum of epsilon_ij x_ij.
+`capacity` interfaces of the block share a server (the paper's is 1). What is minimised stands in `objectives`.
 
 Beyond the paper:
 
@@ -14,6 +14,7 @@ Beyond the paper:
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -37,6 +38,21 @@ class FleetKey(NamedTuple):
     service: ServiceName
 
 
+class Objective(enum.Enum):
+    """What is minimised, summed over all blocks."""
+
+    SUM = "sum"
+    """The sum of epsilon_ij over the chosen pairs: the paper's."""
+    PRODUCT = "product"
+    """The logarithm of their product, the probability that all miss if paths fail independently."""
+    JOINT = "joint"
+    """The logarithm of the probability that all miss, with the measured lift of each pair of paths."""
+
+
+Path = tuple[int, int]
+"""Indices of an interface and of a server in a block."""
+
+
 @dataclass(frozen=True, slots=True)
 class Block:
     """One robot's use of one service. Every interface can reach at least one of the servers."""
@@ -49,6 +65,8 @@ class Block:
     capacity: int = 1
     """Interfaces of this block that may share a server; 0 means no limit."""
     idempotent: bool = True
+    lifts: Mapping[tuple[Path, Path], float] = field(default_factory=dict)
+    """P(both miss) / (epsilon_1 epsilon_2) of two paths, that of the lower interface first; 1 where not named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +76,7 @@ class Problem:
     blocks: tuple[Block, ...]
     fleet_capacity: Mapping[FleetKey, int] = field(default_factory=dict)
     """Interfaces of all robots that a server may serve for a service; those not named have no limit."""
+    objective: Objective = Objective.JOINT
 
 
 Choice = tuple[int | None, ...]

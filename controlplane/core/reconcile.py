@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from controlplane.core.picture import interfaces_of
-from controlplane.core.problem import BlockKey
+from controlplane.core.problem import BlockKey, Objective
 from protos.model import NO_CALLS, Assignment, ServiceMapping
 
 if TYPE_CHECKING:
@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 
 PREDICTION_CHANGE = 2.0
 """A new predicted miss probability alone is sent when it differs by this factor: it informs, nothing acts on it."""
+
+LEAST = {
+    Objective.SUM: "least sum of miss probabilities",
+    Objective.PRODUCT: "least product of miss probabilities",
+    Objective.JOINT: "least probability that all copies miss",
+}
+"""The first words of a reason."""
 
 PREDICTION_FLOOR = 1e-3
 """Below this, predictions count as equal."""
@@ -54,7 +61,9 @@ def mapping_of(
             if assignment.interface in interfaces and use.name in servers.get(assignment.server, NO_CALLS)
         )
         predicted = block.predicted_miss if set(planned) & set(kept) else 1.0
-        mappings.append(ServiceMapping(use.name, kept, min(1.0, predicted), _reason(block, notes, plan)))
+        mappings.append(
+            ServiceMapping(use.name, kept, min(1.0, predicted), _reason(block, notes, plan, picture.problem.objective))
+        )
     return tuple(mappings)
 
 
@@ -84,9 +93,9 @@ def _standby(
     return standby
 
 
-def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan) -> str:
+def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objective) -> str:
     """One short line; without figures that change with every report, as a new reason is a new version."""
-    parts = ["least sum of miss probabilities"]
+    parts = [LEAST[objective]]
     if notes.all_dark:
         parts.append("no path is up, so all known pairs were considered")
     if notes.dark:

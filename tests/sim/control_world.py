@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Close, CloseReason, DepartureNotice, NackNotice, Send, Settings
 from controlplane.core.registry import Refusal, StreamId
-from controlplane.solver import solve
+from controlplane.matcher import solve
 from protos.model import (
     Ack,
     CandidateSet,

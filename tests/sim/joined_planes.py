@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import OffersRefusedNotice, Send, Settings
 from controlplane.core.registry import Refusal
-from controlplane.solver import solve
+from controlplane.matcher import solve
 from protos.convert import control_message_to_proto, parse_control_message
 from protos.model import (
     PROTOCOL_VERSION,

@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import TYPE_CHECKING
 
-from controlplane.core.plan import Price, price
-from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem, is_valid
+from controlplane.core.objectives import PROBABILITY_FLOOR
+from controlplane.core.plan import Price
+from controlplane.core.problem import (
+    Block,
+    BlockKey,
+    Choice,
+    FleetKey,
+    Objective,
+    Path,
+    Problem,
+    block_excess,
+    fleet_excess,
+    is_valid,
+)
 from protos.model import InterfaceName, NodeName, ServiceName
 
 if TYPE_CHECKING:
@@ -23,6 +36,7 @@ def block(
     capacity: int = 1,
     idempotent: bool = True,
     service: ServiceName = PLAN,
+    lifts: dict[tuple[Path, Path], float] | None = None,
 ) -> Block:
     return Block(
         key=BlockKey(NodeName(robot), service),
@@ -31,11 +45,15 @@ def block(
         epsilon=tuple(tuple(row) for row in epsilon),
         capacity=capacity,
         idempotent=idempotent,
+        lifts=lifts or {},
     )
 
 
-def random_problem(rng: random.Random, *, max_choices: int = 30_000) -> Problem:
-    """A few robots, interfaces and servers: some paths missing, some servers limited over all robots."""
+def random_problem(
+    rng: random.Random, objective: Objective = Objective.SUM, *, max_choices: int = 30_000, limited: bool = True
+) -> Problem:
+    """A few robots, interfaces and servers: some paths missing, some failing together, and, unless told otherwise,
+    some servers limited over all robots."""
     while True:
         servers = rng.randint(1, 4)
         blocks = []
@@ -51,13 +69,26 @@ def random_problem(rng: random.Random, *, max_choices: int = 30_000) -> Problem:
                     row[rng.randrange(servers)] = rng.random()
                 epsilon.append(row)
             capacity = rng.choice([0, 1, 1, 1, 2])
-            blocks.append(block(epsilon, robot=f"robot-{robot}", capacity=capacity, idempotent=idempotent))
+            lifts = random_lifts(rng, epsilon, rng.choice([0.0, 0.3, 1.0]))
+            blocks.append(block(epsilon, robot=f"robot-{robot}", capacity=capacity, idempotent=idempotent, lifts=lifts))
         limits = {
-            FleetKey(NodeName(f"cloud-{j}"), PLAN): rng.randint(1, 3) for j in range(servers) if rng.random() < 0.4
+            FleetKey(NodeName(f"cloud-{j}"), PLAN): rng.randint(1, 3)
+            for j in range(servers)
+            if limited and rng.random() < 0.4
         }
-        problem = Problem(tuple(blocks), limits)
+        problem = Problem(tuple(blocks), limits, objective)
         if count_choices(problem) <= max_choices:
             return problem
+
+
+def random_lifts(rng: random.Random, epsilon: list[list[float | None]], share: float) -> dict[tuple[Path, Path], float]:
+    """Lifts of a share of all pairs of paths: below 1, far above, or 0."""
+    paths = [(i, j) for i, row in enumerate(epsilon) for j, value in enumerate(row) if value is not None]
+    return {
+        (one, two): rng.choice([0.0, rng.random(), 1 + 3 * rng.random(), 100.0])
+        for one, two in itertools.combinations(paths, 2)
+        if one[0] != two[0] and rng.random() < share
+    }
 
 
 def count_choices(problem: Problem) -> int:
@@ -74,11 +105,46 @@ def valid_choices(part: Block) -> Iterator[Choice]:
             yield choice
 
 
+def all_miss(part: Block, choice: Choice) -> float:
+    """P(all chosen paths miss) as the page on objectives defines it, written down once more."""
+    paths = [(i, j) for i, j in enumerate(choice) if j is not None]
+    epsilon = {(i, j): max(part.epsilon[i][j] or 0.0, PROBABILITY_FLOOR) for i, j in paths}
+    pairs = {
+        (one, two): epsilon[one] * epsilon[two] * max(part.lifts.get((one, two), 1.0), PROBABILITY_FLOOR)
+        for one, two in itertools.combinations(paths, 2)
+    }
+    product = math.prod(epsilon.values())
+    for (one, two), both in pairs.items():
+        product *= both / (epsilon[one] * epsilon[two])
+    return min([product, *epsilon.values(), *pairs.values()])
+
+
+def plain_cost(objective: Objective, part: Block, choice: Choice) -> float:
+    """What a block's choice costs, by the definition."""
+    chosen = [part.epsilon[i][j] or 0.0 for i, j in enumerate(choice) if j is not None]
+    match objective:
+        case Objective.SUM:
+            return sum(chosen) + choice.count(None)
+        case Objective.PRODUCT:
+            return sum(math.log(max(epsilon, PROBABILITY_FLOOR)) for epsilon in chosen)
+        case Objective.JOINT:
+            return math.log(all_miss(part, choice))
+
+
 def best_price(problem: Problem) -> Price:
     """The least price of all valid choices."""
-    keys = [part.key for part in problem.blocks]
-    every = itertools.product(*(list(valid_choices(part)) for part in problem.blocks))
-    return min(price(problem, dict(zip(keys, choices, strict=True))) for choices in every)
+    options = [
+        [(choice, plain_cost(problem.objective, part, choice)) for choice in valid_choices(part)]
+        for part in problem.blocks
+    ]
+    best = Price(10**9, 0.0)
+    for combination in itertools.product(*options):
+        chosen = {part.key: choice for part, (choice, _) in zip(problem.blocks, combination, strict=True)}
+        excess = sum(block_excess(part, chosen[part.key]) for part in problem.blocks)
+        if excess <= best.excess:
+            excess += sum(fleet_excess(problem, chosen).values())
+            best = min(best, Price(excess, sum(cost for _, cost in combination)))
+    return best
 
 
 def choices_of(

@@ -57,7 +57,7 @@ def test_two_interfaces_and_two_servers_get_one_each(world: World) -> None:
     world.run(SETTLED_S)
     assert sorted(robot.pairs()) == ["wlan0", "wwan0"]
     assert sorted(robot.pairs().values()) == ["a", "b"]
-    assert robot.reason() == "least sum of miss probabilities"
+    assert robot.reason() == "least probability that all copies miss"
 
 
 def test_a_mapping_comes_before_any_path_is_known_to_be_up(world: World) -> None:

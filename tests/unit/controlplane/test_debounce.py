@@ -8,8 +8,8 @@ import pytest
 
 from controlplane.core.debounce import ROUTINE_INTERVAL_S, ROUTINE_TIMES, URGENT_DELAY_S, Change, Debounce, settle
 from controlplane.core.plan import Plan, make_plan, price
-from controlplane.core.problem import FleetKey, Problem
-from controlplane.solver import solve
+from controlplane.core.problem import FleetKey, Objective, Problem
+from controlplane.matcher import solve
 from protos.model import NodeName
 from tests.unit.controlplane.problems import PLAN, block, choices_of, random_problem
 
@@ -70,14 +70,14 @@ def test_what_happens_while_solving_is_solved_for_afterwards() -> None:
     assert debounce.start(5.0)
 
 
-def running(epsilon: list[list[float | None]], choice: tuple[int, ...]) -> Plan:
+def running(epsilon: list[list[float | None]], choice: tuple[int, ...], objective: Objective = Objective.SUM) -> Plan:
     part = block(epsilon)
-    return make_plan(Problem((part,)), {part.key: choice})
+    return make_plan(Problem((part,), objective=objective), {part.key: choice})
 
 
 def test_a_slightly_better_plan_is_not_worth_a_change() -> None:
     part = block([[0.100, 0.096], [0.100, 0.100]])
-    problem = Problem((part,))
+    problem = Problem((part,), objective=Objective.SUM)
     old = running([[0.1, 0.2], [0.2, 0.1]], (0, 1))
     new = solve(problem, time_limit_s=60)
     assert new.blocks[part.key].assignments != old.blocks[part.key].assignments
@@ -89,7 +89,7 @@ def test_a_slightly_better_plan_is_not_worth_a_change() -> None:
 
 def test_a_clearly_better_plan_is_taken() -> None:
     part = block([[0.30, 0.05], [0.05, 0.30]])
-    problem = Problem((part,))
+    problem = Problem((part,), objective=Objective.SUM)
     old = running([[0.1, 0.2], [0.2, 0.1]], (0, 1))
     settled = settle(problem, solve(problem, time_limit_s=60), old)
     assert settled.blocks[part.key].assignments == (("if0", "cloud-1"), ("if1", "cloud-0"))
@@ -97,15 +97,35 @@ def test_a_clearly_better_plan_is_taken() -> None:
 
 def test_noise_near_zero_changes_nothing() -> None:
     part = block([[0.0010, 0.0002], [0.0002, 0.0010]])
-    problem = Problem((part,))
+    problem = Problem((part,), objective=Objective.SUM)
     old = running([[0.1, 0.2], [0.2, 0.1]], (0, 1))
     settled = settle(problem, solve(problem, time_limit_s=60), old)
     assert settled.blocks[part.key].assignments == old.blocks[part.key].assignments
 
 
+@pytest.mark.parametrize("objective", [Objective.PRODUCT, Objective.JOINT])
+@pytest.mark.parametrize(
+    ("epsilon", "changes"),
+    [
+        ([[0.30, 0.05], [0.05, 0.30]], True),
+        ([[0.100, 0.096], [0.100, 0.100]], False),
+        ([[0.0010, 0.0002], [0.0002, 0.0010]], False),
+    ],
+    ids=["clearly better", "slightly better", "noise near zero"],
+)
+def test_logarithms_change_for_a_share_and_for_misses_that_count(
+    epsilon: list[list[float | None]], changes: bool, objective: Objective
+) -> None:
+    part = block(epsilon)
+    problem = Problem((part,), objective=objective)
+    old = running([[0.1, 0.2], [0.2, 0.1]], (0, 1), objective)
+    settled = settle(problem, solve(problem, time_limit_s=60), old)
+    assert (settled.blocks[part.key].assignments != old.blocks[part.key].assignments) == changes
+
+
 def test_a_plan_over_a_dead_path_is_replaced_however_little_is_gained() -> None:
     part = block([[None, 0.5], [0.5, 0.5]])
-    problem = Problem((part,))
+    problem = Problem((part,), objective=Objective.SUM)
     old = running([[0.1, 0.2], [0.2, 0.1]], (0, 1))
     settled = settle(problem, solve(problem, time_limit_s=60), old)
     assert settled.blocks[part.key].assignments == (("if0", "cloud-1"), ("if1", "cloud-0"))
@@ -113,7 +133,7 @@ def test_a_plan_over_a_dead_path_is_replaced_however_little_is_gained() -> None:
 
 def test_a_plan_that_exceeds_a_capacity_is_replaced_by_one_that_need_not() -> None:
     part = block([[0.1, 0.2], [0.1, 0.2]])
-    problem = Problem((part,))
+    problem = Problem((part,), objective=Objective.SUM)
     old = running([[0.1, None], [0.1, None]], (0, 0))
     assert old.relaxed == 1
     assert settle(problem, solve(problem, time_limit_s=60), old).relaxed == 0

@@ -8,7 +8,7 @@ from controlplane.core.estimator import Estimator
 from controlplane.core.permits import Permits
 from controlplane.core.picture import BlockNotes, Picture, draw
 from controlplane.core.policy import CallRule, OfferRule, Policy
-from controlplane.core.problem import BlockKey, FleetKey
+from controlplane.core.problem import BlockKey, FleetKey, Objective
 from controlplane.core.registry import Sidecar
 from protos.model import (
     Candidate,
@@ -33,6 +33,7 @@ from tests.unit.controlplane.samples import (
     use,
 )
 
+OBJECTIVE = Objective.JOINT
 KEY = BlockKey(NodeName("robot"), PLAN)
 
 
@@ -52,7 +53,9 @@ def picture(
     estimator = Estimator(half_life_s=60.0)
     if paths:
         estimator.merge(NodeName("robot"), Report(paths=paths), 0.0)
-    return draw(sidecars, Permits(policy), estimator, 0.0, default_capacity_interfaces=capacity)
+    return draw(
+        sidecars, Permits(policy), estimator, 0.0, default_capacity_interfaces=capacity, objective=Objective.SUM
+    )
 
 
 def test_only_paths_that_are_up_are_candidates() -> None:

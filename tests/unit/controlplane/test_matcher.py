@@ -1,34 +1,52 @@
-"""CP-SAT's answers equal brute force, and no problem is without an answer."""
+"""The matcher's plans equal brute force, and no problem is without an answer."""
 
 from __future__ import annotations
 
 import random
 
+import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
 from controlplane.core.plan import price
-from controlplane.core.problem import FleetKey, Problem, is_valid
-from controlplane.solver import RESOLUTION, solve
+from controlplane.core.problem import FleetKey, Objective, Problem, is_valid
+from controlplane.matcher import solve
+from controlplane.solver import RESOLUTION
 from protos.model import NodeName
 from tests.unit.controlplane.problems import PLAN, best_price, block, choices_of, random_problem
 
 AMPLE_S = 60.0
 
 
+@pytest.mark.parametrize("objective", Objective)
 @pytest.mark.parametrize("seed", range(10))
-def test_equals_brute_force(seed: int) -> None:
+def test_equals_brute_force(seed: int, objective: Objective) -> None:
     rng = random.Random(seed)
-    for _ in range(40):
-        problem = random_problem(rng)
+    for number in range(40):
+        problem = random_problem(rng, objective, max_choices=3_000, limited=number % 3 > 0)
         plan = solve(problem, time_limit_s=AMPLE_S)
         assert plan.unproven == 0
         choices = choices_of(problem, {key: made.assignments for key, made in plan.blocks.items()})
         assert all(is_valid(part, choices[part.key]) for part in problem.blocks)
         found, best = price(problem, choices), best_price(problem)
         assert found.excess == best.excess == plan.relaxed
-        interfaces = sum(len(part.interfaces) for part in problem.blocks)
-        assert found.cost == pytest.approx(best.cost, abs=interfaces * RESOLUTION)
-        assert found.cost == pytest.approx(sum(made.cost for made in plan.blocks.values()))
+        assert found.cost == pytest.approx(best.cost, abs=len(problem.blocks) * 2 * RESOLUTION)
+        assert found.cost == pytest.approx(plan.cost)
+        assert plan.bound <= best.cost + len(problem.blocks) * 2 * RESOLUTION
+        assert plan.gap < 1e-5
+
+
+@pytest.mark.parametrize("objective", [Objective.SUM, Objective.PRODUCT])
+def test_one_robot_alone_is_the_assignment_problem(objective: Objective) -> None:
+    rng = random.Random(5)
+    for _ in range(200):
+        interfaces = rng.randint(1, 6)
+        servers = rng.randint(interfaces, 12)
+        epsilon: list[list[float | None]] = [[rng.random() for _ in range(servers)] for _ in range(interfaces)]
+        plan = solve(Problem((block(epsilon),), {}, objective), time_limit_s=AMPLE_S)
+        table = np.array(epsilon, dtype=float)
+        costs = table if objective is Objective.SUM else np.log(table)
+        assert plan.cost == pytest.approx(costs[linear_sum_assignment(costs)].sum())
 
 
 def test_the_paper_gives_two_interfaces_one_server_each() -> None:
@@ -40,7 +58,7 @@ def test_the_paper_gives_two_interfaces_one_server_each() -> None:
 
 def test_more_interfaces_than_capacity_is_relaxed_by_the_least() -> None:
     part = block([[0.1, 0.2], [0.1, 0.2], [0.1, 0.2]])
-    plan = solve(Problem((part,)), time_limit_s=AMPLE_S)
+    plan = solve(Problem((part,), objective=Objective.SUM), time_limit_s=AMPLE_S)
     assert plan.relaxed == plan.blocks[part.key].excess == 1
     assert len(plan.blocks[part.key].assignments) == 3
     assert plan.blocks[part.key].cost == pytest.approx(0.1 + 0.1 + 0.2)
@@ -73,7 +91,7 @@ def test_a_limit_over_all_robots_is_relaxed_by_the_least() -> None:
 
 def test_what_is_not_idempotent_goes_to_one_server_chosen_over_all_interfaces() -> None:
     part = block([[0.01, 0.1], [0.9, 0.1]], idempotent=False)
-    made = solve(Problem((part,)), time_limit_s=AMPLE_S).blocks[part.key]
+    made = solve(Problem((part,), objective=Objective.SUM), time_limit_s=AMPLE_S).blocks[part.key]
     assert made.assignments == (("if0", "cloud-1"), ("if1", "cloud-1"))
     assert made.excess == 0
 

@@ -1,0 +1,182 @@
+"""A good plan for many blocks that share servers, and a bound below which none is.
+
+Lagrangian relaxation of the limits over all robots. Each limit gets a price; at given prices the blocks are
+independent, and each takes its best choice (`stacks`). The sum of what these are worth, less the prices of the
+capacities, is below the cost of every plan that keeps to the limits. Prices move along the subgradient, the excess
+load, by Polyak's step towards the best plan known; plans come from the blocks' choices by moving blocks away from
+where there is no room (`standing`).
+
+Where the best plan known exceeds capacities by E more interfaces than the blocks must by themselves, an interface in
+excess has a price too, which no price of a limit is above: the bound then holds for plans that exceed by no more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from controlplane.core.choices import MAX_LISTED, OWN_EXCESS_PRICE
+from controlplane.core.plan import relative_gap
+from controlplane.core.problem import Objective
+from controlplane.core.stacks import EnumeratedStack, SeparableStack
+from controlplane.core.standing import Standing
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from controlplane.core.limits import Limits
+    from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from controlplane.core.stacks import Best, Stack
+
+    Floats = NDArray[np.float64]
+
+MAX_STEPS = 300
+STEPS_BETWEEN_PLANS = 12
+"""A plan costs as much as some steps."""
+PATIENCE_STEPS = 8
+"""Steps without a better bound before they become half as long."""
+SHORTEST_STEP = 1e-3
+
+MAX_LISTED_ALL = 4_000_000
+"""Choices listed of all blocks together (some 60 bytes each)."""
+
+MIN_LISTED = 256
+"""Choices listed of a block in any case: 2 interfaces with 16 servers, 4 with 4."""
+
+
+def stack_blocks(objective: Objective, blocks: Sequence[Block], limits: Limits) -> list[Stack]:
+    """Stack blocks of one shape and kind."""
+    shapes: dict[tuple[bool, bool, int], list[Block]] = {}
+    listed = 0
+    for block in blocks:
+        fails_together = objective is Objective.JOINT and bool(block.lifts) and block.idempotent
+        listed += fails_together
+        shapes.setdefault((block.idempotent, fails_together, len(block.interfaces)), []).append(block)
+    at_most = min(MAX_LISTED, max(MIN_LISTED, MAX_LISTED_ALL // max(1, listed)))
+    return [
+        SeparableStack(objective, members, limits)
+        if idempotent and not fails_together
+        else EnumeratedStack(objective, members, limits, at_most=at_most)
+        for (idempotent, fails_together, _), members in shapes.items()
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Relaxed:
+    """The best plan found, and the bound with the prices that prove it."""
+
+    standing: Standing
+    bound: float
+    price: Floats
+    """By limit; one more at the end, 0."""
+    extra: int
+    """By how many interfaces it exceeds capacities beyond what each block must by itself."""
+    excess_proven: bool
+    """Whether no plan exceeds capacities by less."""
+
+
+class Decomposition:
+    """One group of blocks."""
+
+    def __init__(self, problem: Problem, limits: Limits, prices: Mapping[FleetKey, float]) -> None:
+        self.limits = limits
+        self.stacks = stack_blocks(problem.objective, problem.blocks, limits)
+        self._objective = problem.objective
+        self._start = np.array([*(prices.get(key, 0.0) for key in limits.keys), 0.0])
+        free = [stack.best(stack.every, np.zeros((len(stack.blocks), stack.servers + 1))) for stack in self.stacks]
+        self._forced = [best.excess for best in free]
+        self._forced_all = sum(int(excess.sum()) for excess in self._forced)
+        self._best: Standing = Standing.of_best(self.stacks, limits, np.zeros(len(limits) + 1), free)
+        self._bound = -np.inf
+        self._price = self._start
+
+    def run(
+        self, hint: Mapping[BlockKey, Choice] | None, *, good_gap: float, out_of_time: Callable[[], bool]
+    ) -> Relaxed:
+        """Improve plan and bound until they are within `good_gap`, or out of time."""
+        self._best.settle(self._start, out_of_time)
+        if hint is not None:
+            self._offer(Standing.of_choices(self._objective, self.stacks, self.limits, hint), self._start, out_of_time)
+        if len(self.limits):
+            self._climb(good_gap, out_of_time)
+        else:
+            self._bound, _ = self._dual(self._start)
+        return Relaxed(self._best, self._bound, self._price, max(0, self._extra()), self._is_excess_proven())
+
+    def _climb(self, good_gap: float, out_of_time: Callable[[], bool]) -> None:
+        price, length, waited = self._start, 1.0, 0
+        for step in range(MAX_STEPS):
+            value, best = self._dual(price)
+            if value > self._bound:
+                self._bound, self._price, waited = value, price, 0
+            else:
+                waited += 1
+            subgradient = self._subgradient(price, best)
+            norm = float(subgradient @ subgradient)
+            if step % STEPS_BETWEEN_PLANS == 0 or not norm:
+                self._offer(Standing.of_best(self.stacks, self.limits, price, best), price, out_of_time)
+            if not norm or length < SHORTEST_STEP or self._is_good(good_gap) or out_of_time():
+                break
+            if waited >= PATIENCE_STEPS:
+                price, length, waited = self._price, length / 2, 0
+                continue
+            far = max(self._best.cost - value, 1e-9)
+            price = np.append(np.maximum(0.0, price[:-1] + length * far / norm * subgradient), 0.0)
+        self._offer(self._at(self._price), self._price, out_of_time)
+
+    def _at(self, price: Floats) -> Standing:
+        return Standing.of_best(self.stacks, self.limits, price, self._dual(price)[1])
+
+    def _extra(self) -> int:
+        return self._best.excess - self._forced_all
+
+    def _dual(self, price: Floats) -> tuple[float, list[Best]]:
+        """What no plan is below that exceeds capacities by no more than the best one known."""
+        extra = self._extra()
+        excess_price = float(price.max()) if extra else OWN_EXCESS_PRICE
+        total = -float(price[:-1] @ self.limits.capacity) - (excess_price * extra if extra else 0.0)
+        found = []
+        for stack, forced in zip(self.stacks, self._forced, strict=True):
+            prices = price[stack.limit]
+            best = stack.best(stack.every, prices, excess_price)
+            more = np.multiply(best.excess - forced, excess_price, dtype=np.float64)
+            total += float(stack.bound(prices, best, more).sum())
+            found.append(best)
+        return total, found
+
+    def _subgradient(self, price: Floats, best: Sequence[Best]) -> Floats:
+        load = self.limits.loads(
+            [np.take_along_axis(stack.limit, found.picks, 1) for stack, found in zip(self.stacks, best, strict=True)]
+        )
+        subgradient = (load - self.limits.capacity).astype(np.float64)
+        extra = self._extra()
+        if extra:
+            more = sum(int((found.excess - forced).sum()) for found, forced in zip(best, self._forced, strict=True))
+            subgradient[int(price[:-1].argmax())] += more - extra
+        subgradient[(price[:-1] <= 0) & (subgradient < 0)] = 0.0
+        return subgradient
+
+    def _offer(self, standing: Standing, price: Floats, out_of_time: Callable[[], bool]) -> None:
+        standing.settle(price, out_of_time)
+        if standing.is_better_than(self._best):
+            self._best = standing
+
+    def _is_good(self, good_gap: float) -> bool:
+        return self._is_excess_proven() and relative_gap(self._best.cost, self._bound) <= good_gap
+
+    def _is_excess_proven(self) -> bool:
+        """Whether nothing is exceeded beyond what each block must by itself, or everything is full and more is
+        wanted."""
+        extra = self._extra()
+        if extra <= 0:
+            return True
+        if self._forced_all or any(not block.idempotent for stack in self.stacks for block in stack.blocks):
+            return False
+        if any((stack.limit[:, :-1] == len(self.limits)).any() for stack in self.stacks):
+            return False
+        wanted = sum(stack.interfaces * len(stack.blocks) for stack in self.stacks)
+        return extra <= wanted - int(self.limits.capacity.sum())

@@ -1,0 +1,61 @@
+"""Interfaces to servers at the least cost, each server taking a few: the assignment problem proper.
+
+Shortest augmenting paths with potentials (Kuhn's Hungarian method in Jonker and Volgenant's order): row after row, the
+cheapest way to make room for it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+NO_PATH_COST = 1e12
+"""Stands for infinity, which the method cannot subtract."""
+
+
+def cheapest_matching(costs: NDArray[np.float64], slots: int, excess_price: float) -> list[int]:
+    """The server of each interface, where `slots` interfaces fit a server and each one more costs `excess_price`."""
+    interfaces, servers = costs.shape
+    finite = np.where(np.isinf(costs), NO_PATH_COST, costs)
+    within = min(slots, interfaces)
+    wide = np.hstack([finite] * within + [finite + excess_price] * (interfaces - within))
+    return [column % servers for column in cheapest_columns(wide)]
+
+
+def cheapest_columns(costs: NDArray[np.float64]) -> list[int]:
+    """A column of its own for each row, at the least sum; there are no fewer columns than rows."""
+    rows, columns = costs.shape
+    row_potential, column_potential = np.zeros(rows), np.zeros(columns)
+    row_of = np.full(columns, -1)
+    for row in range(rows):
+        distance = costs[row] - row_potential[row] - column_potential
+        came_from = np.full(columns, -1)
+        done = np.zeros(columns, dtype=np.bool_)
+        while True:
+            column = int(np.where(done, np.inf, distance).argmin())
+            nearest = distance[column]
+            if row_of[column] < 0:
+                break
+            done[column] = True
+            other = int(row_of[column])
+            through = nearest + costs[other] - row_potential[other] - column_potential
+            shorter = ~done & (through < distance)
+            distance[shorter] = through[shorter]
+            came_from[shorter] = column
+        settled = np.flatnonzero(done)
+        row_potential[row] += nearest
+        row_potential[row_of[settled]] += nearest - distance[settled]
+        column_potential[settled] -= nearest - distance[settled]
+        while came_from[column] >= 0:
+            before = int(came_from[column])
+            row_of[column] = row_of[before]
+            column = before
+        row_of[column] = row
+    found = [0] * rows
+    for taken in np.flatnonzero(row_of >= 0).tolist():
+        found[row_of[taken]] = taken
+    return found

@@ -1,0 +1,98 @@
+"""What a block's choice costs under each objective.
+
+With S the chosen pairs (i, j) of a block:
+
+- `sum`: the sum of epsilon_ij, and 1 for an interface that gets no server.
+- `product`: the sum of log epsilon_ij.
+- `joint`: the logarithm of `joint_miss`.
+
+Minimising the sum of logarithms over all blocks asks of every robot the same relative gain: to make one robot's miss
+probability ten times smaller is worth as much as to make another's ten times smaller.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from controlplane.core.problem import Objective
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from controlplane.core.problem import Block, Choice
+
+PROBABILITY_FLOOR = 1e-9
+"""Probabilities and lifts below this count as this, so that their logarithms are finite: no posterior mean over less
+than a billion requests is smaller."""
+
+
+def block_cost(objective: Objective, block: Block, choice: Choice) -> float:
+    """The block's share of what is minimised."""
+    if objective is Objective.JOINT:
+        return math.log(joint_miss(block, choice))
+    chosen = [row[server] for row, server in zip(block.epsilon, choice, strict=True) if server is not None]
+    epsilons = [epsilon for epsilon in chosen if epsilon is not None]
+    if objective is Objective.SUM:
+        return sum(epsilons) + (len(choice) - len(epsilons))
+    return sum(math.log(max(epsilon, PROBABILITY_FLOOR)) for epsilon in epsilons)
+
+
+def joint_miss(block: Block, choice: Choice) -> float:
+    """Probability that all chosen paths miss; 1 without any.
+
+    The product of their epsilons and of the lifts of all their pairs: exact for two paths. Beyond two it is a guess,
+    so it never exceeds what one pair or one path of the set allows.
+    """
+    if not block.lifts:
+        chosen = [row[server] for row, server in zip(block.epsilon, choice, strict=True) if server is not None]
+        return math.prod(max(epsilon or 0.0, PROBABILITY_FLOOR) for epsilon in chosen)
+    columns = np.array([[-1 if server is None else server for server in choice]])
+    return float(np.exp(_joint_costs(block, epsilon_matrix(block), columns)[0]))
+
+
+def epsilon_matrix(block: Block) -> NDArray[np.float64]:
+    """By interface, then server; NaN where there is no path."""
+    return np.array(block.epsilon, dtype=np.float64)
+
+
+def path_costs(objective: Objective, epsilon: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What each path adds to the cost as long as lifts are 1; infinite where there is no path."""
+    costs = epsilon if objective is Objective.SUM else np.log(np.maximum(epsilon, PROBABILITY_FLOOR))
+    return np.where(np.isnan(epsilon), np.inf, costs)
+
+
+def choice_costs(objective: Objective, block: Block, choices: NDArray[np.intp]) -> NDArray[np.float64]:
+    """`block_cost` of many choices, a row each, with -1 where an interface gets no server; infinite over no path."""
+    epsilon = epsilon_matrix(block)
+    if objective is Objective.JOINT:
+        return _joint_costs(block, epsilon, choices)
+    total: NDArray[np.float64] = _of_paths(objective, epsilon, choices).sum(axis=1)
+    return total
+
+
+def _of_paths(objective: Objective, epsilon: NDArray[np.float64], choices: NDArray[np.intp]) -> NDArray[np.float64]:
+    costs = path_costs(objective, epsilon)
+    rows = np.arange(epsilon.shape[0])
+    return np.where(choices < 0, 1.0 if objective is Objective.SUM else 0.0, costs[rows, choices])
+
+
+def _joint_costs(block: Block, epsilon: NDArray[np.float64], choices: NDArray[np.intp]) -> NDArray[np.float64]:
+    singles = _of_paths(Objective.JOINT, epsilon, choices)
+    total: NDArray[np.float64] = singles.sum(axis=1)
+    if not block.lifts:
+        return total
+    cap = singles.min(axis=1)
+    lifts: dict[tuple[int, int], NDArray[np.float64]] = {}
+    for ((i, j), (k, m)), lift in block.lifts.items():
+        table = lifts.setdefault((i, k), np.zeros((epsilon.shape[1] + 1, epsilon.shape[1] + 1)))
+        table[j, m] = math.log(max(lift, PROBABILITY_FLOOR))
+    for i, k in itertools.combinations(range(epsilon.shape[0]), 2):
+        # An interface without a server has index -1: the last row and column, which stay 0.
+        lift_log = lifts[i, k][choices[:, i], choices[:, k]] if (i, k) in lifts else 0.0
+        total = total + lift_log
+        cap = np.minimum(cap, singles[:, i] + singles[:, k] + lift_log)
+    return np.where(np.isinf(total), np.inf, np.minimum(total, cap))

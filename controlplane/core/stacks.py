@@ -1,0 +1,207 @@
+"""Blocks of one shape stacked into arrays, so that each one's best choice at given prices is found at once.
+
+Prices by block and server come in as an array with one column more than there are servers: the last, which is 0,
+belongs to an interface that gets no server. A price of infinity closes a server.
+
+There are two kinds. A `SeparableStack` holds blocks whose cost is a sum over interfaces. In an optimum an interface
+has one of its I cheapest servers, I being the number of interfaces: otherwise one of those is left by the others, and
+moving there is cheaper and exceeds nothing. An `EnumeratedStack` holds every choice of its blocks.
+"""
+
+from __future__ import annotations
+
+import abc
+import itertools
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from controlplane.core.choices import (
+    MAX_LISTED,
+    OWN_EXCESS_PRICE,
+    combinations,
+    count_choices,
+    lift_floor,
+    list_choices,
+    nearest,
+    own_excess,
+)
+from controlplane.core.matching import cheapest_matching
+from controlplane.core.objectives import choice_costs, epsilon_matrix, path_costs
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from controlplane.core.choices import Near
+    from controlplane.core.limits import Limits
+    from controlplane.core.problem import Block, Choice, Objective
+
+    Floats = NDArray[np.float64]
+    Indices = NDArray[np.intp]
+
+MAX_TRIED = 4
+"""Interfaces up to which the I cheapest servers of each are combined in all I^I ways; beyond, block after block is
+matched."""
+
+
+class Best(NamedTuple):
+    """The best choice of each block asked for."""
+
+    value: Floats
+    """Cost and prices; infinite where all servers of an interface are closed."""
+    excess: Indices
+    """By how many interfaces the block's own capacity is exceeded."""
+    picks: Indices
+    """By block, then interface: the server's index; the stack's number of servers where an interface gets none."""
+
+
+class Stack(abc.ABC):
+    """Some blocks with equally many interfaces."""
+
+    def __init__(self, blocks: Sequence[Block], limits: Limits) -> None:
+        self.blocks = tuple(blocks)
+        self.interfaces = len(blocks[0].interfaces)
+        self.servers = max(len(block.servers) for block in blocks)
+        self.every = np.arange(len(blocks))
+        """The rows of all blocks."""
+        self.limit: Indices = np.full((len(blocks), self.servers + 1), len(limits), dtype=np.intp)
+        """By block and server: the number of the limit over all robots."""
+        for row, block in enumerate(blocks):
+            self.limit[row, : len(block.servers)] = limits.of_block(block)
+
+    @abc.abstractmethod
+    def best(self, rows: Indices, price: Floats, excess_price: float = OWN_EXCESS_PRICE) -> Best:
+        """The best choice of these blocks at these prices, of the servers and of an interface in excess."""
+
+    @abc.abstractmethod
+    def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
+        """Choices of one block within `margin` of its best."""
+
+    def bound(self, price: Floats, best: Best, more_excess: Floats) -> Floats:
+        """What the best of each block is worth at least: `best` at these prices, where `more_excess` is the price of
+        what it exceeds the block's own capacity by beyond what it must."""
+        return best.value + more_excess
+
+    def picks_of(self, choice: Choice) -> list[int]:
+        """A choice in this stack's numbering."""
+        return [self.servers if server is None else server for server in choice]
+
+    def choice_of(self, picks: Iterable[int]) -> Choice:
+        """The reverse."""
+        return tuple(None if server == self.servers else int(server) for server in picks)
+
+
+class SeparableStack(Stack):
+    """Blocks whose cost is a sum over interfaces."""
+
+    def __init__(self, objective: Objective, blocks: Sequence[Block], limits: Limits) -> None:
+        super().__init__(blocks, limits)
+        self._cost = np.full((len(blocks), self.interfaces, self.servers), np.inf)
+        for row, block in enumerate(blocks):
+            self._cost[row, :, : len(block.servers)] = path_costs(objective, epsilon_matrix(block))
+        self._capacity = np.array([block.capacity or self.interfaces for block in blocks])
+
+    def best(self, rows: Indices, price: Floats, excess_price: float = OWN_EXCESS_PRICE) -> Best:
+        priced = self._cost[rows] + price[:, None, : self.servers]
+        picks = priced.argmin(axis=2)
+        value = np.take_along_axis(priced, picks[:, :, None], 2)[:, :, 0].sum(axis=1)
+        excess = own_excess(picks, self._capacity[rows])
+        crowded = np.flatnonzero(excess)
+        if crowded.size:
+            solve = _try_all if self.interfaces <= MAX_TRIED else _match
+            solved = solve(priced[crowded], self._capacity[rows[crowded]], excess_price)
+            value[crowded], excess[crowded], picks[crowded] = solved
+        return Best(value, excess, picks)
+
+    def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
+        priced = self._cost[row] + price[: self.servers]
+        (value,), _, _ = self.best(np.array([row]), price[None])
+        slack = value + margin - priced.min(axis=1).sum()
+        share = max(1, int(MAX_LISTED ** (1 / self.interfaces) + 1e-9))
+        options = []
+        complete = True
+        for costs in priced:
+            order = np.argsort(costs, kind="stable")
+            within = order[(costs[order] <= costs.min() + slack + 1e-9) & np.isfinite(costs[order])]
+            complete = complete and len(within) <= share
+            options.append(within[:share])
+        picks = np.array(list(itertools.product(*options)), dtype=np.intp)
+        values = priced[np.arange(self.interfaces), picks].sum(axis=1)
+        return nearest(values, own_excess(picks, self._capacity[row]), picks, margin, at_most, complete=complete)
+
+
+def _try_all(priced: Floats, capacity: Indices, excess_price: float) -> Best:
+    interfaces, servers = priced.shape[1:]
+    tried = min(interfaces, servers)
+    cheapest = np.argpartition(priced, tried - 1, axis=2)[:, :, :tried]
+    grid, rows = combinations(interfaces, tried), np.arange(interfaces)
+    picks = cheapest[:, rows, grid]
+    values = np.take_along_axis(priced, cheapest, 2)[:, rows, grid].sum(axis=2)
+    excess = own_excess(picks, capacity[:, None])
+    at = np.arange(len(priced)), (values + excess_price * excess).argmin(axis=1)
+    return Best(values[at], excess[at], picks[at])
+
+
+def _match(priced: Floats, capacity: Indices, excess_price: float) -> Best:
+    found = [cheapest_matching(costs, int(slots), excess_price) for costs, slots in zip(priced, capacity, strict=True)]
+    picks = np.array(found, dtype=np.intp)
+    value = np.take_along_axis(priced, picks[:, :, None], 2)[:, :, 0].sum(axis=1)
+    return Best(value, own_excess(picks, capacity), picks)
+
+
+class EnumeratedStack(Stack):
+    """Blocks whose choices are listed: those that go to one server, and those whose paths fail together.
+
+    Where a block has more than `at_most` choices, only the cheapest servers of each interface are listed. Its bound
+    then rests on the miss probability being no less than the product of its epsilons and of the lifts below 1.
+    """
+
+    def __init__(self, objective: Objective, blocks: Sequence[Block], limits: Limits, *, at_most: int) -> None:
+        super().__init__(blocks, limits)
+        lists = [list_choices(block, at_most) for block in blocks]
+        longest = max(len(choices) for choices in lists)
+        self._choices: Indices = np.full((len(blocks), longest, self.interfaces), self.servers, dtype=np.intp)
+        self._cost = np.full((len(blocks), longest), np.inf)
+        self._excess = np.zeros((len(blocks), longest), dtype=np.intp)
+        self._count = [len(choices) for choices in lists]
+        self._trimmed: dict[int, tuple[Floats, float]] = {}
+        """By row: what each path costs by itself, and what the lifts add at least."""
+        for row, (block, choices) in enumerate(zip(blocks, lists, strict=True)):
+            count = len(choices)
+            self._cost[row, :count] = choice_costs(objective, block, choices)
+            self._choices[row, :count] = np.where(choices < 0, self.servers, choices)
+            if block.idempotent and block.capacity:
+                self._excess[row, :count] = own_excess(choices, np.array(block.capacity))
+            if count < count_choices(block):
+                self._trimmed[row] = path_costs(objective, epsilon_matrix(block)), lift_floor(block)
+
+    def _priced(self, rows: Indices, price: Floats) -> Floats:
+        values = self._cost[rows]
+        for interface in range(self.interfaces):
+            values = values + np.take_along_axis(price, self._choices[rows, :, interface], 1)
+        return values
+
+    def best(self, rows: Indices, price: Floats, excess_price: float = OWN_EXCESS_PRICE) -> Best:
+        values = self._priced(rows, price)
+        chosen = (values + excess_price * self._excess[rows]).argmin(axis=1)
+        return Best(values[np.arange(len(rows)), chosen], self._excess[rows, chosen], self._choices[rows, chosen])
+
+    def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
+        count = self._count[row]
+        values = self._priced(np.array([row]), price[None])[0, :count]
+        return nearest(
+            values,
+            self._excess[row, :count],
+            self._choices[row, :count],
+            margin,
+            at_most,
+            complete=row not in self._trimmed,
+        )
+
+    def bound(self, price: Floats, best: Best, more_excess: Floats) -> Floats:
+        bound = best.value + more_excess
+        for row, (costs, lifts) in self._trimmed.items():
+            bound[row] = (costs + price[row, : costs.shape[1]]).min(axis=1).sum() + lifts
+        return bound
