@@ -156,14 +156,18 @@ class Authority:
         raise AuthorityError(f"{name} has no certificate of this CA; do: plr ca issue {name} --role ...")
 
     def crl_pem(self) -> bytes:
-        """Return the revocation lists of this CA and the former ones; each stands as long as its CA."""
+        """Return the revocation lists of this CA and the former ones; each stands as long as its CA.
+
+        The same bytes until something is revoked.
+        """
         return b"".join(authority._own_crl_pem() for authority in (self, *self.former))
 
     def _own_crl_pem(self) -> bytes:
         revoked = [
             (entry.serial, entry.revoked_at, entry.reason) for entry in self.entries if entry.revoked_at is not None
         ]
-        validity = Validity(self._clock(), self.not_after)
+        begin = self.own.certificate.not_valid_before_utc.timestamp()
+        validity = Validity(max((revoked_at for _, revoked_at, _ in revoked), default=begin), self.not_after)
         return build_revocation_list(self.own, self.crl_number, revoked, validity).public_bytes(Encoding.PEM)
 
     def write_tls_dir(

@@ -1,6 +1,7 @@
 """Builds the X.509 structures that a CA signs: its own certificate, those of nodes, and its revocation list.
 
-`protos.identity` checks what is built here.
+Signatures are deterministic (RFC 6979): the CA's key does not hang on the quality of randomness in every signature, and
+an unchanged revocation list is the same bytes. `protos.identity` checks what is built here.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def build_authority(name: str, key: ec.EllipticCurvePrivateKey, validity: Validi
     builder = _builder(subject, subject, key.public_key(), validity)
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     builder = builder.add_extension(_key_usage(authority=True), critical=True)
-    return _with_key_ids(builder, key.public_key(), key.public_key()).sign(key, _HASH)
+    return _with_key_ids(builder, key.public_key(), key.public_key()).sign(key, _HASH, ecdsa_deterministic=True)
 
 
 def build_leaf(
@@ -94,7 +95,7 @@ def build_leaf(
     builder = builder.add_extension(_key_usage(authority=False), critical=True)
     builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    return _with_key_ids(builder, key, issuer.key.public_key()).sign(issuer.key, _HASH)
+    return _with_key_ids(builder, key, issuer.key.public_key()).sign(issuer.key, _HASH, ecdsa_deterministic=True)
 
 
 def build_revocation_list(
@@ -116,7 +117,7 @@ def build_revocation_list(
             # RFC 5280 section 5.3.1: no reason is said by leaving the extension out.
             entry = entry.add_extension(x509.CRLReason(flag), critical=False)
         builder = builder.add_revoked_certificate(entry.build())
-    return builder.sign(issuer.key, _HASH)
+    return builder.sign(issuer.key, _HASH, ecdsa_deterministic=True)
 
 
 def _builder(

@@ -219,4 +219,9 @@ def test_an_old_or_missing_revocation_list_does_not_replace_a_newer_one(
         "missing or older than"[:20]
     ] * 2
     path.write_bytes(ca.crl_pem())
-    assert watch.poll() is not None, "signed anew, so not the same bytes"
+    assert watch.poll() is None, "what is in use already"
+    assert len(caplog.records) == 2
+    ca.issue("robot-3", IdentityRole.ROBOT)
+    ca.revoke("robot-3")
+    path.write_bytes(ca.crl_pem())
+    assert watch.poll() is not None

@@ -169,3 +169,16 @@ def test_a_name_of_a_former_ca_is_taken(ca: Authority) -> None:
     ca.rotate("next")
     with pytest.raises(AuthorityError, match="plr ca renew robot-1"):
         ca.issue("robot-1", IdentityRole.ROBOT)
+
+
+def test_the_revocation_list_changes_only_when_something_is_revoked(ca: Authority, clock: Clock) -> None:
+    ca.issue("robot-1", IdentityRole.ROBOT)
+    before = ca.crl_pem()
+    clock.now += DAY_S
+    ca.issue("robot-2", IdentityRole.ROBOT)
+    assert ca.crl_pem() == before
+    ca.revoke("robot-2")
+    after = ca.crl_pem()
+    assert after != before
+    clock.now += DAY_S
+    assert ca.crl_pem() == after

@@ -94,6 +94,20 @@ def test_every_nodes_folder_hears_of_a_revocation(kept: AuthorityFolder) -> None
     assert (kept.node_folder("cp") / "crl.pem").read_bytes() == (kept.path / "crl.pem").read_bytes()
 
 
+def written(path: Path) -> dict[str, tuple[int, int]]:
+    return {file.name: (file.stat().st_ino, file.stat().st_mtime_ns) for file in path.iterdir()}
+
+
+def test_a_nodes_folder_is_not_touched_for_nothing(kept: AuthorityFolder) -> None:
+    with kept.locked() as authority:
+        authority.write_tls_dir(kept.node_folder("cp"), "cp", IdentityRole.CONTROL_PLANE)
+        kept.save(authority)
+        before = written(kept.node_folder("cp"))
+        authority.issue("robot-1", IdentityRole.ROBOT)
+        kept.save(authority)
+    assert written(kept.node_folder("cp")) == before
+
+
 # -- passphrase ----------------------------------------------------------------------------------------------------
 
 
