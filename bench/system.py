@@ -110,9 +110,10 @@ class System:
         interfaces: Sequence[str] = ("wlan0", "wwan0"),
         domain: int = 0,
         metrics_port: int = METRICS_PORT,
+        module: str = "sidecar",
         **changes: Any,
     ) -> Part:
-        """Start a robot's sidecar in a ROS domain of its host."""
+        """Start a robot's sidecar (or what takes its place) in a ROS domain of its host."""
         config = {
             "name": name,
             "role": "robot",
@@ -125,7 +126,7 @@ class System:
             **changes,
         }
         written = self._write(f"{name}.sidecar", config)
-        return self._start(f"{name}.sidecar", self.lab.host(host), "sidecar", written, domain=domain)
+        return self._start(f"{name}.sidecar", self.lab.host(host), module, written, domain=domain)
 
     def tls_dir(self, name: str, role: IdentityRole) -> str:
         """The folder with the certificate of this name, which gets one when it is first asked for."""

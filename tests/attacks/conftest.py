@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    """The stage, with everything started."""
+    """The stage, with everything started; at the end, no request may have been lost."""
     with attack_lab() as lab:
         stage = World(System(lab, tmp_path_factory.mktemp("attacks")))
         try:
             stage.start()
             yield stage
+            stage.end_calls()
         finally:
             stage.close()

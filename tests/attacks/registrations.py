@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import zlib
 from typing import TYPE_CHECKING
 
 from protos.convert import sidecar_message_to_proto
@@ -12,20 +13,19 @@ from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, Session
 if TYPE_CHECKING:
     from controlplane.ca import Issued
 
-SESSION = SessionId(0xA77AC)
-
 
 def registration(issued: Issued, name: str, role: Role, incarnation: int | None = None) -> bytes:
     """An encoded registration with a credential signed by this certificate's key."""
     incarnation = int(time.time() * 1000.0) if incarnation is None else incarnation
+    session = SessionId(zlib.crc32(name.encode()) + incarnation)
     credential = SessionCredential(
-        NodeName(name), role, SESSION, incarnation, bytes(range(32)), Aead.AES_256_GCM, issued.certificate_der
+        NodeName(name), role, session, incarnation, bytes(range(32)), Aead.AES_256_GCM, issued.certificate_der
     ).sign(issued.key)
     said = Registration(
         protocol_version=PROTOCOL_VERSION,
         name=NodeName(name),
         role=role,
-        session=SESSION,
+        session=session,
         token=bytes(range(16)),
         incarnation=incarnation,
         software_version="attack",

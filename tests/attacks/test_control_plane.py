@@ -170,7 +170,7 @@ def test_a_robot_that_says_it_is_a_cloud(world: World, intruder: Intruder) -> No
     with world.calls():
         ended = intruder.call(CONNECT, registration(issued, "two-faced", Role.CLOUD))
         assert ended["code"] == "permission_denied", ended
-    assert world.control_counter("plr_registrations_refused_total", reason="wrong_role") >= 1
+    world.wait_until_counted("plr_registrations_refused_total", 1, reason="wrong_role")
 
 
 def test_another_nodes_name(world: World, intruder: Intruder) -> None:
@@ -180,7 +180,7 @@ def test_another_nodes_name(world: World, intruder: Intruder) -> None:
         ended = intruder.call(CONNECT, registration(issued, "robot", Role.ROBOT))
         assert ended["code"] == "permission_denied", ended
         assert ended["answers"] == []
-    assert world.control_counter("plr_registrations_refused_total", reason="name_mismatch") >= 1
+    world.wait_until_counted("plr_registrations_refused_total", 1, reason="name_mismatch")
 
 
 def test_a_good_certificate_is_let_in(world: World, intruder: Intruder) -> None:
@@ -196,10 +196,10 @@ def test_revoked_in_mid_stream(world: World, intruder: Intruder) -> None:
     issued = intruder.certificate("stolen", ROBOT)
     argv_messages = registration(issued, "stolen", Role.ROBOT)
     before = world.control_counter(REFUSED, reason="revoked")
-    with world.calls(8.0):
-        with world.later(4.0, lambda: world.revoke("stolen")):
+    with world.calls():
+        with world.as_soon_as("stolen (robot", lambda: world.revoke("stolen")):
             ended = intruder.call(CONNECT, argv_messages, stay_s=20.0)
-        assert ended["answers"], "it was let in at first"
+        assert ended["answers"], ended
         assert ended["code"] in ("unauthenticated", "unavailable"), ended
         expect_refused(world, "revoked", before)
         ended = intruder.call(CONNECT, argv_messages)

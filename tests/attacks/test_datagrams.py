@@ -39,7 +39,7 @@ def test_replayed(world: World, victim: str) -> None:
 
 def test_replayed_in_another_order_much_later(world: World, victim: str) -> None:
     tap = world.tap(victim)
-    with world.calls(6.0):
+    with world.calls():
         seen = world.towards(tap, COUNT)
         world.towards(tap, 2 * COUNT)
         before = world.refusals(victim)
@@ -131,8 +131,9 @@ def test_replayed_into_a_new_session(world: World) -> None:
     """Everything a run sent, its introductions too, played again to its peer after it has started anew."""
     tap = world.tap("cloud_a")
     before_restart = world.system.parts["robot.sidecar"]
-    with world.calls(2.0):
+    with world.calls():
         seen = world.towards(tap, COUNT)
+    world.end_calls()
     assert before_restart.terminate() == 0
     before_restart.log.unlink()
     world.system.wait_for_offer(world.start_robot())

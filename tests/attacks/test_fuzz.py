@@ -12,7 +12,6 @@ import pytest
 
 from bench.dataplane.remote import Remote
 from tests.attacks.world import ATTACKER, World
-from tests.netns.calling import Call, assert_flawless
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,8 +31,9 @@ STARTING_HOST = {"cloud_a": ATTACKER, "robot": "robot-wlan0-nat"}
 @pytest.mark.parametrize("victim", STARTING_HOST)
 def test_a_fuzzer_at_the_port(world: World, tmp_path: Path, victim: str, fuzz_datagrams: int) -> None:
     tap = world.tap(victim)
-    with world.calls(2.0):
+    with world.calls():
         seen = world.towards(tap, SEEN)
+    world.end_calls()
     sidecar = world.system.parts[f"{victim}.sidecar"]
     real = [base64.b64encode(one.payload).decode() for one in seen]
     address, port = seen[0].destination
@@ -42,19 +42,16 @@ def test_a_fuzzer_at_the_port(world: World, tmp_path: Path, victim: str, fuzz_da
         fuzzer.ask("fuzz", **plan, count=min(fuzz_datagrams, 5_000), seed=1)
         before, refused = world.system.metrics(victim), world.refusals(victim)
         lines = len(sidecar.log.read_text().splitlines())
-        seconds = fuzz_datagrams / RATE_HZ * 1.5 + 2.0
-        call = Call(world.system, "--rate", "20", "--duration", f"{seconds:g}")
-        call.wait_until_sending()
-        sent = fuzzer.ask("fuzz", timeout_s=3600.0, **plan, count=fuzz_datagrams, seed=2)
-        run = call.result(seconds + 60.0)
-    assert_flawless(run)
+        with world.calls():
+            sent = fuzzer.ask("fuzz", timeout_s=3600.0, **plan, count=fuzz_datagrams, seed=2)
+    asked = world.end_calls()
     world.wait_until_refused(victim, refused, int(sent * 0.8))
     assert sidecar.process.poll() is None
     assert len(sidecar.log.read_text().splitlines()) - lines < LOG_LINES, sidecar.tail()
     after = world.system.metrics(victim)
     memory = "process_resident_memory_bytes"
     assert after[memory] - before[memory] < GROWTH_BYTES
-    assert reached_ros(after) - reached_ros(before) <= run["summary"]["sent"]
+    assert reached_ros(after) - reached_ros(before) <= asked
 
 
 def reached_ros(metrics: dict[str, float]) -> float:

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from bench.attacker.wire import Tap
 from bench.netlab import Lab, LabConfig, LinkProfile, robot, server
-from bench.system import CONTROL_METRICS_PORT
+from bench.system import CONTROL_METRICS_PORT, METRICS_PORT
 from controlplane.ca.files import write_atomically
 from protos.tls_files import CRL_FILE
-from tests.netns.calling import Call, assert_flawless
+from tests.netns.calling import Call
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -33,11 +33,13 @@ CLOUDS = ("cloud_a", "cloud_b")
 ATTACKER = "attacker"
 ATTACKERS_PORT = 4444
 SERVICES = [{"name": "/echo", "deadline_ms": 500, "lifetime_ms": 30_000, "idempotent": True}]
-OFFERS = [{"name": "/echo"}]
+OFFERS = [{"name": "/echo"}, {"name": "/plan_path"}]
 WLAN = LinkProfile(delay_ms=5, jitter_ms=2)
 WWAN = LinkProfile(delay_ms=15, jitter_ms=5)
 OURS = 0xD0
 """The upper half of the first byte of our datagrams."""
+UNANSWERED_S = 2.0
+"""Younger requests need not have their answers yet."""
 COUNTED_S = 20.0
 """A sidecar on a busy machine has taken what came in this time."""
 NOT_AN_ATTACK = ("send_buffer", "unsendable", "receive_", "expired", "unsent", "finished_unwatched", "stun_")
@@ -59,6 +61,7 @@ class World:
 
     system: System
     taps: dict[str, Tap] = field(default_factory=dict)
+    _call: Call | None = None
 
     @property
     def lab(self) -> Lab:
@@ -135,13 +138,18 @@ class World:
             assert time.monotonic() < end, f"{host}: {count} refusals as {reasons} expected, more than before: {more}"
             time.sleep(0.1)
 
-    def control_counter(self, name: str, **labels: str) -> float:
-        """The sum of the control plane's series of this name and labels."""
+    def counter(self, host: str, name: str, **labels: str) -> float:
+        """The sum of a program's series of this name and labels."""
+        port = CONTROL_METRICS_PORT if host == "control" else METRICS_PORT
         return sum(
             value
-            for series, value in self.system.metrics("control", CONTROL_METRICS_PORT).items()
+            for series, value in self.system.metrics(host, port).items()
             if series.partition("{")[0] == name and all(f'{key}="{wanted}"' in series for key, wanted in labels.items())
         )
+
+    def control_counter(self, name: str, **labels: str) -> float:
+        """The same of the control plane."""
+        return self.counter("control", name, **labels)
 
     def wait_until_counted(self, name: str, count: float, **labels: str) -> None:
         """Wait until the control plane counted so many."""
@@ -160,24 +168,48 @@ class World:
         """The folder of certificates of one who was started."""
         return self.system.folder / f"{name}.tls"
 
-    @staticmethod
     @contextlib.contextmanager
-    def later(seconds: float, act: Callable[[], None]) -> Iterator[None]:
-        """Do something while the block runs."""
-        timer = threading.Timer(seconds, act)
-        timer.start()
-        yield
-        timer.join()
+    def as_soon_as(self, logged: str, act: Callable[[], None]) -> Iterator[None]:
+        """While the block runs, do something once the control plane has logged this."""
+        over = threading.Event()
+
+        def watch() -> None:
+            while logged not in self.system.parts["controlplane"].log.read_text():
+                if over.wait(0.05):
+                    return
+            act()
+
+        thread = threading.Thread(target=watch)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
 
     # -- legitimate traffic ---------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def calls(self, seconds: float = 4.0, *options: str) -> Iterator[None]:
-        """Requests at 20 Hz beside the attack: at the end, each has been answered once and rightly."""
-        call = Call(self.system, "--duration", f"{seconds:g}", "--rate", "20", *options)
-        call.wait_until_sending()
+    def calls(self) -> Iterator[None]:
+        """Requests at 20 Hz go on beside the attack, and after it: `end_calls` tells what became of all of them."""
+        if self._call is None:
+            self._call = Call(self.system, "--rate", "20", "--duration", "7200")
+            self._call.wait_until_sending()
         yield
-        assert_flawless(call.result())
+
+    def end_calls(self) -> int:
+        """End the requests; returns how many there were. Each has been answered once and rightly."""
+        call, self._call = self._call, None
+        if call is None:
+            return 0
+        run = call.interrupt()
+        summary, requests = run["summary"], run["requests"]
+        assert summary["answered_twice"] == summary["invalid"] == summary["strangers"] == 0, summary
+        # The last ones were on their way when it was interrupted.
+        over = requests[-1]["sent_s"] - UNANSWERED_S
+        unanswered = [one for one in requests if one["latency_ms"] is None and one["sent_s"] < over]
+        assert unanswered == [], f"{len(unanswered)} of {len(requests)}"
+        return len(requests)
 
     def close(self) -> None:
         for tap in self.taps.values():

@@ -24,6 +24,12 @@ class Call:
     def wait_until_sending(self) -> None:
         self._system.wait("the client to call", lambda: " sent " in self._part.log.read_text())
 
+    def interrupt(self) -> dict[str, Any]:
+        """End it before its time; what it had asked for a moment before need not be answered."""
+        self._part.terminate()
+        del self._system.parts[self._part.name]
+        return self.result()
+
     def result(self, timeout_s: float = 90.0) -> dict[str, Any]:
         self._part.process.wait(timeout_s)
         assert self._out.exists(), self._part.tail()
