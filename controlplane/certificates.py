@@ -41,7 +41,6 @@ class CertificateKeeper:
         self._loop = loop
         self._metrics = metrics
         metrics.own_certificate(files.identity)
-        loop.review(files.trust, time.time())
 
     async def run(self) -> NoReturn:
         """Run until cancelled."""

@@ -164,7 +164,6 @@ class ControlLoop:
 
     def review(self, trust: Trust, now_wall: float) -> None:
         """Part with the sidecars whose certificates are not good any more; `now_wall` is seconds since 1970."""
-        self._core.set_revocations(trust.revocations, self._loop.time())
         for name, caller in list(self._callers.items()):
             try:
                 trust.check(caller.certificate, now_wall)

@@ -13,14 +13,12 @@ given, nothing is read.
 from __future__ import annotations
 
 import enum
-import hashlib
 import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, SignatureAlgorithmOID
 
@@ -122,18 +120,6 @@ class Trust:
             numbers.get(authority.certificate, authority.crl_number) < authority.crl_number
             for authority in other._authorities
         )
-
-    @property
-    def revocations(self) -> bytes:
-        """A digest of everything that is revoked, the same for the same; empty if nothing is."""
-        revoked = sorted(
-            (authority.certificate.fingerprint(hashes.SHA256()), serial)
-            for authority in self._authorities
-            for serial in authority.revoked
-        )
-        if not revoked:
-            return b""
-        return hashlib.sha256(repr(revoked).encode()).digest()
 
     def identify(self, certificate_der: bytes) -> Identity:
         """Return whom a certificate of these CAs names, whatever its age and revocation; raises CertificateError."""

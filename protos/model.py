@@ -39,11 +39,11 @@ Address = tuple[str, int]
 TOKEN_BYTES = 16
 """Size of the stable secret of a sidecar."""
 
-RULES_PENDING = 0
-"""In place of the rules' fingerprint: nothing is to be judged by them yet, as peers may still be coming back."""
+POLICY_PENDING = 0
+"""In place of a policy's fingerprint: nothing is to be judged by it yet, as peers may still be coming back."""
 
-NO_RULES = 1
-"""In place of the rules' fingerprint: there is no policy, and nobody is revoked."""
+NO_POLICY = 1
+"""In place of a policy's fingerprint: everything is allowed."""
 
 MAX_CREDENTIAL_BYTES = 2048
 """Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
@@ -165,8 +165,8 @@ class PeerSet:
     nonce: int
     peers: tuple[Peer, ...] = ()
     removed: tuple[RemovedPeer, ...] = ()
-    rules: int = RULES_PENDING
-    """Fingerprint of the access policy and revocations that this set follows, or RULES_PENDING, or NO_RULES."""
+    policy: int = POLICY_PENDING
+    """Fingerprint of the access policy that this set follows, or POLICY_PENDING, or NO_POLICY."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,8 +66,6 @@ class ControlCore:
         self._settings = settings
         self.registry = Registry(lease_s=settings.lease_s)
         self.estimator = Estimator(half_life_s=settings.half_life_s)
-        self._policy = settings.policy
-        self._revocations = b""
         self.permits = Permits(settings.policy)
         self.counters = Counters()
         self.plan = Plan({})
@@ -191,24 +189,10 @@ class ControlCore:
 
     def set_policy(self, policy: Policy | None, now: float) -> None:
         """Another policy is in force: everybody is told what changes for them."""
-        self._policy = policy
-        self._rules_changed(now)
+        self.permits = Permits(policy)
         self._refused_offers.clear()
         for sidecar in self.registry:
             self._note_refused_offers(sidecar.name)
-
-    def set_revocations(self, revocations: bytes, now: float) -> None:
-        """Other certificates are revoked than before; whom of those registered that hits, `revoke` tells.
-
-        Others may be hit that are not registered, and whom their peers still talk to: these are told to let go of all
-        that are not listed.
-        """
-        if revocations != self._revocations:
-            self._revocations = revocations
-            self._rules_changed(now)
-
-    def _rules_changed(self, now: float) -> None:
-        self.permits = Permits(self._policy, self._revocations)
         self._members_changed(now)
 
     def _note_refused_offers(self, name: NodeName) -> None:

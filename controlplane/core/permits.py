@@ -6,11 +6,10 @@ same, so that the rules are tried once for each group and cloud, not for each ro
 
 from __future__ import annotations
 
-import hashlib
 from typing import TYPE_CHECKING
 
 from controlplane.core.registry import MAX_SIDECARS
-from protos.model import ALL_CALLS, NO_RULES, CallPermit
+from protos.model import ALL_CALLS, NO_POLICY, CallPermit
 
 if TYPE_CHECKING:
     from controlplane.core.policy import Policy
@@ -30,13 +29,11 @@ Group = frozenset[int]
 class Permits:
     """What robots may call and clouds may offer; without a policy, everything."""
 
-    def __init__(self, policy: Policy | None, revocations: bytes = b"") -> None:
-        """`revocations` stands for all that is revoked (Trust.revocations); empty if nothing is."""
+    def __init__(self, policy: Policy | None) -> None:
         self._policy = policy
         self._groups: dict[NodeName, Group] = {}
         self._permits: dict[tuple[Group, NodeName], tuple[frozenset[ServiceName], CallPermit]] = {}
-        self.fingerprint = _fingerprint(policy, revocations)
-        """For PeerSet.rules."""
+        self.fingerprint = NO_POLICY if policy is None else policy.fingerprint
 
     @property
     def restricted(self) -> bool:
@@ -85,11 +82,3 @@ class Permits:
     def refused_offers(self, cloud: Sidecar) -> tuple[ServiceName, ...]:
         """What a cloud offers now and may not."""
         return tuple(offer.name for offer in cloud.offers if not self.may_offer(cloud.name, offer.name))
-
-
-def _fingerprint(policy: Policy | None, revocations: bytes) -> int:
-    of_policy = NO_RULES if policy is None else policy.fingerprint
-    if not revocations:
-        return of_policy
-    digest = hashlib.sha256(of_policy.to_bytes(8, "big") + revocations).digest()
-    return max(int.from_bytes(digest[:8], "big"), NO_RULES + 1)

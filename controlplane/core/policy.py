@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from controlplane.core.patterns import matches
-from protos.model import NO_RULES
+from protos.model import NO_POLICY
 
 if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
@@ -96,7 +96,7 @@ class Policy:
             ]
         )
         value = int.from_bytes(hashlib.sha256(text.encode()).digest()[:_FINGERPRINT_BYTES], "big")
-        return max(value, NO_RULES + 1)
+        return max(value, NO_POLICY + 1)
 
 
 def _listed(patterns: tuple[str, ...]) -> str:

@@ -4,8 +4,8 @@ Warm-up. After a restart the registry is empty, while the robots go on with the 
 holds a version is therefore sent nothing until every server that its own reports name is here again, or the warm-up
 is over: a set without a server that merely has not yet come back would cost the robot that server. Robots that hold
 nothing, and clouds (they find their robots by the robots' own probes), are served at once. Nor are sets judged by the
-rules before the warm-up is over (PeerSet.rules): a peer that is merely not back yet would be taken for one that they
-leave nothing to do.
+policy before the warm-up is over (PeerSet.policy): a peer that is merely not back yet would be taken for one that the
+policy leaves nothing to do.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from controlplane.core.control_events import Send
 from controlplane.core.registry import MAX_SIDECARS
 from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
 from controlplane.core.views import Views
-from protos.model import NO_RULES, RULES_PENDING, ResourceKind, Role
+from protos.model import POLICY_PENDING, ResourceKind, Role
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -120,8 +120,8 @@ class Publisher:
 
     def _peers(self, sidecar: Sidecar, stream: StreamId, views: Views, permits: Permits) -> Iterator[Send]:
         snapshots = self._snapshots[sidecar.name]
-        judged = self.warm_until is None or permits.fingerprint == NO_RULES
-        view = PeerView(views.peers_of(sidecar), permits.fingerprint if judged else RULES_PENDING)
+        judged = self.warm_until is None or not permits.restricted
+        view = PeerView(views.peers_of(sidecar), permits.fingerprint if judged else POLICY_PENDING)
         if view != snapshots.peers.sent:
             removed = views.removed(sidecar, snapshots.known_names)
             yield Send(stream, snapshots.send_peers(view, removed, self._versions))

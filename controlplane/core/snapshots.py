@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from protos.model import RULES_PENDING, MappingSet, PeerSet, ResourceStatus, SyncState, Version
+from protos.model import POLICY_PENDING, MappingSet, PeerSet, ResourceStatus, SyncState, Version
 
 if TYPE_CHECKING:
     from protos.model import Ack, Nack, NodeName, Peer, RemovedPeer, ServiceMapping
@@ -18,7 +18,7 @@ class PeerView:
     """What a sidecar is told of its peers."""
 
     peers: tuple[Peer, ...]
-    rules: int = RULES_PENDING
+    policy: int = POLICY_PENDING
     """Of PeerSet."""
 
 
@@ -109,7 +109,7 @@ class Snapshots:
         """Send the sidecar its peers."""
         version = self.peers.send(view, versions)
         self.known_names.update(peer.name for peer in view.peers)
-        return PeerSet(version, self.peers.nonce, view.peers, removed, view.rules)
+        return PeerSet(version, self.peers.nonce, view.peers, removed, view.policy)
 
     def send_mapping(self, services: tuple[ServiceMapping, ...], versions: VersionSource) -> MappingSet:
         """Send the sidecar its mapping."""

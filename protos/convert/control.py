@@ -237,7 +237,7 @@ def _peer_set_from_proto(message: control_pb2.PeerSet) -> PeerSet:
         nonce=message.nonce,
         peers=peers,
         removed=removed,
-        rules=message.rules,
+        policy=message.policy,
     )
 
 
@@ -250,7 +250,7 @@ def _peer_set_to_proto(value: PeerSet) -> control_pb2.PeerSet:
             control_pb2.RemovedPeer(name=removed.name, reason=_REASON_NUMBERS[removed.reason])
             for removed in value.removed
         ),
-        rules=value.rules,
+        policy=value.policy,
     )
 
 

@@ -5,8 +5,8 @@ is no peer, whatever the control plane says.
 
 A peer that merely vanished from the view (its lease ran out, or the control plane restarted with an empty registry)
 is kept while a path to it lives: a dead control plane must not cost a request. One that left, was revoked or is kept
-away by the access policy goes at once; so does every one that vanished when the rules change, since nobody said what it
-may do under the new ones.
+away by the access policy goes at once; so does every one that vanished when the policy changes, since nobody said what
+it may do under the new one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
-from protos.model import NO_RULES, RULES_PENDING, PeerSet, RemovalReason, Version
+from protos.model import NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
 from sidecar.core.link_events import LinkPeer
 
 if TYPE_CHECKING:
@@ -47,8 +47,8 @@ class Peers:
         """Peers of the view whose credentials are bad, and why."""
         self._unlisted: set[NodeName] = set()
         self._restarted_at: dict[NodeName, float] = {}
-        self._rules = NO_RULES
-        """Fingerprint of the rules that were judged by last."""
+        self._policy = NO_POLICY
+        """Fingerprint of the access policy that was judged by last."""
         self.version = Version(0)
 
     def __contains__(self, name: object) -> bool:
@@ -86,9 +86,9 @@ class Peers:
                 self._dropped["bad_credential"] += 1
                 self.refused[peer.name] = str(error)
         unlisted = set()
-        new_rules = peer_set.rules not in (RULES_PENDING, NO_RULES, self._rules)
+        new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)
         for name, peer in self._known.items():
-            if new_rules or name in known or name in gone or peer.session in sessions or len(known) >= MAX_PEERS:
+            if new_policy or name in known or name in gone or peer.session in sessions or len(known) >= MAX_PEERS:
                 continue
             if reaches(name) and name not in self.refused:
                 known[name], keys[name] = peer, self._keys[name]
@@ -96,8 +96,8 @@ class Peers:
         self._known, self._keys = known, keys
         self._restarted_at = {name: at for name, at in self._restarted_at.items() if name in known}
         self._unlisted = unlisted
-        if peer_set.rules != RULES_PENDING:
-            self._rules = peer_set.rules
+        if peer_set.policy != POLICY_PENDING:
+            self._policy = peer_set.policy
         self.version = peer_set.version
         return None
 

@@ -17,7 +17,7 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from controlplane.ca import Authority, Validity
 from protos.identity import CONTROL_PLANE_DNS, IdentityRole
-from protos.model import NO_RULES, RULES_PENDING, MappingSet, RemovalReason, Report, Role, Welcome
+from protos.model import MappingSet, RemovalReason, Report, Role, Welcome
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
 from tests.integration.control_plane_process import (
     PATIENCE_S,
@@ -182,16 +182,6 @@ def test_a_revoked_cloud_loses_its_stream_and_its_peers_are_told(plane: SecuredC
             error = refused(plane.address, bad)
             assert error.code() is grpc.StatusCode.UNAUTHENTICATED
             assert "the certificate of cloud-bad is revoked" in str(error)
-
-
-def test_a_revocation_of_who_is_not_here_makes_the_peers_let_go_of_whom_is_not_listed(tmp_path: Path) -> None:
-    """Who hides from the control plane may still talk to its peers, and the list has no names."""
-    with SecuredControlPlane(tmp_path, warm_up_ms=0) as plane:
-        plane.member("hidden")
-        with cloud(plane.address, "cloud-1", plane.member("cloud-1", IdentityRole.CLOUD)) as c:
-            assert c.peers().rules == NO_RULES
-            plane.revoke("hidden")
-            assert c.peers().rules not in (NO_RULES, RULES_PENDING)
 
 
 def test_a_certificate_that_ends_takes_its_stream_with_it(plane: SecuredControlPlane) -> None:

@@ -8,7 +8,7 @@ import grpc
 import pytest
 
 from protos.convert import status_from_proto
-from protos.model import NO_RULES, NodeName, RemovalReason, RemovedPeer, ServiceName
+from protos.model import NO_POLICY, NodeName, RemovalReason, RemovedPeer, ServiceName
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from tests.integration.control_plane_process import ControlPlaneProcess, cloud, robot
 
@@ -46,10 +46,10 @@ def test_the_policy_is_in_force_from_the_start_and_changes_when_told(plane: Cont
         permit = a.peers("robot").peers[0].may_call
         assert permit.services == {ServiceName("/plan")}
         assert not permit.everything
-        assert b.peers().rules == first.rules != NO_RULES
+        assert b.peers().policy == first.policy != NO_POLICY
         plane.reload(policy=policy())
         second = r.peers("cloud-a", "cloud-b")
-        assert second.rules not in (first.rules, NO_RULES)
+        assert second.policy not in (first.policy, NO_POLICY)
         r.mapping("cloud-a", "cloud-b")
         b.peers("robot")
         plane.reload(policy=policy(clouds="cloud-b"))
@@ -57,7 +57,7 @@ def test_the_policy_is_in_force_from_the_start_and_changes_when_told(plane: Cont
         r.mapping("cloud-b", "cloud-b")
         plane.reload(policy=None)
         nothing = r.peers()
-        assert nothing.rules not in (NO_RULES, second.rules), "a policy that is empty is one that denies"
+        assert nothing.policy not in (NO_POLICY, second.policy), "a policy that is empty is one that denies"
 
 
 def test_a_file_that_is_not_in_order_leaves_the_policy_in_force(plane: ControlPlaneProcess) -> None:
@@ -91,5 +91,5 @@ def test_without_a_policy_the_log_says_so(tmp_path: Path) -> None:
     with ControlPlaneProcess(tmp_path) as running:
         running.wait_for_line("WARNING", "there is no policy: every robot may call")
         with cloud(running.address, "cloud-a") as a, robot(running.address) as r:
-            assert r.peers("cloud-a").rules == NO_RULES
+            assert r.peers("cloud-a").policy == NO_POLICY
             assert a.peers("robot").peers[0].may_call.everything

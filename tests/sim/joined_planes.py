@@ -114,7 +114,7 @@ class JoinedPlanes:
         if node.name not in self.rogues:
             return told
         others = (other.as_peer() for other in self.mesh.nodes.values() if other.role is not node.role)
-        return dataclasses.replace(told, peers=tuple(others), removed=(), rules=0)
+        return dataclasses.replace(told, peers=tuple(others), removed=(), policy=0)
 
 
 def restored(peer_set: PeerSet) -> PeerSet:

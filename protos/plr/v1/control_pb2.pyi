@@ -575,14 +575,14 @@ class PeerSet(_message.Message):
     NONCE_FIELD_NUMBER: _builtins.int
     PEERS_FIELD_NUMBER: _builtins.int
     REMOVED_FIELD_NUMBER: _builtins.int
-    RULES_FIELD_NUMBER: _builtins.int
+    POLICY_FIELD_NUMBER: _builtins.int
     version: _builtins.int
     nonce: _builtins.int
-    rules: _builtins.int
-    """Fingerprint of the rules that this set follows: the access policy, and which certificates are revoked. When it
-    differs from the last one that was not 0, a peer that is not listed goes at once, whatever its paths prove: nobody
-    said what it may do under the new rules. 0: not yet to be judged by them (right after a start, while peers are
-    still coming back). 1: there are no rules; then nothing need go.
+    policy: _builtins.int
+    """Fingerprint of the access policy that this set follows. When it differs from the last one that was not 0, a peer
+    that is not listed goes at once, whatever its paths prove: nobody said what it may do under the new policy.
+    0: not yet to be judged by it (right after a start, while peers are still coming back). 1: there is no policy;
+    then nothing need go.
     """
     @_builtins.property
     def peers(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.Peer]: ...
@@ -597,11 +597,11 @@ class PeerSet(_message.Message):
         nonce: _builtins.int = ...,
         peers: _abc.Iterable[_types_pb2.Peer] | None = ...,
         removed: _abc.Iterable[Global___RemovedPeer] | None = ...,
-        rules: _builtins.int = ...,
+        policy: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["nonce", b"nonce", "peers", b"peers", "removed", b"removed", "rules", b"rules", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["nonce", b"nonce", "peers", b"peers", "policy", b"policy", "removed", b"removed", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

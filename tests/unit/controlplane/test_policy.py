@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.policy_explain import MAX_CLOSE, explain
-from protos.model import NO_RULES, RULES_PENDING, NodeName, ServiceName
+from protos.model import NO_POLICY, POLICY_PENDING, NodeName, ServiceName
 
 ARM, BASE = NodeName("arm-1"), NodeName("base-1")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")
@@ -44,7 +44,7 @@ def test_fingerprints_tell_policies_apart_and_outlive_a_restart() -> None:
         Policy((CallRule(("a", "b"), ("/s",), ("c",)),)),
         Policy((CallRule(("a",), ("b", "/s"), ("c",)),)),
     ]
-    assert len({policy.fingerprint for policy in policies} - {NO_RULES, RULES_PENDING}) == len(policies)
+    assert len({policy.fingerprint for policy in policies} - {NO_POLICY, POLICY_PENDING}) == len(policies)
     assert Policy().fingerprint == 0xA683096011DB3975
 
 

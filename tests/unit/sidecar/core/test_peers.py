@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from protos.model import (
-    NO_RULES,
-    RULES_PENDING,
+    NO_POLICY,
+    POLICY_PENDING,
     CallPermit,
     Candidate,
     CandidateKind,
@@ -37,8 +37,8 @@ OWN = session_of("robot-1", Role.ROBOT, 99)
 HELD = peer(A, session=1), peer(B, session=2)
 
 
-def view(*listed: Peer, removed: tuple[RemovedPeer, ...] = (), rules: int = RULES_PENDING) -> PeerSet:
-    return PeerSet(Version(1), 1, listed, removed, rules)
+def view(*listed: Peer, removed: tuple[RemovedPeer, ...] = (), policy: int = POLICY_PENDING) -> PeerSet:
+    return PeerSet(Version(1), 1, listed, removed, policy)
 
 
 def known(*listed: Peer) -> Peers:
@@ -89,31 +89,31 @@ def test_one_whose_lease_expired_is_kept_one_that_left_or_was_revoked_goes_at_on
         assert B in peers
 
 
-def test_one_that_vanished_goes_when_the_rules_change() -> None:
-    """Nobody said what it may do under the new rules, and its own say-so is worth nothing."""
+def test_one_that_vanished_goes_when_the_policy_changes() -> None:
+    """Nobody said what it may do under the new policy, and its own say-so is worth nothing."""
     for before, after, kept in (
         (7, 7, True),
         (7, 8, False),
-        (7, RULES_PENDING, True),
-        (7, NO_RULES, True),
-        (NO_RULES, 7, False),
-        (RULES_PENDING, 7, False),
+        (7, POLICY_PENDING, True),
+        (7, NO_POLICY, True),
+        (NO_POLICY, 7, False),
+        (POLICY_PENDING, 7, False),
     ):
         peers = Peers(OWN, Counter())
-        peers.apply(view(*HELD, rules=before), nobody)
-        peers.apply(view(HELD[1], rules=after), everybody)
+        peers.apply(view(*HELD, policy=before), nobody)
+        peers.apply(view(HELD[1], policy=after), everybody)
         assert (A in peers) is kept, (before, after)
         assert B in peers
 
 
-def test_rules_that_were_away_for_a_while_are_a_change() -> None:
-    """Without any a peer was allowed everything, which must not outlive their return."""
+def test_a_policy_that_was_away_for_a_while_is_a_change() -> None:
+    """Without a policy a peer was allowed everything, which must not outlive the policy's return."""
     peers = Peers(OWN, Counter())
-    for rules in (7, NO_RULES):
-        peers.apply(view(HELD[0], rules=rules), everybody)
-    peers.apply(view(rules=RULES_PENDING), everybody)
+    for policy in (7, NO_POLICY):
+        peers.apply(view(HELD[0], policy=policy), everybody)
+    peers.apply(view(policy=POLICY_PENDING), everybody)
     assert A in peers
-    peers.apply(view(rules=7), everybody)
+    peers.apply(view(policy=7), everybody)
     assert A not in peers
 
 

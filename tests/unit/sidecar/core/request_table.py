@@ -1,0 +1,106 @@
+"""A request table that a test drives from both sides."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.copies import OBSERVED_ONE_IN
+from sidecar.core.events import ApplicationEvent, RejectReason, RequestFailed, RequestId
+from sidecar.core.link_events import LinkCommand, Send
+from sidecar.core.mapping import MappingTable
+from sidecar.core.measurements import Measurements
+from sidecar.core.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
+from sidecar.core.offers import Offers
+from sidecar.core.outbox import Outbox
+from sidecar.core.path_id import PathId, PathState
+from sidecar.core.priority import Priority
+from sidecar.core.requests import RequestParts, RequestTable
+from sidecar.core.routes import Routes
+from sidecar.core.rules import ServiceRule
+from sidecar.core.stats import EngineStats
+from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+
+WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
+SERVERS = {A: WLAN_A, B: WWAN_B}
+RACE = OBSERVED_ONE_IN
+"""Number of a request whose copies are all measured."""
+
+
+class Table:
+    """A request table whose commands and events the test reads; wlan0 reaches cloud-a, wwan0 cloud-b."""
+
+    def __init__(self, *, idempotent: bool = True, drop_late: bool = False) -> None:
+        self.rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=idempotent, drop_late=drop_late)
+        self.routes, self.stats, self.measurements = Routes(), EngineStats(), Measurements()
+        self.commands: list[LinkCommand] = []
+        self.events: list[ApplicationEvent] = []
+        self.sought: list[frozenset[NodeName]] = []
+        self.outbox = Outbox(self.routes, self.commands.append, self.stats)
+        offers = Offers((self.rule,))
+        offers.set_peers([peer(A), peer(B, session=2)])
+        mapping = MappingTable(self.routes)
+        parts = RequestParts(
+            offers,
+            mapping,
+            self.routes,
+            self.outbox,
+            self.measurements,
+            self.stats,
+            self.events.append,
+            self.sought.append,
+        )
+        self.table = RequestTable(parts)
+        for known in SERVERS.values():
+            self.routes.set_state(known, PathState.UP)
+
+    def submit(self, number: int = 1, payload: bytes = b"question", now: float = 0.0, *, begun: bool = True) -> None:
+        self.table.submit(request_id(number), ECHO, TYPE, self.rule, payload, now)
+        for command in self.commands if begun else ():
+            if isinstance(command, Send):
+                command.message.begun = True
+
+    def sent(self) -> list[PathId]:
+        """Paths that got copies since the last look."""
+        paths = [command.path for command in self.commands if isinstance(command, Send)]
+        self.commands.clear()
+        return paths
+
+    def cancelled(self) -> list[tuple[PathId, RequestId]]:
+        """What was cancelled where; those messages count as delivered."""
+        found = []
+        for message in list(self.outbox._messages.values()):
+            content = decode_message(memoryview(b"".join(message.content)))
+            if isinstance(content, CancelMessage):
+                assert message.priority is Priority.HIGH
+                found.append((message.path, content.request_id))
+                self.outbox.drop(message)
+        return found
+
+    def latencies(self) -> dict[str, tuple[int, int]]:
+        """(answered, lost) by server."""
+        reports = self.measurements.take(self.routes, []).latencies
+        return {report.server: (sum(report.latency.counts), report.latency.lost) for report in reports}
+
+    def respond(self, server: str = A, copy: int = 0, number: int = 1, now: float = 0.1, size: int = 0) -> None:
+        response = ResponseMessage(request_id(number), copy, 0.01, (b"from " + server.encode()).ljust(size))
+        self.table.on_response(peer(server).name, response, now)
+
+    def reject(self, reason: RejectReason, server: str = A, copy: int = 0, now: float = 0.1) -> None:
+        self.table.on_rejection(peer(server).name, RejectionMessage(request_id(1), copy, reason, "why"), now)
+
+    def change(self, changed: PathId, state: PathState, now: float = 0.1) -> None:
+        self.routes.set_state(changed, state)
+        self.table.on_path_changed(changed, state, now)
+
+    def only_failure(self) -> RequestFailed:
+        (failed,) = [event for event in self.events if isinstance(event, RequestFailed)]
+        return failed
+
+    def assert_empty(self) -> None:
+        assert self.table.unanswered == 0
+        assert not self.table._requests
+        assert len(self.outbox) == 0
+        assert self.table.next_timer() is None

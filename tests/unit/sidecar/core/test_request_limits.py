@@ -1,0 +1,56 @@
+"""What a request table takes on, and what it refuses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core import requests as requests_module
+from sidecar.core.messages import MAX_PAYLOAD_BYTES, Encoded
+from sidecar.core.priority import Priority
+from tests.unit.sidecar.core.builders import ECHO
+from tests.unit.sidecar.core.request_table import WLAN_A, WWAN_B, Table
+
+if TYPE_CHECKING:
+    import pytest
+
+
+def test_what_cannot_be_sent_is_rejected_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = Table()
+    table.submit(payload=bytes(MAX_PAYLOAD_BYTES + 1))
+    assert "limit" in table.only_failure().reason
+    table.events.clear()
+    table.submit()
+    table.submit()
+    assert "identity" in table.only_failure().reason
+    table.events.clear()
+    monkeypatch.setattr(requests_module, "MAX_IN_FLIGHT", 1)
+    table.submit(2)
+    assert "in flight" in table.only_failure().reason
+    assert table.stats.requests[ECHO, "rejected"] == 3
+
+
+def test_requests_that_wait_are_capped_in_bytes_and_leave_room_when_they_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(requests_module, "MAX_HELD_BYTES", 1000)
+    table = Table()
+    table.submit(1, payload=bytes(600))
+    table.submit(2, payload=bytes(600))
+    assert "bytes already" in table.only_failure().reason
+    table.table.handle_timer(1.0)
+    table.table.handle_timer(100.0)
+    table.events.clear()
+    table.submit(3, payload=bytes(600), now=100.0)
+    assert not table.events
+
+
+def test_a_full_outbox_towards_one_server_sends_to_the_other_only_and_two_full_ones_reject() -> None:
+    table = Table()
+    huge = Encoded(b"", bytes(8_000_000))
+    while table.outbox.send(WLAN_A, huge, priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
+        pass
+    table.sent()
+    table.submit(1, payload=bytes(8_000_000))
+    assert table.sent() == [WWAN_B]
+    while table.outbox.send(WWAN_B, huge, priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
+        pass
+    table.submit(2, payload=bytes(8_000_000))
+    assert table.only_failure().outcome == "rejected"

@@ -1,0 +1,120 @@
+"""Requests in trouble: paths that go, servers that refuse or leave, and who else is asked."""
+
+from __future__ import annotations
+
+import pytest
+
+from sidecar.core.events import RejectReason, ResponseArrived
+from sidecar.core.path_id import PathState
+from sidecar.core.requests import MAX_COPIES
+from tests.unit.sidecar.core.builders import A, B
+from tests.unit.sidecar.core.request_table import SERVERS, WLAN_A, WWAN_B, Table
+
+
+def test_with_no_path_the_request_waits_for_the_first_one_that_comes_up() -> None:
+    table = Table()
+    for known in SERVERS.values():
+        table.routes.set_state(known, PathState.DOWN)
+    table.submit()
+    assert table.sent() == []
+    table.change(WWAN_B, PathState.UP)
+    assert table.sent() == [WWAN_B]
+
+
+@pytest.mark.parametrize("state", [PathState.UNSTABLE, PathState.DOWN])
+def test_trouble_on_the_only_path_sends_a_copy_elsewhere_if_idempotent(state: PathState) -> None:
+    for idempotent, rescued in ((True, [WWAN_B]), (False, [])):
+        table = Table(idempotent=idempotent)
+        table.routes.set_state(WWAN_B, PathState.DOWN)
+        table.submit()
+        assert table.sent() == [WLAN_A]
+        table.routes.set_state(WWAN_B, PathState.UP)
+        table.change(WLAN_A, state)
+        assert table.sent() == rescued
+
+
+def test_flapping_paths_do_not_multiply_copies_without_end() -> None:
+    table = Table()
+    table.submit()
+    for turn in range(50):
+        for known in SERVERS.values():
+            table.change(known, PathState.UNSTABLE, now=turn * 0.01)
+        for known in SERVERS.values():
+            table.change(known, PathState.UP, now=turn * 0.01)
+    assert len(table.sent()) <= MAX_COPIES
+
+
+@pytest.mark.parametrize("reason", RejectReason)
+def test_a_rejected_request_goes_to_another_server_only_where_that_is_allowed(reason: RejectReason) -> None:
+    table = Table(idempotent=False)
+    table.submit()
+    assert table.sent() == [WLAN_A]
+    table.reject(reason)
+    if reason.certainly_not_run:
+        assert table.sent() == [WWAN_B]
+        assert table.events == []
+        table.respond(B, copy=1)
+        assert isinstance(table.events[0], ResponseArrived)
+    else:
+        assert table.sent() == []
+        assert table.only_failure().outcome == "rejected"
+    table.assert_empty()
+
+
+def test_a_request_that_all_servers_reject_fails_with_the_last_reason() -> None:
+    table = Table()
+    table.submit()
+    table.reject(RejectReason.OVERLOADED, A, 0)
+    assert table.events == []
+    table.reject(RejectReason.BAD_PAYLOAD, B, 1)
+    assert "bad payload: why" in table.only_failure().reason
+    table.assert_empty()
+
+
+@pytest.mark.parametrize("reason", [RejectReason.NOT_OFFERED, RejectReason.BAD_PAYLOAD])
+def test_who_refused_while_starting_is_asked_again_when_all_else_is_lost(reason: RejectReason) -> None:
+    """A cloud's sidecar is up before its ROS side is; meanwhile the other cloud dies."""
+    table = Table()
+    table.submit()
+    table.sent()
+    table.reject(reason, B, 1)
+    assert table.sent() == [], "the other copy is on its way"
+    table.change(WLAN_A, PathState.DOWN)
+    assert table.sent() == ([WWAN_B] if reason.certainly_not_run else [])
+    assert table.events == []
+
+
+def test_a_second_rejection_of_a_copy_changes_nothing() -> None:
+    table = Table()
+    table.submit()
+    table.sent()
+    for _ in range(5):
+        table.reject(RejectReason.OVERLOADED, A, 0)
+    assert table.sent() == []
+    assert table.events == []
+
+
+def test_when_its_server_goes_a_request_that_may_not_run_twice_fails_and_another_is_sent_on() -> None:
+    table = Table(idempotent=False)
+    table.submit()
+    table.table.on_peer_gone(A, 0.1)
+    assert "may have run" in table.only_failure().reason
+    table = Table()
+    table.routes.set_state(WWAN_B, PathState.DOWN)
+    table.submit()
+    table.routes.set_state(WWAN_B, PathState.UP)
+    table.routes.forget_peer(A)
+    table.sent()
+    table.table.on_peer_gone(A, 0.1)
+    assert table.sent() == [WWAN_B]
+    assert table.events == []
+
+
+def test_a_request_without_any_path_has_the_links_look_for_one() -> None:
+    table = Table()
+    table.submit(1)
+    assert not table.sought
+    for known in SERVERS.values():
+        table.routes.set_state(known, PathState.DOWN)
+    table.submit(2)
+    assert table.sought == [frozenset((A, B))]
