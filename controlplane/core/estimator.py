@@ -266,6 +266,12 @@ class Estimator:
         latency = tables.latencies.get((interface, server, service))
         return latency.outcomes.posterior(prior, now) if latency is not None else prior
 
+    def raced_together(self, robot: NodeName, service: ServiceName) -> Iterator[tuple[Assignment, Assignment]]:
+        """The pairs of paths that carried copies of the same requests."""
+        tables = self._robots.get(robot)
+        if tables is not None:
+            yield from ((first, second) for of, first, second in tables.joints if of == service)
+
     def both_miss(
         self, robot: NodeName, service: ServiceName, first: Assignment, second: Assignment, product: float, now: float
     ) -> Estimate:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.permits import Permits
-    from controlplane.core.problem import Objective
+    from controlplane.core.problem import Objective, Path
     from controlplane.core.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceName, ServiceUse
 
@@ -118,13 +118,40 @@ def _block(
             robot.name, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s
         ).mean
 
+    epsilons = tuple(tuple(epsilon(interface, server) for server in reached) for interface in lit)
     block = Block(
         key=BlockKey(robot.name, use.name),
         interfaces=lit,
         servers=reached,
-        epsilon=tuple(tuple(epsilon(interface, server) for server in reached) for interface in lit),
+        epsilon=epsilons,
         capacity=capacity,
         idempotent=use.idempotent,
+        lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
     )
     dark = tuple(interface for interface in interfaces if interface not in lit)
     return block, BlockNotes(servers, dark, all_dark)
+
+
+def _lifts(
+    key: BlockKey,
+    interfaces: tuple[InterfaceName, ...],
+    servers: tuple[NodeName, ...],
+    epsilons: tuple[tuple[float | None, ...], ...],
+    estimator: Estimator,
+    now: float,
+) -> dict[tuple[Path, Path], float]:
+    """How much more often than by chance two paths over different interfaces miss together, where it was measured."""
+    lifts: dict[tuple[Path, Path], float] = {}
+    row = {interface: number for number, interface in enumerate(interfaces)}
+    column = {server: number for number, server in enumerate(servers)}
+    for first, second in estimator.raced_together(key.robot, key.service):
+        if not ({first.interface, second.interface} <= row.keys() and {first.server, second.server} <= column.keys()):
+            continue
+        one, other = ((row[path.interface], column[path.server]) for path in (first, second))
+        epsilon_one, epsilon_other = epsilons[one[0]][one[1]], epsilons[other[0]][other[1]]
+        if one[0] == other[0] or epsilon_one is None or epsilon_other is None:
+            continue
+        product = epsilon_one * epsilon_other
+        both_miss = estimator.both_miss(key.robot, key.service, first, second, product, now).mean
+        lifts[min(one, other), max(one, other)] = both_miss / product
+    return lifts

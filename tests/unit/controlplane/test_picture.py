@@ -5,13 +5,17 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.estimator import Estimator
+from controlplane.core.objectives import joint_miss
 from controlplane.core.permits import Permits
 from controlplane.core.picture import BlockNotes, Picture, draw
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem import BlockKey, FleetKey, Objective
 from controlplane.core.registry import Sidecar
 from protos.model import (
+    Assignment,
     Candidate,
+    InterfaceName,
+    JointReport,
     NodeName,
     PathReport,
     Report,
@@ -26,6 +30,7 @@ from tests.unit.controlplane.samples import (
     candidate,
     histogram,
     interfaces,
+    latency,
     offer,
     path,
     registration,
@@ -133,6 +138,37 @@ def test_capacities_come_from_the_configuration_and_from_the_offers() -> None:
     assert block.capacity == 2
     assert not block.idempotent
     assert drawn.problem.fleet_capacity == {FleetKey(NodeName("a"), PLAN): 3}
+
+
+def test_paths_that_were_seen_to_fail_together_get_a_lift_whatever_the_order_of_their_names() -> None:
+    estimator = Estimator(half_life_s=60.0)
+    # One request in ten misses on each path, and always on both.
+    tenth = histogram(*[0.01] * 9, 0.5, times=50)
+    pairs = (("wlan0", "a"), ("wwan0", "b"))
+    joint = JointReport(PLAN, assignment("wlan0", "a"), assignment("wwan0", "b"), 4000, 400)
+    gone = JointReport(PLAN, assignment("usb0", "a"), assignment("wlan0", "a"), 4000, 400)
+    same = JointReport(PLAN, assignment("wlan0", "a"), assignment("wlan0", "b"), 4000, 400)
+    estimator.merge(
+        NodeName("robot"),
+        Report(
+            latencies=tuple(latency(*pair, tenth) for pair in pairs),
+            paths=tuple(path(interface, server) for interface in ("wlan0", "wwan0") for server in ("a", "b")),
+            joints=(joint, gone, same),
+        ),
+        0.0,
+    )
+    backwards = robot(candidates=interfaces("wwan0", "wlan0"))
+    seen = [backwards, cloud("a"), cloud("b")]
+    drawn = draw(seen, Permits(None), estimator, 0.0, default_capacity_interfaces=1, objective=OBJECTIVE)
+    (block,) = drawn.problem.blocks
+    assert block.interfaces == ("wwan0", "wlan0")
+    assert block.lifts == {((0, 1), (1, 0)): pytest.approx(10.0, rel=0.1)}
+    assert joint_miss(block, (1, 0)) == pytest.approx(0.1, rel=0.05)
+    assert joint_miss(block, (0, 1)) == pytest.approx(0.25), "never tried, alone or together"
+
+
+def assignment(interface: str, server: str) -> Assignment:
+    return Assignment(InterfaceName(interface), NodeName(server))
 
 
 def test_each_use_has_its_own_deadline() -> None:
