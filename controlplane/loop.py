@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from controlplane.core.picture import Picture
     from controlplane.core.policy import Policy
     from controlplane.core.registry import StreamId
+    from controlplane.matcher import Matcher
     from controlplane.metrics import Metrics
     from controlplane.stun_server import StunServer
     from controlplane.tls_gate import Caller
@@ -60,11 +61,21 @@ def _few(services: Sequence[ServiceName]) -> str:
     return ", ".join(services[:MAX_SERVICES_LOGGED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _solve(problem: Problem, time_limit_s: float, hint: Plan) -> Plan:
-    # OR-Tools takes one to two seconds to import: the streams need not wait for it after a restart.
-    from controlplane.matcher import solve
+class _LateMatcher:
+    """The matcher, for the solver's thread alone.
 
-    return solve(problem, time_limit_s=time_limit_s, hint=hint)
+    OR-Tools takes one to two seconds to import: the streams need not wait for it after a restart.
+    """
+
+    def __init__(self) -> None:
+        self._matcher: Matcher | None = None
+
+    def solve(self, problem: Problem, time_limit_s: float, hint: Plan) -> Plan:
+        from controlplane.matcher import Matcher
+
+        if self._matcher is None:
+            self._matcher = Matcher()
+        return self._matcher.solve(problem, time_limit_s=time_limit_s, hint=hint)
 
 
 class ControlLoop:
@@ -80,6 +91,7 @@ class ControlLoop:
         self._superseded = 0
         self._wake = asyncio.Event()
         self._stopping = False
+        self._matcher = _LateMatcher()
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
         self.stun_servers: list[StunServer] = []
 
@@ -198,7 +210,7 @@ class ControlLoop:
     async def run(self) -> None:
         """Run until `stop`."""
         metrics_at = self._loop.time()
-        self._executor.submit(_solve, Problem(()), 0.0, Plan({}))
+        self._executor.submit(self._matcher.solve, Problem(()), 0.0, Plan({}))
         async with asyncio.TaskGroup() as solving:
             while not self._stopping:
                 now = self._loop.time()
@@ -232,7 +244,7 @@ class ControlLoop:
         hint = self._core.plan
 
         try:
-            plan = await self._loop.run_in_executor(self._executor, _solve, picture.problem, limit_s, hint)
+            plan = await self._loop.run_in_executor(self._executor, self._matcher.solve, picture.problem, limit_s, hint)
         except Exception:
             # The plan in force goes on; one failed solving must not take the streams down.
             log.exception("solving failed; the plan in force stays")

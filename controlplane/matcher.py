@@ -1,62 +1,133 @@
-"""From an assignment problem to a plan, within a time limit.
+"""From an assignment problem to a plan, within a time limit; from problem to problem with what it learned.
 
-Blocks that share no limit over all robots get their best choice at once. Those that do go through the decomposition
-(`controlplane.core.decomposition`); what it leaves open between plan and bound is searched by CP-SAT, in a small group
-until the optimum is proven, in a large one only if the gap is wide.
+Blocks that share no limit over all robots get their best choice at once, the others by groups (`group_solver`). When
+few blocks of a large fleet changed since the last problem, only these choose anew, within the capacity that the others
+leave; the prices of the last whole solution tell how far from the best that is.
 """
 
 from __future__ import annotations
 
-import math
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.decomposition import Decomposition, Relaxed
+from controlplane.core.decomposition import Decomposition
 from controlplane.core.grouping import independent_groups
 from controlplane.core.limits import Limits
-from controlplane.core.plan import choice_of, make_plan, relative_gap
-from controlplane.solver import RESOLUTION, Column, pick_columns
+from controlplane.core.plan import Plan, make_plan, relative_gap
+from controlplane.core.problem import FleetKey, reachable
+from controlplane.group_solver import SMALL_BLOCKS, GroupSolver
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
-    from controlplane.core.plan import Plan
-    from controlplane.core.problem import BlockKey, Choice, Problem
+    from controlplane.core.problem import Block, BlockKey, Problem
 
-SMALL_BLOCKS = 64
-"""Groups of up to this many blocks are solved to the optimum, if the time allows."""
+CHANGED_SHARE = 0.02
+"""Beyond this share of changed blocks all are solved: it costs little more, and moves others out of the way."""
 
-GOOD_GAP = 0.002
-"""Larger groups are left alone once the plan costs at most this share more than the bound: below the resolution of
-any estimate."""
-
-MIN_GROUP_TIME_S = 0.01
-"""Time a group of blocks gets for the search even when those before it used up the limit."""
-
-MAX_COLUMNS = 30_000
-"""Choices of all blocks of a group that CP-SAT is given: a second's work to set up."""
-
-MIN_COLUMNS_BLOCK = 4
-MAX_COLUMNS_BLOCK = 4096
+INCREMENTAL_GAP = 0.01
+"""All blocks are solved again once the plan may cost this share more than the best."""
 
 
 def solve(problem: Problem, *, time_limit_s: float, hint: Plan | None = None) -> Plan:
-    """Find the plan with the least excess over the capacities and, among those, the least cost.
+    """The plan for one problem, by a matcher that knows nothing from before."""
+    return Matcher().solve(problem, time_limit_s=time_limit_s, hint=hint)
 
-    Groups of blocks that share no limit are solved one after the other within `time_limit_s` seconds together. A
-    group out of time keeps the best plan found, and counts as unproven.
-    """
-    end = time.monotonic() + time_limit_s
-    choices: dict[BlockKey, Choice] = {}
-    bound = 0.0
-    unproven = 0
-    for group in _groups(problem):
-        found = _Group(group, end).solve(hint)
-        choices.update(found.choices)
-        bound += found.bound
-        unproven += not found.proven
-    return make_plan(problem, choices, bound=bound, unproven=unproven)
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """The last problem with its plan, and what was learned of it."""
+
+    problem: Problem
+    blocks: Mapping[BlockKey, Block]
+    plan: Plan
+    load: Mapping[FleetKey, int]
+    prices: Mapping[FleetKey, float]
+    worth: Mapping[BlockKey, float]
+
+
+class Matcher:
+    """Solves one problem after the other."""
+
+    def __init__(self) -> None:
+        self._kept: _Kept | None = None
+        self.incremental = 0
+        """Problems of which only what changed was solved."""
+
+    def solve(self, problem: Problem, *, time_limit_s: float, hint: Plan | None = None) -> Plan:
+        """Find the plan with the least excess over the capacities and, among those, the least cost.
+
+        Groups of blocks that share no limit are solved one after the other within `time_limit_s` seconds together. A
+        group out of time keeps the best plan found, and counts as unproven.
+        """
+        end = time.monotonic() + time_limit_s
+        kept = self._kept
+        if kept is not None:
+            plan = self._solve_changed(problem, kept, end)
+            if plan is not None:
+                self.incremental += 1
+                return plan
+        return self._solve_all(problem, end, hint, kept.prices if kept is not None else {})
+
+    def _solve_all(self, problem: Problem, end: float, hint: Plan | None, prices: Mapping[FleetKey, float]) -> Plan:
+        found = [GroupSolver(group, end).solve(hint, prices) for group in _groups(problem)]
+        plan = make_plan(
+            problem,
+            {key: choice for group in found for key, choice in group.choices.items()},
+            bound=sum(group.bound for group in found),
+            unproven=sum(not group.proven for group in found),
+        )
+        self._kept = _Kept(
+            problem,
+            {block.key: block for block in problem.blocks},
+            plan,
+            _loads(problem, plan, plan.blocks),
+            {key: price for group in found for key, price in group.prices.items()},
+            {key: worth for group in found for key, worth in group.worth.items()},
+        )
+        return plan
+
+    def _solve_changed(self, problem: Problem, kept: _Kept, end: float) -> Plan | None:
+        """The plan, if it can be had by solving the changed blocks alone, and is good."""
+        last = kept.problem
+        same_frame = (problem.objective, problem.fleet_capacity) == (last.objective, last.fleet_capacity)
+        if not same_frame or kept.plan.fleet_excess or len(problem.blocks) <= SMALL_BLOCKS:
+            return None
+        blocks = {block.key: block for block in problem.blocks}
+        changed = [
+            block for key, block in blocks.items() if (old := kept.blocks.get(key)) is not block and old != block
+        ]
+        if len(changed) > max(1, CHANGED_SHARE * len(blocks)):
+            return None
+        left_out = {block.key for block in changed} | (kept.blocks.keys() - blocks.keys())
+        load = dict(kept.load)
+        for key, count in _loads(kept.problem, kept.plan, left_out & kept.plan.blocks.keys()).items():
+            load[key] -= count
+        free = {key: limit - load.get(key, 0) for key, limit in problem.fleet_capacity.items()}
+        part = _part(problem, changed, free)
+        if part is None:
+            return None
+        found = [GroupSolver(group, end).solve(None, {}) for group in _groups(part)]
+        choices = {key: choice for group in found for key, choice in group.choices.items()}
+        added = make_plan(replace(part, blocks=tuple(changed)), choices)
+        if added.fleet_excess:
+            return None
+        for key, count in _loads(problem, added, added.blocks).items():
+            load[key] = load.get(key, 0) + count
+        worth = {key: value for key, value in kept.worth.items() if key not in left_out}
+        worth.update(_worth(replace(problem, blocks=tuple(changed)), kept.prices))
+        paid = sum(price * problem.fleet_capacity[key] for key, price in kept.prices.items())
+        plan = Plan(
+            {key: added.blocks.get(key) or kept.plan.blocks[key] for key in blocks},
+            bound=sum(worth.values()) - paid,
+            unproven=kept.plan.unproven,
+        )
+        if relative_gap(plan.cost, plan.bound) > INCREMENTAL_GAP:
+            return None
+        self._kept = _Kept(problem, blocks, plan, load, kept.prices, worth)
+        return plan
 
 
 def _groups(problem: Problem) -> list[Problem]:
@@ -67,85 +138,32 @@ def _groups(problem: Problem) -> list[Problem]:
     return [replace(problem, blocks=free, fleet_capacity={}), *bound] if free else bound
 
 
-@dataclass(frozen=True, slots=True)
-class _Found:
-    choices: Mapping[BlockKey, Choice]
-    bound: float
-    proven: bool
-
-
-class _Group:
-    def __init__(self, group: Problem, end: float) -> None:
-        self._group = group
-        self._end = end
-        self._is_small = len(group.blocks) <= SMALL_BLOCKS
-        self._good_gap = 0.0 if self._is_small else GOOD_GAP
-        self._limits = Limits(group)
-
-    def solve(self, hint: Plan | None) -> _Found:
-        decomposition = Decomposition(self._group, self._limits, {})
-        relaxed = decomposition.run(
-            self._hinted(hint), good_gap=self._good_gap, out_of_time=lambda: time.monotonic() > self._end
+def _part(problem: Problem, changed: Iterable[Block], free: Mapping[FleetKey, int]) -> Problem | None:
+    """The changed blocks without the servers that the others fill; None if that takes an interface its last one."""
+    blocks = []
+    for block in changed:
+        full = {server for server in block.servers if free.get(FleetKey(server, block.key.service), 1) <= 0}
+        epsilon = tuple(
+            tuple(None if server in full else value for server, value in zip(block.servers, row, strict=True))
+            for row in block.epsilon
         )
-        proven = self._is_good(relaxed.standing.cost, relaxed.bound) and relaxed.excess_proven
-        if proven or not len(self._limits):
-            return _Found(relaxed.standing.choices(), relaxed.bound, proven=proven)
-        return self._search(relaxed)
-
-    def _hinted(self, hint: Plan | None) -> dict[BlockKey, Choice] | None:
-        if hint is None:
+        if not all(reachable(row) for row in epsilon):
             return None
-        found: dict[BlockKey, Choice] = {}
-        for block in self._group.blocks:
-            choice = choice_of(block, hint.blocks.get(block.key))
-            if choice is None:
-                return None
-            found[block.key] = choice
-        return found
+        blocks.append(replace(block, epsilon=epsilon))
+    used = {FleetKey(server, block.key.service) for block in blocks for server in block.servers}
+    return replace(
+        problem, blocks=tuple(blocks), fleet_capacity={key: limit for key, limit in free.items() if key in used}
+    )
 
-    def _is_good(self, cost: float, bound: float) -> bool:
-        return cost - bound <= RESOLUTION * len(self._group.blocks) or relative_gap(cost, bound) <= self._good_gap
 
-    def _search(self, relaxed: Relaxed) -> _Found:
-        """Let CP-SAT choose among the choices that the bound leaves a chance."""
-        standing, limits = relaxed.standing, self._limits
-        margin = math.inf if relaxed.extra else standing.cost - relaxed.bound
-        at_most = min(MAX_COLUMNS_BLOCK, max(MIN_COLUMNS_BLOCK, MAX_COLUMNS // len(self._group.blocks)))
-        columns: list[list[Column]] = []
-        picks = []
-        hint = []
-        complete = True
-        for stack, part in zip(standing.stacks, standing.parts, strict=True):
-            for row in stack.every:
-                price = relaxed.price[stack.limit[row]]
-                near = stack.near(int(row), price, margin, at_most)
-                complete = complete and near.complete
-                options = [
-                    Column(
-                        float(value - price[servers].sum()),
-                        int(excess),
-                        tuple(limit for limit in stack.limit[row, servers].tolist() if limit < len(limits)),
-                    )
-                    for value, excess, servers in zip(near.values, near.excess, near.picks, strict=True)
-                ]
-                servers = [tuple(option.tolist()) for option in near.picks]
-                now = tuple(part.picks[row].tolist())
-                if now not in servers:
-                    servers.append(now)
-                    used = stack.limit[row, part.picks[row]].tolist()
-                    under = tuple(limit for limit in used if limit < len(limits))
-                    options.append(Column(float(part.cost[row]), int(part.excess[row]), under))
-                hint.append(servers.index(now))
-                columns.append(options)
-                picks.append((stack, servers))
-        left_s = max(MIN_GROUP_TIME_S, self._end - time.monotonic())
-        found, proven = pick_columns(columns, limits.capacity.tolist(), hint, time_limit_s=left_s)
-        choices = {}
-        cost = 0.0
-        keys = [block.key for stack in standing.stacks for block in stack.blocks]
-        for key, number, options, (stack, servers) in zip(keys, found, columns, picks, strict=True):
-            choices[key] = stack.choice_of(servers[number])
-            cost += options[number].cost
-        if proven and complete:
-            return _Found(choices, cost, proven=True)
-        return _Found(choices, relaxed.bound, proven=relaxed.excess_proven and self._is_good(cost, relaxed.bound))
+def _loads(problem: Problem, plan: Plan, keys: Iterable[BlockKey]) -> Counter[FleetKey]:
+    """Interfaces that these blocks of a plan give each server with a limit."""
+    used = (FleetKey(server, key.service) for key in keys for _, server in plan.blocks[key].assignments)
+    return Counter(key for key in used if key in problem.fleet_capacity)
+
+
+def _worth(problem: Problem, prices: Mapping[FleetKey, float]) -> dict[BlockKey, float]:
+    """What blocks are worth at least at these prices."""
+    limits = Limits(problem)
+    decomposition = Decomposition(problem, limits, prices)
+    return decomposition.worth(decomposition.start)

@@ -86,29 +86,39 @@ class Decomposition:
         self.limits = limits
         self.stacks = stack_blocks(problem.objective, problem.blocks, limits)
         self._objective = problem.objective
-        self._start = np.array([*(prices.get(key, 0.0) for key in limits.keys), 0.0])
+        self.start = np.array([*(prices.get(key, 0.0) for key in limits.keys), 0.0])
         free = [stack.best(stack.every, np.zeros((len(stack.blocks), stack.servers + 1))) for stack in self.stacks]
         self._forced = [best.excess for best in free]
         self._forced_all = sum(int(excess.sum()) for excess in self._forced)
         self._best: Standing = Standing.of_best(self.stacks, limits, np.zeros(len(limits) + 1), free)
         self._bound = -np.inf
-        self._price = self._start
+        self._price = self.start
 
     def run(
         self, hint: Mapping[BlockKey, Choice] | None, *, good_gap: float, out_of_time: Callable[[], bool]
     ) -> Relaxed:
         """Improve plan and bound until they are within `good_gap`, or out of time."""
-        self._best.settle(self._start, out_of_time)
+        self._best.settle(self.start, out_of_time)
         if hint is not None:
-            self._offer(Standing.of_choices(self._objective, self.stacks, self.limits, hint), self._start, out_of_time)
+            self._offer(Standing.of_choices(self._objective, self.stacks, self.limits, hint), self.start, out_of_time)
         if len(self.limits):
             self._climb(good_gap, out_of_time)
         else:
-            self._bound, _ = self._dual(self._start)
+            self._bound, _ = self._dual(self.start)
         return Relaxed(self._best, self._bound, self._price, max(0, self._extra()), self._is_excess_proven())
 
+    def worth(self, price: Floats) -> dict[BlockKey, float]:
+        """What each block's best choice is worth at least at these prices of the limits."""
+        found: dict[BlockKey, float] = {}
+        for stack in self.stacks:
+            prices = price[stack.limit]
+            best = stack.best(stack.every, prices)
+            values = stack.bound(prices, best, np.zeros(len(stack.blocks)))
+            found.update(zip((block.key for block in stack.blocks), values.tolist(), strict=True))
+        return found
+
     def _climb(self, good_gap: float, out_of_time: Callable[[], bool]) -> None:
-        price, length, waited = self._start, 1.0, 0
+        price, length, waited = self.start, 1.0, 0
         for step in range(MAX_STEPS):
             value, best = self._dual(price)
             if value > self._bound:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 PROBABILITY_FLOOR = 1e-9
 """Probabilities and lifts below this count as this, so that their logarithms are finite: no posterior mean over less
 than a billion requests is smaller."""
+
+LEAST_POSITIVE = sys.float_info.min
+"""What a product of very many paths comes to at least, so that it has a logarithm."""
 
 
 def block_cost(objective: Objective, block: Block, choice: Choice) -> float:
@@ -47,11 +51,17 @@ def joint_miss(block: Block, choice: Choice) -> float:
     The product of their epsilons and of the lifts of all their pairs: exact for two paths. Beyond two it is a guess,
     so it never exceeds what one pair or one path of the set allows.
     """
+    paths = [(i, j) for i, j in enumerate(choice) if j is not None]
+    epsilon = {(i, j): max(block.epsilon[i][j] or 0.0, PROBABILITY_FLOOR) for i, j in paths}
+    total = math.prod(epsilon.values())
     if not block.lifts:
-        chosen = [row[server] for row, server in zip(block.epsilon, choice, strict=True) if server is not None]
-        return math.prod(max(epsilon or 0.0, PROBABILITY_FLOOR) for epsilon in chosen)
-    columns = np.array([[-1 if server is None else server for server in choice]])
-    return float(np.exp(_joint_costs(block, epsilon_matrix(block), columns)[0]))
+        return max(total, LEAST_POSITIVE)
+    cap = min(epsilon.values(), default=1.0)
+    for one, two in itertools.combinations(paths, 2):
+        lift = max(block.lifts.get((one, two), 1.0), PROBABILITY_FLOOR)
+        total *= lift
+        cap = min(cap, epsilon[one] * epsilon[two] * lift)
+    return max(min(total, cap), LEAST_POSITIVE)
 
 
 def epsilon_matrix(block: Block) -> NDArray[np.float64]:
@@ -86,13 +96,14 @@ def _joint_costs(block: Block, epsilon: NDArray[np.float64], choices: NDArray[np
     if not block.lifts:
         return total
     cap = singles.min(axis=1)
-    lifts: dict[tuple[int, int], NDArray[np.float64]] = {}
-    for ((i, j), (k, m)), lift in block.lifts.items():
-        table = lifts.setdefault((i, k), np.zeros((epsilon.shape[1] + 1, epsilon.shape[1] + 1)))
-        table[j, m] = math.log(max(lift, PROBABILITY_FLOOR))
-    for i, k in itertools.combinations(range(epsilon.shape[0]), 2):
-        # An interface without a server has index -1: the last row and column, which stay 0.
-        lift_log = lifts[i, k][choices[:, i], choices[:, k]] if (i, k) in lifts else 0.0
-        total = total + lift_log
-        cap = np.minimum(cap, singles[:, i] + singles[:, k] + lift_log)
+    named = np.array(list(block.lifts), dtype=np.intp)
+    logs = np.log(np.maximum(np.fromiter(block.lifts.values(), np.float64, len(named)), PROBABILITY_FLOOR))
+    interfaces, servers = epsilon.shape
+    # An interface without a server has index -1: the last row and column, which stay 0.
+    lifts = np.zeros((interfaces, servers + 1, interfaces, servers + 1))
+    lifts[named[:, 0, 0], named[:, 0, 1], named[:, 1, 0], named[:, 1, 1]] = logs
+    for i, k in itertools.combinations(range(interfaces), 2):
+        lift = lifts[i, choices[:, i], k, choices[:, k]]
+        total = total + lift
+        cap = np.minimum(cap, singles[:, i] + singles[:, k] + lift)
     return np.where(np.isinf(total), np.inf, np.minimum(total, cap))

@@ -81,6 +81,21 @@ def random_problem(
             return problem
 
 
+def fleet(rng: random.Random, robots: int, interfaces: int, servers: int, objective: Objective, room: float) -> Problem:
+    """Robots with good and bad carriers, servers near and far, of `room` times the capacity wanted."""
+    far = [0.3 + rng.random() for _ in range(servers)]
+    blocks = []
+    for robot in range(robots):
+        carriers = [10 ** rng.uniform(-3, -0.5) for _ in range(interfaces)]
+        epsilon: list[list[float | None]] = [
+            [min(0.99, carrier * distance * rng.uniform(0.3, 3)) for distance in far] for carrier in carriers
+        ]
+        blocks.append(block(epsilon, robot=f"robot-{robot}"))
+    capacity = max(1, int(robots * interfaces * room / servers))
+    limits = {FleetKey(NodeName(f"cloud-{j}"), PLAN): capacity for j in range(servers)}
+    return Problem(tuple(blocks), limits, objective)
+
+
 def random_lifts(rng: random.Random, epsilon: list[list[float | None]], share: float) -> dict[tuple[Path, Path], float]:
     """Lifts of a share of all pairs of paths: below 1, far above, or 0."""
     paths = [(i, j) for i, row in enumerate(epsilon) for j, value in enumerate(row) if value is not None]

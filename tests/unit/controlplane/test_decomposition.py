@@ -15,29 +15,13 @@ from controlplane.core.objectives import path_costs
 from controlplane.core.plan import price
 from controlplane.core.problem import Block, FleetKey, Objective, Problem, is_valid
 from controlplane.core.stacks import EnumeratedStack
-from protos.model import NodeName
-from tests.unit.controlplane.problems import PLAN, best_price, block, plain_cost, random_problem, valid_choices
+from tests.unit.controlplane.problems import PLAN, best_price, block, fleet, plain_cost, random_problem, valid_choices
 
 FLOW_UNIT = 1e-6
 
 
 def never() -> bool:
     return False
-
-
-def fleet(rng: random.Random, robots: int, interfaces: int, servers: int, objective: Objective, room: float) -> Problem:
-    """Robots with good and bad carriers, servers near and far, of `room` times the capacity wanted."""
-    far = [0.3 + rng.random() for _ in range(servers)]
-    blocks = []
-    for robot in range(robots):
-        carriers = [10 ** rng.uniform(-3, -0.5) for _ in range(interfaces)]
-        epsilon: list[list[float | None]] = [
-            [min(0.99, carrier * distance * rng.uniform(0.3, 3)) for distance in far] for carrier in carriers
-        ]
-        blocks.append(block(epsilon, robot=f"robot-{robot}"))
-    capacity = max(1, int(robots * interfaces * room / servers))
-    limits = {FleetKey(NodeName(f"cloud-{j}"), PLAN): capacity for j in range(servers)}
-    return Problem(tuple(blocks), limits, objective)
 
 
 @pytest.mark.parametrize("objective", Objective)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ from scipy.optimize import linear_sum_assignment
 
 from controlplane.core.plan import price
 from controlplane.core.problem import FleetKey, Objective, Problem, is_valid
-from controlplane.matcher import solve
+from controlplane.matcher import Matcher, solve
 from controlplane.solver import RESOLUTION
 from protos.model import NodeName
-from tests.unit.controlplane.problems import PLAN, best_price, block, choices_of, random_problem
+from tests.unit.controlplane.problems import PLAN, best_price, block, choices_of, fleet, random_problem
 
 AMPLE_S = 60.0
 
@@ -119,3 +120,57 @@ def test_out_of_time_there_is_still_a_valid_plan() -> None:
 def test_the_same_problem_gives_the_same_plan() -> None:
     problem = random_problem(random.Random(21))
     assert solve(problem, time_limit_s=AMPLE_S) == solve(problem, time_limit_s=AMPLE_S)
+
+
+def test_one_robot_that_changes_is_solved_alone_and_within_what_the_others_leave() -> None:
+    rng = random.Random(6)
+    problem = fleet(rng, 120, 2, 12, Objective.JOINT, 1.1)
+    matcher = Matcher()
+    before = matcher.solve(problem, time_limit_s=AMPLE_S)
+    for round_ in range(1, 21):
+        number = rng.randrange(len(problem.blocks))
+        problem = with_block(problem, number, fleet(rng, 1, 2, 12, Objective.JOINT, 1.0).blocks[0].epsilon)
+        plan = matcher.solve(problem, time_limit_s=AMPLE_S)
+        if matcher.incremental == round_:
+            moved = [key for key in plan.blocks if plan.blocks[key] != before.blocks[key]]
+            assert set(moved) <= {problem.blocks[number].key}
+        again = price(problem, choices_of(problem, {key: made.assignments for key, made in plan.blocks.items()}))
+        assert again.excess == 0
+        assert again.cost == pytest.approx(plan.cost)
+        best = solve(problem, time_limit_s=AMPLE_S)
+        assert plan.bound <= best.cost
+        assert plan.gap <= 0.01
+        before = plan
+    assert matcher.incremental >= 15
+
+
+def test_robots_that_leave_and_come_need_no_other_to_move() -> None:
+    problem = fleet(random.Random(7), 100, 2, 12, Objective.JOINT, 1.1)
+    matcher = Matcher()
+    matcher.solve(problem, time_limit_s=AMPLE_S)
+    fewer = replace(problem, blocks=problem.blocks[1:])
+    left = matcher.solve(fewer, time_limit_s=AMPLE_S)
+    assert left.blocks.keys() == {part.key for part in fewer.blocks}
+    back = matcher.solve(problem, time_limit_s=AMPLE_S)
+    assert back.blocks.keys() == {part.key for part in problem.blocks}
+    assert back.relaxed == 0
+    assert matcher.incremental == 2
+    assert matcher.solve(problem, time_limit_s=AMPLE_S) == back
+
+
+def test_what_all_share_changes_all() -> None:
+    problem = fleet(random.Random(8), 100, 2, 12, Objective.JOINT, 1.1)
+    matcher = Matcher()
+    matcher.solve(problem, time_limit_s=AMPLE_S)
+    key, limit = next(iter(problem.fleet_capacity.items()))
+    smaller = replace(problem, fleet_capacity={**problem.fleet_capacity, key: limit - 5})
+    assert matcher.solve(smaller, time_limit_s=AMPLE_S).relaxed == 0
+    many = replace(problem, blocks=tuple(replace(part, capacity=2) for part in problem.blocks))
+    assert matcher.solve(many, time_limit_s=AMPLE_S).relaxed == 0
+    assert matcher.incremental == 0
+
+
+def with_block(problem: Problem, number: int, epsilon: tuple[tuple[float | None, ...], ...]) -> Problem:
+    blocks = list(problem.blocks)
+    blocks[number] = replace(blocks[number], epsilon=epsilon)
+    return replace(problem, blocks=tuple(blocks))

@@ -1,0 +1,137 @@
+"""The plan of blocks that share servers: decomposition first, then what it leaves open.
+
+What the decomposition (`controlplane.core.decomposition`) leaves open between plan and bound is searched by CP-SAT, in
+a small group until the optimum is proven, in a large one only if the gap is wide.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from controlplane.core.decomposition import Decomposition, Relaxed
+from controlplane.core.limits import Limits
+from controlplane.core.plan import choice_of, relative_gap
+from controlplane.solver import RESOLUTION, Column, pick_columns
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from controlplane.core.plan import Plan
+    from controlplane.core.problem import BlockKey, Choice, FleetKey, Problem
+
+SMALL_BLOCKS = 64
+"""Groups of up to this many blocks are solved to the optimum, if the time allows."""
+
+GOOD_GAP = 0.002
+"""Larger groups are left alone once the plan costs at most this share more than the bound: below the resolution of
+any estimate."""
+
+MIN_GROUP_TIME_S = 0.01
+"""Time a group of blocks gets for the search even when those before it used up the limit."""
+
+MAX_COLUMNS = 30_000
+"""Choices of all blocks of a group that CP-SAT is given: a second's work to set up."""
+
+MIN_COLUMNS_BLOCK = 4
+MAX_COLUMNS_BLOCK = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What one group's blocks choose."""
+
+    choices: Mapping[BlockKey, Choice]
+    bound: float
+    """No plan that exceeds capacities by no more costs less."""
+    proven: bool
+    """Whether cost and bound are as close as wanted, and nothing can exceed less."""
+    prices: Mapping[FleetKey, float]
+    """Of the limits, to start from next time."""
+    worth: Mapping[BlockKey, float]
+    """What each block's best choice is worth at these prices: together, less the prices of the capacities, a bound
+    too."""
+
+
+class GroupSolver:
+    """Solves one group until `end`, on `time.monotonic`."""
+
+    def __init__(self, group: Problem, end: float) -> None:
+        self._group = group
+        self._end = end
+        self._is_small = len(group.blocks) <= SMALL_BLOCKS
+        self._good_gap = 0.0 if self._is_small else GOOD_GAP
+        self._limits = Limits(group)
+
+    def solve(self, hint: Plan | None, prices: Mapping[FleetKey, float]) -> Found:
+        """Start from the prices and the plan of before."""
+        decomposition = Decomposition(self._group, self._limits, prices)
+        relaxed = decomposition.run(
+            self._hinted(hint), good_gap=self._good_gap, out_of_time=lambda: time.monotonic() > self._end
+        )
+        proven = self._is_good(relaxed.standing.cost, relaxed.bound) and relaxed.excess_proven
+        choices, bound = relaxed.standing.choices(), relaxed.bound
+        if not proven and len(self._limits):
+            choices, bound, proven = self._search(relaxed)
+        found = dict(zip(self._limits.keys, relaxed.price.tolist(), strict=False))
+        return Found(choices, bound, proven, found, decomposition.worth(relaxed.price))
+
+    def _hinted(self, hint: Plan | None) -> dict[BlockKey, Choice] | None:
+        if hint is None:
+            return None
+        found: dict[BlockKey, Choice] = {}
+        for block in self._group.blocks:
+            choice = choice_of(block, hint.blocks.get(block.key))
+            if choice is None:
+                return None
+            found[block.key] = choice
+        return found
+
+    def _is_good(self, cost: float, bound: float) -> bool:
+        return cost - bound <= RESOLUTION * len(self._group.blocks) or relative_gap(cost, bound) <= self._good_gap
+
+    def _search(self, relaxed: Relaxed) -> tuple[dict[BlockKey, Choice], float, bool]:
+        """Let CP-SAT choose among the choices that the bound leaves a chance."""
+        standing, limits = relaxed.standing, self._limits
+        margin = math.inf if relaxed.extra else standing.cost - relaxed.bound
+        at_most = min(MAX_COLUMNS_BLOCK, max(MIN_COLUMNS_BLOCK, MAX_COLUMNS // len(self._group.blocks)))
+        columns: list[list[Column]] = []
+        picks = []
+        hint = []
+        complete = True
+        for stack, part in zip(standing.stacks, standing.parts, strict=True):
+            for row in stack.every:
+                price = relaxed.price[stack.limit[row]]
+                near = stack.near(int(row), price, margin, at_most)
+                complete = complete and near.complete
+                options = [
+                    Column(
+                        float(value - price[servers].sum()),
+                        int(excess),
+                        tuple(limit for limit in stack.limit[row, servers].tolist() if limit < len(limits)),
+                    )
+                    for value, excess, servers in zip(near.values, near.excess, near.picks, strict=True)
+                ]
+                servers = [tuple(option.tolist()) for option in near.picks]
+                now = tuple(part.picks[row].tolist())
+                if now not in servers:
+                    servers.append(now)
+                    used = stack.limit[row, part.picks[row]].tolist()
+                    under = tuple(limit for limit in used if limit < len(limits))
+                    options.append(Column(float(part.cost[row]), int(part.excess[row]), under))
+                hint.append(servers.index(now))
+                columns.append(options)
+                picks.append((stack, servers))
+        left_s = max(MIN_GROUP_TIME_S, self._end - time.monotonic())
+        found, proven = pick_columns(columns, limits.capacity.tolist(), hint, time_limit_s=left_s)
+        choices = {}
+        cost = 0.0
+        keys = [block.key for stack in standing.stacks for block in stack.blocks]
+        for key, number, options, (stack, servers) in zip(keys, found, columns, picks, strict=True):
+            choices[key] = stack.choice_of(servers[number])
+            cost += options[number].cost
+        if proven and complete:
+            return choices, cost, True
+        return choices, relaxed.bound, relaxed.excess_proven and self._is_good(cost, relaxed.bound)
