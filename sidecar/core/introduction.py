@@ -13,7 +13,8 @@ the nonce of every datagram (frame.py): one key for each path of a session, on w
 
 Every peer of the sender knows the token, so this proves little: the credential says who it is, by its signature, and
 the sealed datagrams that follow prove that it has the session's key. Until then nothing moves, nothing counts as
-received, and the answer is shorter than the question.
+received, and the answer is shorter than the question. Who repeats itself could not read the answer, since it does not
+know our session: while the path is down here as well, our own introductions, as rare as they are, go there too.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class PathTable:
     @property
     def next_number(self) -> int:
         """No path of this link used this packet number or a later one."""
-        return max((self._memory.next_number, *(path.recovery.next_number for path in self.paths.values())))
+        return max((self._memory.next_number, *(path.recovery.next_number for path in list(self.paths.values()))))
 
     def remember(self, *, hangs: bool) -> LinkMemory:
         """Return what the interface's next link must know; `hangs`: this one may yet seal a burst or two."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import heapq
 import random
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TYPE_CHECKING
 
+from protos.credential import Aead
 from protos.model import (
     ALL_CALLS,
     Candidate,
@@ -33,7 +34,7 @@ from sidecar.core.path_keys import DEFAULT_LIMITS
 from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.request_id import make_request_id
 from sidecar.core.rules import ServiceRule
-from tests.sessions import session_of, with_credential
+from tests.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -94,7 +95,8 @@ class Node:
         now = self.mesh.now
         self.session = SessionId(self.mesh.rng.getrandbits(64))
         self.incarnation = int(now * 1e6) + 1
-        self.own = session_of(self.name, self.role, self.session, self.incarnation)
+        aead = self.mesh.aeads.get(self.name, Aead.AES_256_GCM)
+        self.own = session_of(self.name, self.role, self.session, self.incarnation, aead)
         self.engine = Engine(EngineConfig(self.role, self.rules), self.own, now)
         self.links = {
             interface: Link(
@@ -133,7 +135,7 @@ class Node:
             self.offers,
             may_call=ALL_CALLS,
         )
-        return with_credential(peer)
+        return replace(peer, credential=self.own.credential.encode())
 
     def submit(self, payload: bytes, service: ServiceName = SERVICE) -> RequestId:
         self.sequence += 1
@@ -171,6 +173,8 @@ class Mesh:
         self.version = 0
         self.calls = 0
         self.key_limits = DEFAULT_LIMITS
+        self.aeads: dict[str, Aead] = {}
+        """What nodes prefer other than AES; set it before they start."""
         self.tap: Callable[[Address, Address, bytes], None] | None = None
         """Sees every datagram that leaves: from where, where to."""
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from protos.credential import Aead
 from protos.errors import DecodeError
 from protos.model import InterfaceId, PeerSet, Version
 from sidecar.core import frame
@@ -55,6 +56,21 @@ def test_keys_change_in_the_middle_of_messages_over_a_bad_network_and_nothing_is
     assert min(phases(robot) + phases(cloud)) > 5
     for node in (robot, cloud):
         assert dropped(node)["unauthentic"] == 0
+
+
+@pytest.mark.parametrize("slow", ["robot", "cloud-a"])
+def test_where_either_is_slow_at_aes_both_use_the_other_cipher(slow: str) -> None:
+    mesh = Mesh(1)
+    mesh.aeads[slow] = Aead.CHACHA20_POLY1305
+    robot, cloud = mesh.robot("wlan0"), mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(1.0)
+    robot.submit(bytes(50_000))
+    mesh.run(1.0)
+    assert_each_answered_once(robot, 1)
+    for node in (robot, cloud):
+        (keys,) = node.engine.peers.for_links()
+        assert keys.keys.aead is Aead.CHACHA20_POLY1305
 
 
 def test_the_keys_of_an_idle_path_change_by_age() -> None:

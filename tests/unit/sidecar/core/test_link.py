@@ -268,6 +268,21 @@ def test_a_credential_signed_anew_is_introduced_from_then_on() -> None:
     assert after == Introduction(1, renewed)
 
 
+def test_introductions_that_find_the_path_down_bring_few_of_ours_to_where_they_come_from() -> None:
+    """The peer may not know our session; but who knows its token must not make us flood others."""
+    bench = Bench()
+    bench.wait(10.0)
+    ours = 0
+    start = bench.now
+    for number in range(1000):
+        bench.now += 0.001
+        bench.receive_datagram(bench.introduction(number=number), ELSEWHERE)
+        for batch in bench.link.batches_to_send(bench.now):
+            if batch.address == ELSEWHERE:
+                ours += sum(isinstance(item, Introduction) for item in bench.frames(map(bytes, batch.cut())))
+    assert 1 <= ours <= (bench.now - start) / FIRST_PROBE_S + 1
+
+
 def test_an_introduction_that_comes_again_is_not_answered_once_something_newer_was_authentic() -> None:
     bench = up()
     again = bench.introduction(number=5)

@@ -25,8 +25,8 @@ LIMITS = KeyLimits(datagrams=10, seconds=5.0)
 SECRET, HEAD = bytes(32), 0xD2010000
 
 
-def ends(limits: KeyLimits = LIMITS) -> tuple[SealingKeys, OpeningKeys]:
-    return SealingKeys(Aead.AES_256_GCM, SECRET, HEAD, limits, 0.0), OpeningKeys(Aead.AES_256_GCM, SECRET, HEAD)
+def ends(limits: KeyLimits = LIMITS, aead: Aead = Aead.AES_256_GCM) -> tuple[SealingKeys, OpeningKeys]:
+    return SealingKeys(aead, SECRET, HEAD, limits, 0.0), OpeningKeys(aead, SECRET, HEAD)
 
 
 def sealed(keys: SealingKeys, number: int, now: float = 0.0) -> bytes:
@@ -75,8 +75,9 @@ def test_keys_change_by_age_and_by_volume_but_only_once_the_present_one_is_confi
     assert sealing.phase == 3, "ten were sealed"
 
 
-def test_the_receiver_follows_and_takes_what_comes_late_of_the_phase_before() -> None:
-    sealing, opening = ends()
+@pytest.mark.parametrize("aead", Aead)
+def test_the_receiver_follows_and_takes_what_comes_late_of_the_phase_before(aead: Aead) -> None:
+    sealing, opening = ends(aead=aead)
     late = sealed(sealing, 3)
     assert opens(opening, sealed(sealing, 4))
     for phase in range(1, 5):
