@@ -1,6 +1,7 @@
 """A cipher that only copies, for measuring what sealing costs. No program of ours imports it but benchmarks.
 
-It takes the place of the AEAD where that is made, in this process; no configuration leads here.
+It takes the place of the AEAD where that is made, in this process; no configuration leads here. It is itself a call
+into Python for each datagram at either end, 0.2 us each: by so much sealing looks cheaper than it is.
 """
 
 from __future__ import annotations
@@ -18,23 +19,21 @@ if TYPE_CHECKING:
     from protos.credential import Aead
     from sidecar.core.aead import Cipher
 
-_NO_TAG = bytes(aead.TAG_BYTES)
-
 
 class NullCipher:
-    """Copies, in place of encrypting and authenticating."""
+    """Copies, in place of encrypting and authenticating; the tag is whatever the buffer held."""
 
-    def encrypt_into(self, nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
+    @staticmethod
+    def encrypt_into(nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
         """As a Cipher's."""
-        view = memoryview(buf)
-        view[: -aead.TAG_BYTES] = data
-        view[-aead.TAG_BYTES :] = _NO_TAG
-        return len(view)
+        buf[: -aead.TAG_BYTES] = data  # type: ignore[index]  # a bytearray or memoryview
+        return 0
 
-    def decrypt_into(self, nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
+    @staticmethod
+    def decrypt_into(nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
         """As a Cipher's, but of whatever comes."""
-        memoryview(buf)[:] = memoryview(data)[: -aead.TAG_BYTES]
-        return len(buf)
+        buf[:] = data[: -aead.TAG_BYTES]  # type: ignore[index]  # a bytearray or memoryview
+        return 0
 
 
 def install() -> None:

@@ -3,9 +3,6 @@
 Plain non-blocking sockets on the loop's reader callbacks instead of a DatagramProtocol, for two reasons: a
 wake-up drains a batch of requests, and a host with several addresses answers from the address that was asked
 (IP_PKTINFO), without which NATs and clients refuse the answer.
-
-There is no rate limit per source yet; a response is barely longer than its request, so the server is of no
-use as an amplifier.
 """
 
 from __future__ import annotations
@@ -15,14 +12,14 @@ import errno
 import logging
 import socket
 import struct
-from collections import Counter
 from ipaddress import IPv6Address
 from typing import TYPE_CHECKING, Any
 
-from controlplane.core.stun_responder import StunOutcome, respond
+from controlplane.core.stun_responder import StunOutcome, StunResponder
 from protos.stun import MAX_MESSAGE_BYTES
 
 if TYPE_CHECKING:
+    from collections import Counter
     from collections.abc import Sequence
 
     from protos.model import Address
@@ -50,15 +47,19 @@ class StunServer:
     """A running server; `outcomes` counts what came in, `send_failures` answers that the kernel refused."""
 
     def __init__(self, sockets: Sequence[socket.socket], software: str | None) -> None:
-        self.outcomes: Counter[StunOutcome] = Counter()
         self.send_failures = 0
         self.receive_failures = 0
-        self._software = software
         self._loop = asyncio.get_running_loop()
+        self._responder = StunResponder(self._loop.time(), software=software)
         self._sockets = list(sockets)
         self.addresses: tuple[Address, ...] = tuple(sock.getsockname()[:2] for sock in self._sockets)
         for sock in self._sockets:
             self._loop.add_reader(sock, self._drain, sock)
+
+    @property
+    def outcomes(self) -> Counter[StunOutcome]:
+        """Datagrams by what came of them."""
+        return self._responder.outcomes
 
     def close(self) -> None:
         """Stop answering and free the ports; may be called twice."""
@@ -68,6 +69,7 @@ class StunServer:
             sock.close()
 
     def _drain(self, sock: socket.socket) -> None:
+        now = self._loop.time()
         for _ in range(BATCH_DATAGRAMS):
             try:
                 # One byte more than a message may have: what is cut off must not look whole.
@@ -77,7 +79,7 @@ class StunServer:
             except OSError:
                 self.receive_failures += 1
                 return
-            response = respond(data, _address(peer), self.outcomes, software=self._software)
+            response = self._responder.respond(data, _address(peer), now)
             if response is None:
                 continue
             try:

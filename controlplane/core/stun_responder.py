@@ -1,20 +1,21 @@
-"""Answers STUN Binding requests (RFC 8489 section 6.3.1). Sans-IO and without state.
+"""Answers STUN Binding requests (RFC 8489 section 6.3.1). Sans-IO.
 
-Anyone may ask from a forged source address, so an answer is never worth forging for: a success is 12 bytes
-(IPv4) or 24 bytes (IPv6) longer than its request, plus SOFTWARE where set; a refusal at most 32 bytes.
+Anyone may ask from a forged source address, so an answer is never worth forging for: a success is at most 12 bytes
+(IPv4) or 24 bytes (IPv6) longer than its request, plus SOFTWARE where set; a refusal at most 32 bytes. And no source
+is answered more often than `source_limits.py` allows.
 """
 
 from __future__ import annotations
 
 import enum
+from collections import Counter
 from typing import TYPE_CHECKING
 
+from controlplane.core.source_limits import SourceLimits
 from protos.errors import DecodeError
 from protos.stun import MessageClass, StunMessage, decode, encode, is_stun
 
 if TYPE_CHECKING:
-    from collections import Counter
-
     from protos.model import Address
 
 UNKNOWN_ATTRIBUTE_CODE = 420
@@ -30,22 +31,34 @@ class StunOutcome(enum.StrEnum):
     MALFORMED = "malformed"
     NOT_A_REQUEST = "not_a_request"
     BAD_SOURCE = "bad_source"
+    TOO_OFTEN = "too_often"
 
 
-def respond(
-    data: bytes | memoryview, source: Address, outcomes: Counter[StunOutcome], *, software: str | None = None
-) -> bytes | None:
-    """The response to send back to `source`, or None; counts into `outcomes` which it was and why."""
-    outcome, response = _respond(data, source, software)
-    outcomes[outcome] += 1
-    return response
+class StunResponder:
+    """Answers datagrams; `outcomes` counts what came of them."""
+
+    def __init__(self, now: float, *, software: str | None = None) -> None:
+        self.outcomes: Counter[StunOutcome] = Counter()
+        self._limits = SourceLimits(now)
+        self._software = software
+
+    def respond(self, data: bytes | memoryview, source: Address, now: float) -> bytes | None:
+        """The response to send back to `source`, or None."""
+        outcome, response = self._respond(data, source, now)
+        self.outcomes[outcome] += 1
+        return response
+
+    def _respond(self, data: bytes | memoryview, source: Address, now: float) -> tuple[StunOutcome, bytes | None]:
+        if not is_stun(data):
+            return StunOutcome.NOT_STUN, None
+        if source[1] == 0:
+            return StunOutcome.BAD_SOURCE, None
+        if not self._limits.allows(source, now):
+            return StunOutcome.TOO_OFTEN, None
+        return _answer(data, source, self._software)
 
 
-def _respond(data: bytes | memoryview, source: Address, software: str | None) -> tuple[StunOutcome, bytes | None]:
-    if not is_stun(data):
-        return StunOutcome.NOT_STUN, None
-    if source[1] == 0:
-        return StunOutcome.BAD_SOURCE, None
+def _answer(data: bytes | memoryview, source: Address, software: str | None) -> tuple[StunOutcome, bytes | None]:
     try:
         request = decode(data)
     except DecodeError:

@@ -22,3 +22,7 @@ class TokenBucket:
             return False
         self._tokens -= cost
         return True
+
+    def is_full(self, now: float) -> bool:
+        """Whether it is as good as a new one."""
+        return self._tokens + self._rate * max(0.0, now - self._at) >= self._burst

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import random
 import struct
-from collections import Counter
 from ipaddress import IPv4Address, IPv6Address
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.stun_responder import StunOutcome, respond
+from controlplane.core.stun_responder import StunOutcome, StunResponder
 from protos.errors import DecodeError
 from protos.stun import (
     HEADER_BYTES,
@@ -89,8 +88,9 @@ def test_a_cut_message_is_refused(message: StunMessage, data: st.DataObject) -> 
 
 @given(datagrams, addresses)
 def test_the_responder_stands_and_never_amplifies(data: bytes, source: tuple[str, int]) -> None:
-    outcomes: Counter[StunOutcome] = Counter()
-    response = respond(data, source, outcomes)
+    responder = StunResponder(0.0)
+    response = responder.respond(data, source, 0.0)
+    outcomes = responder.outcomes
     assert outcomes.total() == 1
     answered = outcomes[StunOutcome.ANSWERED] + outcomes[StunOutcome.REFUSED]
     assert (response is not None) == bool(answered)

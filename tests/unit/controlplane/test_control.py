@@ -438,3 +438,34 @@ def test_status_shows_everything_but_the_secret(world: World) -> None:
     assert shown.services == robot.services
     assert {(report.interface, report.server) for report in shown.paths} == {("wlan0", "a"), ("wwan0", "a")}
     assert a.mapping.state is SyncState.NOT_SENT
+
+
+def test_a_revoked_server_goes_at_once_and_its_peers_are_told_why(world: World) -> None:
+    a, b = world.cloud("a"), world.cloud("b")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    world.all_up(robot, ("a", "b"))
+    world.run(SETTLED_S)
+    assert set(robot.pairs().values()) == {"a", "b"}
+    world.core.revoke(NodeName("b"), world.now)
+    world.dispatch()
+    assert b.closed == [CloseReason.REVOKED]
+    assert robot.peer_names == {"a"}
+    assert robot.removed == {"b": RemovalReason.REVOKED}
+    assert "b" not in robot.pairs().values()
+    assert a.closed == []
+    world.run(SETTLED_S)
+    assert set(robot.pairs().values()) == {"a"}
+    assert world.core.registry.counters.revoked == 1
+    # Nobody there: nothing to do.
+    world.core.revoke(NodeName("b"), world.now)
+    assert world.core.registry.counters.revoked == 1
+
+
+def test_a_stream_that_is_ended_leaves_its_sidecar_registered(world: World) -> None:
+    a, robot = world.cloud("a"), world.robot()
+    world.run(SETTLED_S)
+    world.core.end_stream(NodeName("a"), CloseReason.CERTIFICATE_ENDED)
+    world.run(0.5)
+    assert a.closed == [CloseReason.CERTIFICATE_ENDED]
+    assert robot.peer_names == {"a"}

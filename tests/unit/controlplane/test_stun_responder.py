@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from controlplane.core.stun_responder import StunOutcome, respond
+from controlplane.core.source_limits import ANSWERS_BURST, ANSWERS_PER_S
+from controlplane.core.stun_responder import StunOutcome, StunResponder
 from protos.stun import MessageClass, StunMessage, decode, encode
 
 TRANSACTION_ID = bytes(range(12))
 SOURCE = ("198.51.100.7", 40000)
+NOW = 100.0
 
 
 def request(message_class: MessageClass = MessageClass.REQUEST, *, fingerprint: bool = False) -> bytes:
@@ -26,8 +28,8 @@ def with_attribute(attribute: bytes) -> bytes:
 @pytest.mark.parametrize("source", [SOURCE, ("2001:db8::7", 40000)])
 @pytest.mark.parametrize("fingerprint", [False, True])
 def test_a_binding_request_is_answered_with_its_source(source: tuple[str, int], fingerprint: bool) -> None:
-    outcomes: Counter[StunOutcome] = Counter()
-    response = respond(request(fingerprint=fingerprint), source, outcomes, software="plr")
+    responder = StunResponder(NOW, software="plr")
+    response = responder.respond(request(fingerprint=fingerprint), source, NOW)
     assert response is not None
     assert decode(response) == StunMessage(
         MessageClass.SUCCESS,
@@ -36,34 +38,34 @@ def test_a_binding_request_is_answered_with_its_source(source: tuple[str, int], 
         software="plr",
         fingerprint=fingerprint,
     )
-    assert outcomes == {StunOutcome.ANSWERED: 1}
+    assert responder.outcomes == {StunOutcome.ANSWERED: 1}
 
 
 @pytest.mark.parametrize(("source", "growth"), [(SOURCE, 12), (("2001:db8::7", 40000), 24)])
 def test_an_answer_is_longer_than_its_request_by_the_address_only(source: tuple[str, int], growth: int) -> None:
     for fingerprint in (False, True):
         asked = request(fingerprint=fingerprint)
-        response = respond(asked, source, Counter())
+        response = StunResponder(NOW).respond(asked, source, NOW)
         assert response is not None
         assert len(response) - len(asked) == growth
 
 
 def test_an_extension_not_spoken_is_refused_by_name() -> None:
-    outcomes: Counter[StunOutcome] = Counter()
+    responder = StunResponder(NOW)
     change_request = bytes.fromhex("00030004 00000006")
-    response = respond(with_attribute(change_request), SOURCE, outcomes)
+    response = responder.respond(with_attribute(change_request), SOURCE, NOW)
     assert response is not None
     refusal = decode(response)
     assert (refusal.message_class, refusal.error_code) == (MessageClass.ERROR, 420)
     assert refusal.unknown_attributes == (3,)
     assert refusal.transaction_id == TRANSACTION_ID
-    assert outcomes == {StunOutcome.REFUSED: 1}
+    assert responder.outcomes == {StunOutcome.REFUSED: 1}
 
 
 def test_an_optional_extension_is_passed_over() -> None:
-    outcomes: Counter[StunOutcome] = Counter()
-    assert respond(with_attribute(bytes.fromhex("80290008 0102030405060708")), SOURCE, outcomes) is not None
-    assert outcomes == {StunOutcome.ANSWERED: 1}
+    responder = StunResponder(NOW)
+    assert responder.respond(with_attribute(bytes.fromhex("80290008 0102030405060708")), SOURCE, NOW) is not None
+    assert responder.outcomes == {StunOutcome.ANSWERED: 1}
 
 
 @pytest.mark.parametrize(
@@ -82,6 +84,35 @@ def test_an_optional_extension_is_passed_over() -> None:
     ],
 )
 def test_anything_else_gets_silence_and_a_count(data: bytes, source: tuple[str, int], outcome: StunOutcome) -> None:
-    outcomes: Counter[StunOutcome] = Counter()
-    assert respond(data, source, outcomes) is None
-    assert outcomes == {outcome: 1}
+    responder = StunResponder(NOW)
+    assert responder.respond(data, source, NOW) is None
+    assert responder.outcomes == {outcome: 1}
+
+
+@given(st.lists(st.tuples(st.integers(0, 0xFFFF), st.binary(max_size=20)), max_size=8), st.booleans())
+def test_no_answer_is_longer_than_its_request_by_more_than_it_must(
+    attributes: list[tuple[int, bytes]], ipv6: bool
+) -> None:
+    body = b"".join(
+        kind.to_bytes(2, "big") + len(value).to_bytes(2, "big") + value + bytes(-len(value) % 4)
+        for kind, value in attributes
+    )
+    asked = with_attribute(body)
+    response = StunResponder(NOW).respond(asked, ("2001:db8::7", 40000) if ipv6 else SOURCE, NOW)
+    assert response is None or len(response) <= len(asked) + 32
+
+
+def test_a_source_that_asks_too_often_gets_silence_until_it_waits() -> None:
+    responder = StunResponder(NOW)
+    answers = [responder.respond(request(), SOURCE, NOW) for _ in range(int(ANSWERS_BURST) + 10)]
+    assert sum(answer is not None for answer in answers) == ANSWERS_BURST
+    assert responder.outcomes == {StunOutcome.ANSWERED: ANSWERS_BURST, StunOutcome.TOO_OFTEN: 10}
+    assert responder.respond(request(), ("198.51.100.8", 40000), NOW) is not None
+    assert responder.respond(request(), SOURCE, NOW + 1.1 / ANSWERS_PER_S) is not None
+
+
+def test_what_would_not_be_answered_anyway_takes_nothing_from_a_source() -> None:
+    responder = StunResponder(NOW)
+    for _ in range(1000):
+        responder.respond(b"junk", SOURCE, NOW)
+    assert responder.respond(request(), SOURCE, NOW) is not None
