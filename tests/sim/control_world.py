@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 SOLVER_LIMIT_S = 60.0
 
+SETTLED_S = 2.0
+"""Long enough for everything debounced to happen."""
+
 NOTHING = Version(0)
 
 

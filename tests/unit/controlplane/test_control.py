@@ -2,40 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
+from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.control_events import CloseReason, Settings
-from controlplane.core.registry import Refusal
-from protos.errors import DecodeError
-from protos.model import (
-    Ack,
-    CandidateSet,
-    Heartbeat,
-    NodeName,
-    OutcomeReport,
-    PeerSet,
-    RemovalReason,
-    Report,
-    ResourceKind,
-    Role,
-    ServiceSet,
-    SyncState,
-    Version,
-)
-from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
+from protos.model import Heartbeat, NodeName, OutcomeReport, Report, ServiceSet, SyncState, Version
+from tests.sim.control_world import SETTLED_S
+from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, use
+
+if TYPE_CHECKING:
+    from tests.sim.control_world import World
 
 ROBOT = NodeName("robot")
-
-SETTLED_S = 2.0
-"""Long enough for everything debounced to happen."""
-
-
-@pytest.fixture
-def world() -> World:
-    return World()
 
 
 def test_robots_see_clouds_and_clouds_see_robots(world: World) -> None:
@@ -149,137 +127,6 @@ def test_without_a_server_the_mapping_is_empty_and_says_why(world: World) -> Non
     assert robot.services[0].predicted_miss == 1.0
 
 
-def test_a_silent_cloud_disappears_with_its_lease(world: World) -> None:
-    a, b = world.cloud("a"), world.cloud("b")
-    robot = world.robot()
-    world.run(SETTLED_S)
-    a.silent = True
-    world.run(world.settings.lease_s + SETTLED_S)
-    assert a.closed == [CloseReason.LEASE_EXPIRED]
-    assert world.departed == ["a"]
-    assert robot.peer_names == {"b"}
-    assert robot.removed == {"a": RemovalReason.LEASE_EXPIRED}
-    assert set(robot.pairs().values()) == {"b"}
-    assert b.peer_names == {"robot"}
-
-
-def test_a_cloud_that_says_goodbye_is_given_no_new_requests_and_then_has_left(world: World) -> None:
-    a = world.cloud("a")
-    world.cloud("b")
-    robot = world.robot()
-    world.run(SETTLED_S)
-    world.leave(a)
-    world.run(0.2)
-    assert robot.peer_names == {"b"}
-    assert robot.removed == {"a": RemovalReason.LEFT}
-    assert set(robot.pairs().values()) == {"b"}
-
-
-def test_a_lost_stream_alone_changes_nothing_for_the_peers(world: World) -> None:
-    a = world.cloud("a")
-    robot = world.robot()
-    world.run(SETTLED_S)
-    sets = len(robot.peer_sets)
-    world.drop_stream(a)
-    world.run(world.settings.lease_s / 2)
-    world.join(dataclasses.replace(a.registration, peers_version=a.peers_version))
-    world.run(SETTLED_S)
-    assert len(robot.peer_sets) == sets
-    # It holds the set sent last: nothing is sent again.
-    assert len(a.peer_sets) == 1
-    assert world.core.status(world.now)[0].peers.state is SyncState.SYNCED
-
-
-def test_a_newer_incarnation_ends_the_older_stream(world: World) -> None:
-    a = world.cloud("a")
-    old_stream = a.stream
-    robot = world.robot()
-    world.run(SETTLED_S)
-    world.join(registration("a", Role.CLOUD, incarnation=2))
-    assert world.closings == [(old_stream, CloseReason.REPLACED)]
-    world.run(0.2)
-    assert [peer.incarnation for peer in robot.peers] == [2]
-    assert robot.removed == {}
-
-
-def test_messages_on_a_replaced_stream_are_ignored(world: World) -> None:
-    a = world.cloud("a")
-    old_stream = a.stream
-    world.join(registration("a", Role.CLOUD, incarnation=2))
-    assert old_stream is not None
-    world.core.receive(old_stream, CandidateSet(), world.now)
-    assert world.core.counters.old_stream_messages == 1
-    world.core.disconnected(old_stream, world.now)
-    assert world.core.registry.get(a.name) is not None
-
-
-def test_an_older_incarnation_is_refused(world: World) -> None:
-    world.join(registration("a", Role.CLOUD, incarnation=2))
-    result = world.core.register(registration("a", Role.CLOUD, incarnation=1), world.now)
-    assert result is Refusal.OLDER_INCARNATION
-
-
-def test_a_nack_is_shown_and_the_same_content_is_not_sent_again(world: World) -> None:
-    world.cloud("a")
-    robot = world.robot()
-    robot.refuse = lambda message: isinstance(message, PeerSet)
-    world.run(SETTLED_S)
-    sent = len(robot.peer_sets)
-    world.run(3 * SETTLED_S)
-    assert len(robot.peer_sets) == sent
-    (status,) = (found for found in world.core.status(world.now) if found.peer.name == "robot")
-    assert status.peers.state is SyncState.REJECTED
-    assert status.peers.error == "not with me"
-    assert status.peers.version_acked == 0
-    assert world.nacks[0].sidecar == "robot"
-    robot.refuse = lambda message: False
-    world.cloud("b")
-    world.run(SETTLED_S)
-    (status,) = (found for found in world.core.status(world.now) if found.peer.name == "robot")
-    assert status.peers.state is SyncState.SYNCED
-
-
-def test_stale_answers_are_counted_and_ignored(world: World) -> None:
-    world.cloud("a")
-    robot = world.robot()
-    robot.silent = True
-    world.run(0.2)
-    first = robot.peer_sets[-1]
-    world.cloud("b")
-    world.run(0.2)
-    assert robot.peer_sets[-1].nonce > first.nonce
-    world.say(robot, Ack(ResourceKind.PEERS, first.version, first.nonce))
-    (status,) = (found for found in world.core.status(world.now) if found.peer.name == "robot")
-    assert status.peers.state is SyncState.STALE
-    assert world.core.counters.stale_answers == 1
-
-
-def test_notices_cover_all_that_a_slow_sidecar_may_know(world: World) -> None:
-    a, b, robot = world.cloud("a"), world.cloud("b"), world.robot()
-    robot.silent = True
-    world.run(0.2, heartbeats=False)
-    assert robot.peer_names == {"a", "b"}
-    world.leave(a)
-    world.run(0.2, heartbeats=False)
-    assert robot.removed == {"a": RemovalReason.LEFT}
-    # Nothing was acknowledged yet: the next set may be the first one that it applies.
-    world.leave(b)
-    world.run(0.2, heartbeats=False)
-    assert robot.removed == {"a": RemovalReason.LEFT, "b": RemovalReason.LEFT}
-    last = robot.peer_sets[-1]
-    world.say(robot, Ack(ResourceKind.PEERS, last.version, last.nonce))
-    world.cloud("c")
-    world.run(0.2, heartbeats=False)
-    assert robot.peer_names == {"c"}
-    assert robot.removed == {}
-
-
-def test_a_second_registration_on_a_stream_is_an_error(world: World) -> None:
-    robot = world.robot()
-    with pytest.raises(DecodeError, match="second registration"):
-        world.say(robot, registration("robot"))
-
-
 def test_reports_of_clouds_are_ignored(world: World) -> None:
     a = world.cloud("a")
     world.say(a, Report(outcomes=(OutcomeReport(PLAN, ok=5),)))
@@ -333,94 +180,6 @@ def test_a_service_no_longer_used_leaves_the_mapping(world: World) -> None:
     world.say(robot, ServiceSet((), (use("/other"),)))
     world.run(SETTLED_S)
     assert [mapping.service for mapping in robot.services] == ["/other"]
-
-
-def test_a_sidecar_is_shown_only_when_it_told_where_it_is(world: World) -> None:
-    robot = world.robot()
-    cloud = world.join(registration("a", Role.CLOUD))
-    world.run(0.2)
-    assert robot.peer_names == set()
-    world.say(cloud, CandidateSet(interfaces("eth0")))
-    world.say(cloud, ServiceSet((offer(),)))
-    world.run(0.2)
-    assert robot.peer_names == {"a"}
-    assert len(robot.peer_sets[-1].peers[0].candidates) == 1
-
-
-# ── restart of the control plane ──
-
-WARM_UP_S = 12.0
-
-
-def restarted(epoch: int = 5000) -> World:
-    return World(Settings(warm_up_s=WARM_UP_S), epoch=epoch)
-
-
-def come_back(world: World, held: int = 4711) -> SimSidecar:
-    robot = world.join(registration("robot", Role.ROBOT, held=held))
-    world.say(robot, CandidateSet(interfaces("wlan0", "wwan0")))
-    world.say(robot, ServiceSet((), (use(),)))
-    return robot
-
-
-def test_after_a_restart_a_robot_keeps_its_peers_until_those_are_back() -> None:
-    world = restarted()
-    robot = come_back(world)
-    world.all_up(robot, ("a", "b"))
-    world.run(1.0)
-    world.cloud("a")
-    world.run(3.0)
-    assert robot.peer_sets == []
-    assert robot.mapping_sets == []
-    world.cloud("b")
-    world.all_up(robot, ("a", "b"))
-    world.run(0.2)
-    assert robot.peer_names == {"a", "b"}
-    assert sorted(robot.pairs().values()) == ["a", "b"]
-
-
-def test_after_the_warm_up_a_robot_is_told_who_did_not_come_back() -> None:
-    world = restarted()
-    robot = come_back(world)
-    world.cloud("a")
-    world.all_up(robot, ("a", "b"))
-    world.run(WARM_UP_S - 1.0)
-    assert robot.peer_sets == []
-    world.run(1.5)
-    assert robot.peer_names == {"a"}
-
-
-def test_a_robot_that_holds_nothing_is_served_during_the_warm_up() -> None:
-    world = restarted()
-    world.cloud("a")
-    robot = world.robot()
-    world.run(0.2)
-    assert robot.peer_names == {"a"}
-
-
-def test_versions_grow_over_a_restart_even_if_the_clock_went_back() -> None:
-    world = restarted(epoch=10)
-    robot = come_back(world, held=4711)
-    world.cloud("a")
-    world.all_up(robot, ("a",))
-    world.run(1.0)
-    assert robot.peer_sets[0].version > 4711
-    assert robot.mapping_sets[0].version > 4711
-
-
-def test_an_expired_robot_that_returns_is_told_who_went_meanwhile() -> None:
-    world = World()
-    a, b = world.cloud("a"), world.cloud("b")
-    robot = world.robot()
-    world.run(SETTLED_S)
-    world.drop_stream(robot)
-    world.run(world.settings.lease_s + 1.0)
-    assert a.peer_names == set()
-    world.leave(b)
-    world.join(dataclasses.replace(robot.registration, peers_version=robot.peers_version))
-    world.run(0.2)
-    assert robot.peer_names == {"a"}
-    assert robot.removed == {"b": RemovalReason.LEFT}
 
 
 def test_status_shows_everything_but_the_secret(world: World) -> None:

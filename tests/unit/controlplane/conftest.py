@@ -1,0 +1,12 @@
+"""What several files here begin with."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.sim.control_world import World
+
+
+@pytest.fixture
+def world() -> World:
+    return World()

@@ -1,0 +1,120 @@
+"""Who is there: streams that come, go and are replaced, leases, and names."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from controlplane.core.control_events import CloseReason
+from controlplane.core.registry import Refusal
+from protos.errors import DecodeError
+from protos.model import CandidateSet, RemovalReason, Role, ServiceSet, SyncState
+from tests.sim.control_world import SETTLED_S, World
+from tests.unit.controlplane.samples import interfaces, offer, registration
+
+
+def test_a_silent_cloud_disappears_with_its_lease(world: World) -> None:
+    a, b = world.cloud("a"), world.cloud("b")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    a.silent = True
+    world.run(world.settings.lease_s + SETTLED_S)
+    assert a.closed == [CloseReason.LEASE_EXPIRED]
+    assert world.departed == ["a"]
+    assert robot.peer_names == {"b"}
+    assert robot.removed == {"a": RemovalReason.LEASE_EXPIRED}
+    assert set(robot.pairs().values()) == {"b"}
+    assert b.peer_names == {"robot"}
+
+
+def test_a_cloud_that_says_goodbye_is_given_no_new_requests_and_then_has_left(world: World) -> None:
+    a = world.cloud("a")
+    world.cloud("b")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    world.leave(a)
+    world.run(0.2)
+    assert robot.peer_names == {"b"}
+    assert robot.removed == {"a": RemovalReason.LEFT}
+    assert set(robot.pairs().values()) == {"b"}
+
+
+def test_a_lost_stream_alone_changes_nothing_for_the_peers(world: World) -> None:
+    a = world.cloud("a")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    sets = len(robot.peer_sets)
+    world.drop_stream(a)
+    world.run(world.settings.lease_s / 2)
+    world.join(dataclasses.replace(a.registration, peers_version=a.peers_version))
+    world.run(SETTLED_S)
+    assert len(robot.peer_sets) == sets
+    # It holds the set sent last: nothing is sent again.
+    assert len(a.peer_sets) == 1
+    assert world.core.status(world.now)[0].peers.state is SyncState.SYNCED
+
+
+def test_a_newer_incarnation_ends_the_older_stream(world: World) -> None:
+    a = world.cloud("a")
+    old_stream = a.stream
+    robot = world.robot()
+    world.run(SETTLED_S)
+    world.join(registration("a", Role.CLOUD, incarnation=2))
+    assert world.closings == [(old_stream, CloseReason.REPLACED)]
+    world.run(0.2)
+    assert [peer.incarnation for peer in robot.peers] == [2]
+    assert robot.removed == {}
+
+
+def test_messages_on_a_replaced_stream_are_ignored(world: World) -> None:
+    a = world.cloud("a")
+    old_stream = a.stream
+    world.join(registration("a", Role.CLOUD, incarnation=2))
+    assert old_stream is not None
+    world.core.receive(old_stream, CandidateSet(), world.now)
+    assert world.core.counters.old_stream_messages == 1
+    world.core.disconnected(old_stream, world.now)
+    assert world.core.registry.get(a.name) is not None
+
+
+def test_an_older_incarnation_is_refused(world: World) -> None:
+    world.join(registration("a", Role.CLOUD, incarnation=2))
+    result = world.core.register(registration("a", Role.CLOUD, incarnation=1), world.now)
+    assert result is Refusal.OLDER_INCARNATION
+
+
+def test_a_second_registration_on_a_stream_is_an_error(world: World) -> None:
+    robot = world.robot()
+    with pytest.raises(DecodeError, match="second registration"):
+        world.say(robot, registration("robot"))
+
+
+def test_a_sidecar_is_shown_only_when_it_told_where_it_is(world: World) -> None:
+    robot = world.robot()
+    cloud = world.join(registration("a", Role.CLOUD))
+    world.run(0.2)
+    assert robot.peer_names == set()
+    world.say(cloud, CandidateSet(interfaces("eth0")))
+    world.say(cloud, ServiceSet((offer(),)))
+    world.run(0.2)
+    assert robot.peer_names == {"a"}
+    assert len(robot.peer_sets[-1].peers[0].candidates) == 1
+
+
+# ── restart of the control plane ──
+
+
+def test_an_expired_robot_that_returns_is_told_who_went_meanwhile() -> None:
+    world = World()
+    a, b = world.cloud("a"), world.cloud("b")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    world.drop_stream(robot)
+    world.run(world.settings.lease_s + 1.0)
+    assert a.peer_names == set()
+    world.leave(b)
+    world.join(dataclasses.replace(robot.registration, peers_version=robot.peers_version))
+    world.run(0.2)
+    assert robot.peer_names == {"a"}
+    assert robot.removed == {"b": RemovalReason.LEFT}
