@@ -8,6 +8,7 @@ import ssl
 import time
 from typing import TYPE_CHECKING, NoReturn
 
+from protos.convert.fields import MAX_CRL_BYTES
 from protos.errors import ConfigError
 from protos.identity import IdentityRole
 from protos.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
@@ -41,6 +42,7 @@ class CertificateKeeper:
         self._loop = loop
         self._metrics = metrics
         metrics.own_certificate(files.identity)
+        self._relay_revocations(files)
 
     async def run(self) -> NoReturn:
         """Run until cancelled."""
@@ -59,6 +61,7 @@ class CertificateKeeper:
             return
         # The streams first: who is revoked shall hear so from gRPC before the connection is cut.
         self._loop.review(files.trust, time.time())
+        self._relay_revocations(files)
         try:
             self._gate.use(files)
         except ssl.SSLError as error:
@@ -66,3 +69,10 @@ class CertificateKeeper:
             return
         self._metrics.own_certificate(files.identity)
         log.info("took new certificate files from %s", files.directory)
+
+    def _relay_revocations(self, files: TlsFiles) -> None:
+        crl = files.crl_pem or b""
+        if len(crl) > MAX_CRL_BYTES:
+            log.error("%s/crl.pem is longer than %d bytes: sidecars are not told of it", files.directory, MAX_CRL_BYTES)
+            return
+        self._loop.relay_revocations(crl)

@@ -183,6 +183,11 @@ class ControlLoop:
                 self._part_with(name, error)
         self._dispatch()
 
+    def relay_revocations(self, crl: bytes) -> None:
+        """Tell every sidecar, now and later, what is revoked (PEM)."""
+        self._core.relay_revocations(crl)
+        self._dispatch()
+
     def end_expired(self, trust: Trust, now_wall: float) -> None:
         """The same for those whose time is over, at next to no cost while there are none."""
         if any(caller.identity.not_after < now_wall for caller in self._callers.values()):

@@ -239,11 +239,15 @@ class Drain:
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """The control plane's answer to a registration; `stun_servers` are host:port strings."""
+    """The control plane's answer to a registration, sent again when any of it changes.
+
+    `stun_servers` are host:port strings, `crl` what the fleet's CAs have revoked (PEM, signed by them; may be empty).
+    """
 
     lease_s: float
     report_interval_s: float
     stun_servers: tuple[str, ...] = ()
+    crl: bytes = field(default=b"", repr=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ Both planes read their identity with it; no core does.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import stat
@@ -155,12 +156,13 @@ class TlsWatch:
 
     Call `poll` every `POLL_INTERVAL_S`. Files that do not fit together keep the old ones in force: while they are being
     replaced one by one that is nothing unusual, so it is logged only, and once, when they still do not fit at the next
-    look. A revocation list is replaced by a newer one only.
+    look. A revocation list is replaced by a newer one only. One that came another way counts beside the folder's.
     """
 
     def __init__(self, files: TlsFiles) -> None:
         self.current = files
         # Unknown, hence different from whatever is there: a change between loading and now is not missed.
+        self._relayed = b""
         self._seen: _Fingerprint | None = None
         self._broken: _Fingerprint | None = None
 
@@ -170,7 +172,7 @@ class TlsWatch:
         if fingerprint == self._seen:
             return None
         try:
-            files = load_tls_files(self.current.directory)
+            files = self._with_relayed(load_tls_files(self.current.directory))
             if files.trust.forgets(self.current.trust):
                 path = str(self.current.directory / CRL_FILE)
                 raise ConfigError(path, "", "missing or older than the one in use; copy the newest there")
@@ -184,6 +186,27 @@ class TlsWatch:
         changed = files != self.current
         self.current = files
         return files if changed else None
+
+    def take_revocations(self, crl_pem: bytes) -> bool:
+        """Believe this list too, which somebody relayed; whether it says anything new. It has to be of our CAs."""
+        before, trust = self._relayed, self.current.trust
+        self._relayed = crl_pem
+        files = self._with_relayed(self.current)
+        if not trust.forgets(files.trust) or files.trust.forgets(trust):
+            self._relayed = before
+            return False
+        self.current = files
+        return True
+
+    def _with_relayed(self, files: TlsFiles) -> TlsFiles:
+        if not self._relayed:
+            return files
+        try:
+            trust = Trust(files.ca_pem, (files.crl_pem or b"") + b"\n" + self._relayed)
+        except CertificateError as error:
+            _log.warning("a relayed revocation list is ignored: %s", error)
+            return files
+        return dataclasses.replace(files, trust=trust)
 
 
 _Fingerprint = tuple[tuple[int, int, int, int] | None, ...]

@@ -315,7 +315,8 @@ class ControlClient:
                 self._apply(apply)
 
     def _on_welcome(self, welcome: Welcome) -> None:
-        self._outage.over()
+        if not self._connected:
+            self._outage.over()
         try:
             self._hooks.welcome(welcome)
         except Exception:

@@ -104,6 +104,8 @@ class Sidecar:
         self._open_metrics()
         self._data_plane.start()
         last = self._store.last_good
+        if last.welcome is not None:
+            self._take_revocations(last.welcome)
         self._interfaces.set_stun_servers(self._stun_servers(last.welcome))
         self._interfaces.start()
         if last.peers is not None:
@@ -159,6 +161,11 @@ class Sidecar:
         else:
             log.info("started from the %s kept on disk", what.value)
 
+    def _take_revocations(self, welcome: Welcome) -> None:
+        if self._tls is not None and welcome.crl and self._tls.take_revocations(welcome.crl):
+            log.info("took a new revocation list of the control plane")
+            self._data_plane.trust_changed()
+
     def _stun_servers(self, welcome: Welcome | None) -> tuple[str, ...]:
         if welcome is not None and welcome.stun_servers:
             return welcome.stun_servers
@@ -175,7 +182,8 @@ class Sidecar:
     # -- ControlHooks, on the control client's thread -------------------------------------------------------------
 
     def welcome(self, welcome: Welcome) -> None:
-        """A stream is accepted."""
+        """A stream is accepted, or the control plane has another revocation list."""
+        self._take_revocations(welcome)
         self._store.remember(welcome)
         self._interfaces.set_stun_servers(self._stun_servers(welcome))
 

@@ -75,6 +75,7 @@ class ControlCore:
         self._publisher = Publisher(self.registry, version_epoch=version_epoch, warm_until=warm_until)
         self._streams: dict[StreamId, NodeName] = {}
         self._last_stream = 0
+        self._crl = b""
         self._refused_offers = RefusedOffers()
         self._publish_at: float | None = None
         self._events: deque[Event] = deque()
@@ -96,12 +97,7 @@ class ControlCore:
         if result.new_run:
             self.estimator.forget_paths(name)
         self._publisher.begin_stream(registration)
-        self._events.append(
-            Send(
-                stream,
-                Welcome(self._settings.lease_s, self._settings.report_interval_s, self._settings.stun_servers),
-            )
-        )
+        self._events.append(Send(stream, self._welcome()))
         self._members_changed(now)
         return stream
 
@@ -158,6 +154,19 @@ class ControlCore:
             self._events.append(NackNotice(name, nack))
         else:
             self.counters.stale_answers += 1
+
+    def _welcome(self) -> Welcome:
+        settings = self._settings
+        return Welcome(settings.lease_s, settings.report_interval_s, settings.stun_servers, self._crl)
+
+    def relay_revocations(self, crl: bytes) -> None:
+        """Pass this list (PEM) on to all: a sidecar may know peers that this run of ours has never heard of."""
+        if crl == self._crl:
+            return
+        self._crl = crl
+        for sidecar in self.registry:
+            if sidecar.stream is not None:
+                self._events.append(Send(sidecar.stream, self._welcome()))
 
     def refuse(self, refusal: Refusal) -> Refusal:
         """Count a registration that the driver does not let in; returns its reason."""

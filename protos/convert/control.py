@@ -7,6 +7,7 @@ from typing import assert_never
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from protos.convert.fields import (
+    MAX_CRL_BYTES,
     MAX_PEERS,
     MAX_REMOVED,
     MAX_STUN_SERVERS,
@@ -176,6 +177,7 @@ def control_message_to_proto(value: ControlMessage) -> control_pb2.ControlMessag
                 lease_us=microseconds(value.lease_s),
                 report_interval_us=microseconds(value.report_interval_s),
                 stun_servers=value.stun_servers,
+                crl=value.crl,
             )
             return control_pb2.ControlMessage(welcome=welcome)
         case PeerSet():
@@ -221,10 +223,13 @@ def _registration_to_proto(value: Registration) -> control_pb2.Register:
 def _welcome_from_proto(message: control_pb2.Welcome) -> Welcome:
     if len(message.stun_servers) > MAX_STUN_SERVERS:
         raise DecodeError(f"stun_servers has more than {MAX_STUN_SERVERS} elements")
+    if len(message.crl) > MAX_CRL_BYTES:
+        raise DecodeError(f"crl has more than {MAX_CRL_BYTES} bytes")
     return Welcome(
         lease_s=duration(message.lease_us, "lease_us"),
         report_interval_s=duration(message.report_interval_us, "report_interval_us"),
         stun_servers=tuple(text(server, "stun_servers") for server in message.stun_servers),
+        crl=message.crl,
     )
 
 

@@ -43,6 +43,9 @@ MAX_PATHS = 4096
 MAX_OUTCOMES = 1024
 """Outcome reports in one report: as many as a robot can carry services."""
 
+MAX_CRL_BYTES = 1 << 20
+"""Longest revocation list that is relayed: some 25,000 certificates."""
+
 MAX_STUN_SERVERS = 16
 """STUN servers in one welcome."""
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.ca import Authority, Validity
-from protos.identity import IdentityRole
+from protos.identity import CertificateError, IdentityRole
 from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, Welcome
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar import control_client
@@ -38,13 +38,14 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredControlPl
 class Robot:
     """A control client with the files of a folder; what happens waits in queues."""
 
-    def __init__(self, address: str, folder: Path | None) -> None:
-        self.said = registration("robot-1")
+    def __init__(self, address: str, folder: Path | None, name: str = "robot-1") -> None:
+        self.said = registration(name)
         self.session = ControlSession(self.said, random.Random(1))
         self.tls = TlsWatch(load_tls_files(folder)) if folder is not None else None
         if self.tls is not None:
             self.claim(self.tls.current)
         self.client = ControlClient(address, self.session, self, self.tls)
+        self.welcomes: queue.Queue[Welcome] = queue.Queue()
         self.peers: queue.Queue[PeerSet] = queue.Queue()
         self.connection: queue.Queue[tuple[bool, str]] = queue.Queue()
         self.files: queue.Queue[TlsFiles] = queue.Queue()
@@ -53,7 +54,7 @@ class Robot:
         self.session.set_credential(credential_of(self.said, files.certificate_der, files.private_key))
 
     def welcome(self, welcome: Welcome) -> None:
-        pass
+        self.welcomes.put(welcome)
 
     def apply_peers(self, peers: PeerSet) -> str | None:
         self.peers.put(peers)
@@ -97,7 +98,22 @@ def test_a_renewed_certificate_is_shown_on_a_new_stream(
             assert files.certificate_der == renewed.certificate_der
             assert robot.connection.get(timeout=PATIENCE_S) == (False, "new certificate files")
             assert robot.connection.get(timeout=PATIENCE_S) == (True, "registered")
-            assert robot.session.version(ResourceKind.PEERS) == first.version
+            assert robot.session.version(ResourceKind.PEERS) >= first.version
+
+
+def test_sidecars_are_told_what_is_revoked(plane: SecuredControlPlane, tmp_path: Path) -> None:
+    """Also of nodes that this run of the control plane has never heard of."""
+    plane.authority.write_tls_dir(tmp_path / "tls", "robot-5", IdentityRole.ROBOT)
+    thief = plane.member("thief", IdentityRole.CLOUD).issued
+    with Robot(plane.address, tmp_path / "tls", "robot-5") as robot:
+        assert robot.tls is not None
+        robot.tls.take_revocations(robot.welcomes.get(timeout=PATIENCE_S).crl)
+        assert robot.tls.current.trust.check(thief.certificate_der, time.time()).name == "thief"
+        plane.revoke("thief")
+        assert robot.tls.take_revocations(robot.welcomes.get(timeout=PATIENCE_S).crl)
+        with pytest.raises(CertificateError, match="the certificate of thief is revoked"):
+            robot.tls.current.trust.check(thief.certificate_der, time.time())
+        assert robot.client.stats.streams == 1
 
 
 def replace_files(folder: Path, key: bytes, certificate: bytes) -> None:

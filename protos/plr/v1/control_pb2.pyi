@@ -523,9 +523,14 @@ class Welcome(_message.Message):
     LEASE_US_FIELD_NUMBER: _builtins.int
     REPORT_INTERVAL_US_FIELD_NUMBER: _builtins.int
     STUN_SERVERS_FIELD_NUMBER: _builtins.int
+    CRL_FIELD_NUMBER: _builtins.int
     lease_us: _builtins.int
     """A sidecar that is silent for longer leaves its peers' view."""
     report_interval_us: _builtins.int
+    crl: _builtins.bytes
+    """What the fleet's CAs have revoked, PEM: signed by them, so that the sidecar need not believe the control plane.
+    With a newer list the Welcome is sent again.
+    """
     @_builtins.property
     def stun_servers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """host:port, to be tried over each interface."""
@@ -536,10 +541,11 @@ class Welcome(_message.Message):
         lease_us: _builtins.int = ...,
         report_interval_us: _builtins.int = ...,
         stun_servers: _abc.Iterable[_builtins.str] | None = ...,
+        crl: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["lease_us", b"lease_us", "report_interval_us", b"report_interval_us", "stun_servers", b"stun_servers"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["crl", b"crl", "lease_us", b"lease_us", "report_interval_us", b"report_interval_us", "stun_servers", b"stun_servers"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

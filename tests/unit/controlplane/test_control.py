@@ -228,3 +228,14 @@ def test_a_stream_that_is_ended_leaves_its_sidecar_registered(world: World) -> N
     world.run(0.5)
     assert a.closed == [CloseReason.CERTIFICATE_ENDED]
     assert robot.peer_names == {"a"}
+
+
+def test_the_revocation_list_goes_to_all_at_once_and_to_who_comes_later(world: World) -> None:
+    robot = world.robot()
+    world.run(SETTLED_S)
+    assert [welcome.crl for welcome in robot.welcomes] == [b""]
+    for crl in (b"first", b"first", b"second"):
+        world.core.relay_revocations(crl)
+        world.dispatch()
+    assert [welcome.crl for welcome in robot.welcomes] == [b"", b"first", b"second"]
+    assert world.cloud("a").welcomes[0].crl == b"second"

@@ -176,7 +176,7 @@ service_mappings = st.builds(
     texts,
 )
 mapping_sets = st.builds(MappingSet, versions, uint64, _tuples(service_mappings, by="service"))
-welcomes = st.builds(Welcome, durations, durations, _tuples(texts))
+welcomes = st.builds(Welcome, durations, durations, _tuples(texts), st.binary(max_size=50))
 
 
 @st.composite

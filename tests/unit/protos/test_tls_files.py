@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.serialization import BestAvailableEncryption
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.errors import ConfigError
-from protos.identity import IdentityRole
+from protos.identity import CertificateError, IdentityRole
 from protos.tls_files import MAX_FILE_BYTES, TlsWatch, load_tls_files
 
 if TYPE_CHECKING:
@@ -225,3 +225,38 @@ def test_an_old_or_missing_revocation_list_does_not_replace_a_newer_one(
     ca.revoke("robot-3")
     path.write_bytes(ca.crl_pem())
     assert watch.poll() is not None
+
+
+def test_a_relayed_revocation_list_counts_beside_the_folders(folder: Path, ca: Authority) -> None:
+    old = ca.crl_pem()
+    robber = ca.issue("robot-2", IdentityRole.ROBOT)
+    (folder / "crl.pem").unlink()
+    watch = TlsWatch(load_tls_files(folder))
+    now = ca.entries[0].not_before + 400.0
+    assert watch.take_revocations(old)
+    assert watch.current.trust.check(robber.certificate_der, now).name == "robot-2"
+    ca.revoke("robot-2")
+    assert watch.take_revocations(ca.crl_pem())
+    for again in (ca.crl_pem(), old):
+        assert not watch.take_revocations(again)
+    # Also after the node's own files have changed.
+    (folder / "cert.pem").write_bytes(ca.renew("robot-1").certificate_pem)
+    write_tls_files(folder, ca.renew("robot-1"), ca.ca_pem, old)
+    assert watch.poll() is not None
+    with pytest.raises(CertificateError, match="revoked"):
+        watch.current.trust.check(robber.certificate_der, now)
+
+
+def test_a_relayed_list_that_our_cas_did_not_sign_changes_nothing(folder: Path) -> None:
+    watch = TlsWatch(load_tls_files(folder))
+    other = other_ca()
+    other.issue("robot-1", IdentityRole.ROBOT)
+    other.revoke("robot-1")
+    for crl in (other.crl_pem(), b"junk", b""):
+        assert not watch.take_revocations(crl)
+    (folder / "crl.pem").unlink()
+    watch = TlsWatch(load_tls_files(folder))
+    for crl in (other.crl_pem(), b"junk", b""):
+        assert not watch.take_revocations(crl)
+    own = watch.current.identity
+    assert watch.current.trust.check(watch.current.certificate_der, own.not_before) == own
