@@ -5,7 +5,8 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
-from sidecar.core.frame import HEADER_BYTES, MAX_DATAGRAM_BYTES
+from sidecar.core.frame import HEADER_BYTES, INTRODUCTION_FLAG, MAX_DATAGRAM_BYTES
+from sidecar.core.introduction import HELLO_BYTES
 
 if TYPE_CHECKING:
     import random
@@ -24,6 +25,8 @@ class JunkKind(enum.StrEnum):
     """Random bytes."""
     HEADED = "headed"
     """The clear header of a datagram seen on the way, another packet number, random bytes."""
+    INTRODUCED = "introduced"
+    """An introduction seen on the way, another packet number, random bytes behind the name it asks to be known by."""
     FLIPPED = "flipped"
     """A datagram seen on the way, one bit of it changed."""
     REPLAYED = "replayed"
@@ -43,6 +46,9 @@ def _one(kind: JunkKind, seen: Sequence[bytes], rng: random.Random) -> bytes:
             return noise(rng)
         case JunkKind.HEADED:
             return headed(rng.choice(seen), rng)
+        case JunkKind.INTRODUCED:
+            known = [one for one in seen if is_introduction(one)]
+            return headed(rng.choice(known), rng, HEADER_BYTES + HELLO_BYTES) if known else noise(rng)
         case JunkKind.FLIPPED:
             return flipped(rng.choice(seen), rng)
         case JunkKind.REPLAYED:
@@ -56,12 +62,17 @@ def noise(rng: random.Random) -> bytes:
     return rng.randbytes(rng.choice((rng.randint(1, 64), rng.randint(1, LONGEST_BYTES))))
 
 
-def headed(datagram: bytes, rng: random.Random) -> bytes:
-    """Return a live session's header with a packet number that may come next, and random bytes of any length."""
-    header = bytearray(datagram[:HEADER_BYTES])
-    number = int.from_bytes(header[_NUMBER], "big") + rng.randint(1, 1 << rng.randint(1, 40))
-    header[_NUMBER] = (number & (1 << 64) - 1).to_bytes(8, "big")
-    return bytes(header) + rng.randbytes(rng.choice((len(datagram) - HEADER_BYTES, rng.randint(0, 1000))))
+def is_introduction(datagram: bytes) -> bool:
+    """Whether a datagram is one by which a sidecar introduces itself."""
+    return len(datagram) > HEADER_BYTES and bool(datagram[1] & INTRODUCTION_FLAG)
+
+
+def headed(datagram: bytes, rng: random.Random, kept: int = HEADER_BYTES) -> bytes:
+    """Return the first `kept` bytes with a packet number that may come next, and random bytes."""
+    head = bytearray(datagram[:kept])
+    number = int.from_bytes(head[_NUMBER], "big") + rng.randint(1, 1 << rng.randint(1, 40))
+    head[_NUMBER] = (number & (1 << 64) - 1).to_bytes(8, "big")
+    return bytes(head) + rng.randbytes(rng.choice((len(datagram) - kept, rng.randint(0, 1000))))
 
 
 def flipped(datagram: bytes, rng: random.Random) -> bytes:

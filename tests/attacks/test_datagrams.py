@@ -6,6 +6,7 @@ Every test sends to the robot and to a cloud, while requests go on.
 from __future__ import annotations
 
 import random
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 
 COUNT = 100
+INLINE_S = 4.0
+HELD_S = 0.03
 VICTIMS = ("cloud_a", "robot")
 
 
@@ -46,6 +49,28 @@ def test_replayed_in_another_order_much_later(world: World, victim: str) -> None
         random.Random(1).shuffle(seen)
         send_all(tap, seen)
         world.wait_until_refused(victim, before, COUNT, "duplicate")
+
+
+def test_every_datagram_doubled_and_out_of_order(world: World) -> None:
+    """Nothing reaches the cloud but by the attacker's hand, who holds it back, shuffles it and sends it twice."""
+    tap, rng = world.tap("cloud_a"), random.Random(7)
+    address = {world.lab.host("cloud_a").address(family=family) for family in (4, 6)}
+    with world.calls(), world.roads_from("robot") as roads:
+        model = world.towards(tap, 1)[0]
+        before = world.refusals("cloud_a")
+        passed = 0
+        with world.nothing_reaches(tap):
+            end = time.monotonic() + INLINE_S
+            while time.monotonic() < end:
+                taken = [one for road in roads for one in road.take() if one.destination[0] in address]
+                held = [one._replace(ethernet=model.ethernet) for one in taken]
+                passed += sum(map(is_ours, held))
+                held *= 2
+                rng.shuffle(held)
+                send_all(tap, held)
+                time.sleep(HELD_S)
+        assert passed > COUNT
+        world.wait_until_refused("cloud_a", before, passed, "duplicate", "old_introduction")
 
 
 def test_one_bit_flipped(world: World, victim: str) -> None:

@@ -101,6 +101,25 @@ class World:
         tap.frames()
         return tap
 
+    @contextlib.contextmanager
+    def roads_from(self, host: str) -> Iterator[list[Tap]]:
+        """Taps on the internet's ends of all cables of a host behind NAT routers."""
+        names = self.lab.host(host).interfaces
+        numbers = [self.lab.nat(name, host=host).public_address.split(".")[2] for name in names]
+        with contextlib.ExitStack() as stack:
+            yield [stack.enter_context(Tap(self.lab.host("internet"), f"to{number}")) for number in numbers]
+
+    @contextlib.contextmanager
+    def nothing_reaches(self, tap: Tap) -> Iterator[None]:
+        """The internet loses all UDP on its way to where the tap is: what gets there is sent by the attacker."""
+        core = self.lab.host("internet")
+        rule = f'type filter hook forward priority -300; oifname "{tap.interface}" meta l4proto udp drop;'
+        core.run(["nft", "-f", "-"], input=f"table inet middle {{ chain lose {{ {rule} }}; }}\n", check=True)
+        try:
+            yield
+        finally:
+            core.run(["nft", "delete", "table", "inet", "middle"], check=True)
+
     def from_attacker(self, one: Captured) -> Captured:
         """The same datagram with the attacker's own address as its source."""
         family = 6 if ":" in one.source[0] else 4

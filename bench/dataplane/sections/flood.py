@@ -33,7 +33,7 @@ WARM_UP = 50
 SETTLE_S = 0.3
 ALLOWED_MS = 5.0
 """By so much the P99 may rise, or to twice what it was."""
-KINDS = (JunkKind.NOISE, JunkKind.HEADED, JunkKind.FLIPPED, JunkKind.REPLAYED)
+KINDS = tuple(kind for kind in JunkKind if kind is not JunkKind.MANGLED)
 ATTACKER = CLOUDS[1]
 QUIET = "undisturbed"
 
@@ -47,6 +47,7 @@ class Flood:
     attacker: Remote
     addresses: dict[str, str]
     seen: list[Captured]
+    """From the start on, with the introductions."""
     rows: dict[str, list[Row]] = field(default_factory=dict)
     arrived: dict[str, list[float]] = field(default_factory=dict)
     cost_us: dict[str, list[float]] = field(default_factory=dict)
@@ -98,6 +99,7 @@ def measure(context: Context) -> Findings:
     """Measure."""
     with (
         Lab(cables()) as lab,
+        Tap(lab.host(CLOUD), CLOUD_INTERFACE) as tap,
         Ours(
             context.folder,
             robot=lab.host(ROBOT),
@@ -105,7 +107,6 @@ def measure(context: Context) -> Findings:
             interfaces=CARRIERS,
             cloud_interface=CLOUD_INTERFACE,
         ) as ours,
-        Tap(lab.host(CLOUD), CLOUD_INTERFACE) as tap,
         Remote.start("flood", context.folder, host=lab.host(ATTACKER)) as attacker,
     ):
         ours.call(size=SIZE, count=WARM_UP, rate_hz=RATE_HZ)
