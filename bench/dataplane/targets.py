@@ -68,6 +68,7 @@ TARGETS = (
         or_at_least=5,
     ),
     Target("sealed_over_null_goodput", "goodput of one path on loopback over that with a null cipher", at_least=0.65),
+    Target("ethernet_sealed_over_null_goodput", "the same with packets of 1500 bytes", at_least=0.65),
     Target("proxied_over_direct_1k", "median ROS call of 1 kB through two sidecars over the direct call", at_most=5),
     Target("proxied_over_direct_150k", "the same with 150 kB", at_most=7),
     Target("blackhole_lost", "requests lost after one of two paths went silent", at_most=0),

@@ -32,6 +32,7 @@ def measure(context: Context) -> Findings:
     ours_runs: list[tuple[float | None, float]] = []
     ethernet_runs: list[tuple[float | None, float]] = []
     null_runs: list[tuple[float | None, float]] = []
+    ethernet_null_runs: list[tuple[float | None, float]] = []
     aioquic_runs: list[tuple[float | None, float]] = []
     small: list[float | None] = []
     with contextlib.ExitStack() as stack:
@@ -40,6 +41,16 @@ def measure(context: Context) -> Findings:
         null = start(Ours(context.folder, clouds={"cloud_a": None}, service=PATIENT, name="null", null_cipher=True))
         host = ethernet_loopback(start(Lab(cables())))
         ethernet = start(Ours(context.folder, robot=host, clouds={"cloud_a": host}, service=PATIENT, name="ethernet"))
+        ethernet_null = start(
+            Ours(
+                context.folder,
+                robot=host,
+                clouds={"cloud_a": host},
+                service=PATIENT,
+                name="ethernet_null",
+                null_cipher=True,
+            )
+        )
         server = start(Remote.start("quic", context.folder, name="quic.server"))
         client = start(Remote.start("quic", context.folder, name="quic.client"))
         client.ask("connect", host="127.0.0.1", port=server.ask("listen"))
@@ -48,10 +59,16 @@ def measure(context: Context) -> Findings:
         _bulk(ours.robot, WARM_UP)
         _bulk(ethernet.robot, WARM_UP)
         _bulk(null.robot, WARM_UP)
+        _bulk(ethernet_null.robot, WARM_UP)
         _bulk(client, WARM_UP)
         for repeat in range(context.repeats):
             context.say(f"goodput: ours, {repeat + 1} of {context.repeats}")
-            for runs, pair in ((ours_runs, ours), (null_runs, null), (ethernet_runs, ethernet)):
+            for runs, pair in (
+                (ours_runs, ours),
+                (null_runs, null),
+                (ethernet_runs, ethernet),
+                (ethernet_null_runs, ethernet_null),
+            ):
                 runs.append(_costed((pair.robot, *pair.clouds.values()), context.scaled(OURS_COUNT, WARM_UP)))
             context.say(f"goodput: aioquic, {repeat + 1} of {context.repeats}")
             aioquic_runs.append(_costed(aioquic, context.scaled(AIOQUIC_COUNT, WARM_UP)))
@@ -70,6 +87,11 @@ def measure(context: Context) -> Findings:
         "sealed_over_null_goodput": median(
             ratio(one[0], other[0]) for one, other in zip(ours_runs, null_runs, strict=True)
         ),
+        "ethernet_goodput_null_cipher_mbit_s": median(run[0] for run in ethernet_null_runs),
+        "ethernet_sealed_over_null_goodput": median(
+            ratio(one[0], other[0]) for one, other in zip(ethernet_runs, ethernet_null_runs, strict=True)
+        ),
+        "ethernet_null_cipher_cpu_ms_per_mb": median(run[1] for run in ethernet_null_runs),
         "null_cipher_cpu_ms_per_mb": median(run[1] for run in null_runs),
         "ethernet_goodput_mbit_s": median(run[0] for run in ethernet_runs),
         "ethernet_goodput_over_aioquic": median(
@@ -83,6 +105,11 @@ def measure(context: Context) -> Findings:
         ("ours", figures["goodput_mbit_s"], figures["cpu_ms_per_mb"]),
         ("ours, null cipher", figures["goodput_null_cipher_mbit_s"], figures["null_cipher_cpu_ms_per_mb"]),
         ("ours, packets of 1500 bytes", figures["ethernet_goodput_mbit_s"], figures["ethernet_cpu_ms_per_mb"]),
+        (
+            "ours, packets of 1500 bytes, null cipher",
+            figures["ethernet_goodput_null_cipher_mbit_s"],
+            figures["ethernet_null_cipher_cpu_ms_per_mb"],
+        ),
         ("aioquic", figures["aioquic_goodput_mbit_s"], figures["aioquic_cpu_ms_per_mb"]),
     )
     title = f"{AT_ONCE} messages of 1 MB in flight, loopback, two processes"
