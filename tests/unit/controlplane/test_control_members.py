@@ -9,7 +9,7 @@ import pytest
 from controlplane.core.control_events import CloseReason
 from controlplane.core.registry import Refusal
 from protos.errors import DecodeError
-from protos.model import CandidateSet, RemovalReason, Role, ServiceSet, SyncState
+from protos.model import CandidateSet, NodeName, RemovalReason, Role, ServiceSet, SyncState
 from tests.sim.control_world import SETTLED_S, World
 from tests.unit.controlplane.samples import interfaces, offer, registration
 
@@ -118,3 +118,45 @@ def test_an_expired_robot_that_returns_is_told_who_went_meanwhile() -> None:
     world.run(0.2)
     assert robot.peer_names == {"a"}
     assert robot.removed == {"b": RemovalReason.LEFT}
+
+
+def test_a_revoked_server_goes_at_once_and_its_peers_are_told_why(world: World) -> None:
+    a, b = world.cloud("a"), world.cloud("b")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    world.all_up(robot, ("a", "b"))
+    world.run(SETTLED_S)
+    assert set(robot.pairs().values()) == {"a", "b"}
+    world.core.revoke(NodeName("b"), world.now)
+    world.dispatch()
+    assert b.closed == [CloseReason.REVOKED]
+    assert robot.peer_names == {"a"}
+    assert robot.removed == {"b": RemovalReason.REVOKED}
+    assert "b" not in robot.pairs().values()
+    assert a.closed == []
+    world.run(SETTLED_S)
+    assert set(robot.pairs().values()) == {"a"}
+    assert world.core.registry.counters.revoked == 1
+    # Nobody there: nothing to do.
+    world.core.revoke(NodeName("b"), world.now)
+    assert world.core.registry.counters.revoked == 1
+
+
+def test_a_stream_that_is_ended_leaves_its_sidecar_registered(world: World) -> None:
+    a, robot = world.cloud("a"), world.robot()
+    world.run(SETTLED_S)
+    world.core.end_stream(NodeName("a"), CloseReason.CERTIFICATE_ENDED)
+    world.run(0.5)
+    assert a.closed == [CloseReason.CERTIFICATE_ENDED]
+    assert robot.peer_names == {"a"}
+
+
+def test_the_revocation_list_goes_to_all_at_once_and_to_who_comes_later(world: World) -> None:
+    robot = world.robot()
+    world.run(SETTLED_S)
+    assert [welcome.crl for welcome in robot.welcomes] == [b""]
+    for crl in (b"first", b"first", b"second"):
+        world.core.relay_revocations(crl)
+        world.dispatch()
+    assert [welcome.crl for welcome in robot.welcomes] == [b"", b"first", b"second"]
+    assert world.cloud("a").welcomes[0].crl == b"second"

@@ -1,0 +1,199 @@
+"""The gate alone, with a server of bytes behind it: what it carries, what it bounds, what it forgets."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ssl
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from controlplane import tls_gate
+from controlplane.ca import Authority
+from controlplane.tls_gate import TlsGate
+from protos.identity import CONTROL_PLANE_DNS, IdentityRole
+from protos.tls_files import load_tls_files
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
+
+    import pytest
+
+PATIENCE_S = 30.0
+
+Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+@dataclass
+class Fleet:
+    """A CA, the gate's files and those of its clients."""
+
+    folder: Path
+    authority: Authority = field(default_factory=Authority.create)
+
+    def tls_dir(self, name: str, role: IdentityRole = IdentityRole.ROBOT) -> Path:
+        folder = self.folder / name
+        if not folder.exists():
+            self.authority.write_tls_dir(folder, name, role)
+        return folder
+
+    def client(self, name: str) -> ssl.SSLContext:
+        folder = self.tls_dir(name)
+        context = ssl.create_default_context(cafile=str(folder / "ca.pem"))
+        context.load_cert_chain(folder / "cert.pem", folder / "key.pem")
+        return context
+
+
+@dataclass
+class Gate:
+    """A gate before a server that sends back what it gets."""
+
+    fleet: Fleet
+    port: int
+    gate: TlsGate
+    refused: Counter[str]
+    peers: list[str]
+
+    async def connect(self, name: str) -> Streams:
+        return await asyncio.open_connection(
+            "127.0.0.1", self.port, ssl=self.fleet.client(name), server_hostname=CONTROL_PLANE_DNS
+        )
+
+
+@contextlib.asynccontextmanager
+async def opened(folder: Path) -> AsyncIterator[Gate]:
+    fleet, refused, peers = Fleet(folder), Counter[str](), list[str]()
+
+    async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        peers.append("unix-abstract:" + writer.get_extra_info("peername").removeprefix(b"\0").decode())
+        with contextlib.suppress(ConnectionError):
+            while data := await reader.read(1 << 16):
+                writer.write(data)
+                await writer.drain()
+        writer.close()
+
+    upstream = str(folder / "upstream")
+    server = await asyncio.start_unix_server(echo, upstream)
+    files = load_tls_files(fleet.tls_dir("control", IdentityRole.CONTROL_PLANE))
+    gate = TlsGate(files, upstream, lambda reason: refused.update([reason]))
+    try:
+        yield Gate(fleet, gate.listen("127.0.0.1", 0), gate, refused, peers)
+    finally:
+        await gate.close()
+        server.close()
+        await asyncio.sleep(0.05)
+
+
+async def until(done: Callable[[], bool]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not done():  # noqa: ASYNC110 - what is waited for has no event
+            await asyncio.sleep(0.01)
+
+
+async def ended(streams: Streams) -> None:
+    """Wait until the other side has ended the connection."""
+    async with asyncio.timeout(PATIENCE_S):
+        with contextlib.suppress(ConnectionError, ssl.SSLError):
+            assert await streams[0].read(1) == b""
+    streams[1].close()
+
+
+def test_bytes_arrive_whole_however_slow_their_reader_is(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            reader, writer = await gate.connect("robot-1")
+            sent = bytes(range(256)) * (1 << 15)
+            writing = asyncio.create_task(write(writer, sent))
+            # Nobody reads for a while: what is under way has to wait somewhere, and not in the gate.
+            await asyncio.sleep(0.3)
+            async with asyncio.timeout(PATIENCE_S):
+                assert await reader.readexactly(len(sent)) == sent
+            await writing
+            caller = gate.gate.caller(gate.peers[0])
+            assert caller is not None
+            assert (caller.identity.name, caller.refusal) == ("robot-1", None)
+            writer.close()
+            await until(lambda: gate.gate.caller(gate.peers[0]) is None)
+
+    asyncio.run(run())
+
+
+async def write(writer: asyncio.StreamWriter, data: bytes) -> None:
+    for start in range(0, len(data), 1 << 16):
+        writer.write(data[start : start + (1 << 16)])
+        await writer.drain()
+
+
+def test_of_many_connections_of_one_name_the_oldest_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tls_gate, "MAX_CONNECTIONS_PER_NAME", 2)
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            other = await gate.connect("robot-2")
+            oldest, second, third = [await gate.connect("robot-1") for _ in range(3)]
+            await ended(oldest)
+            assert gate.refused == {"too_many_connections": 1}
+            for reader, writer in (other, second, third):
+                writer.write(b"x")
+                async with asyncio.timeout(PATIENCE_S):
+                    assert await reader.readexactly(1) == b"x"
+                writer.close()
+
+    asyncio.run(run())
+
+
+def test_beyond_all_connections_a_further_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tls_gate, "MAX_CONNECTIONS", 1)
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            reader, writer = await gate.connect("robot-1")
+            await ended(await gate.connect("robot-2"))
+            assert gate.refused["too_many_connections"] == 1
+            writer.write(b"x")
+            assert await reader.readexactly(1) == b"x"
+            writer.close()
+
+    asyncio.run(run())
+
+
+def test_half_open_handshakes_make_room_oldest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tls_gate, "MAX_HANDSHAKES", 3)
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            waiting = [await asyncio.open_connection("127.0.0.1", gate.port) for _ in range(3)]
+            reader, writer = await gate.connect("robot-1")
+            writer.write(b"x")
+            assert await reader.readexactly(1) == b"x"
+            await ended(waiting[0])
+            assert gate.refused["too_many_handshakes"] == 1
+            for _, other in (*waiting[1:], (reader, writer)):
+                other.close()
+
+    asyncio.run(run())
+
+
+def test_a_revoked_certificates_connections_end_and_no_others(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            bad, (reader, writer) = await gate.connect("robot-1"), await gate.connect("robot-2")
+            await until(lambda: len(gate.peers) == 2)
+            gate.fleet.authority.revoke("robot-1")
+            control = gate.fleet.tls_dir("control")
+            (control / "crl.pem").write_bytes(gate.fleet.authority.crl_pem())
+            gate.gate.use(load_tls_files(control))
+            judged = [gate.gate.caller(peer) for peer in gate.peers]
+            assert [(c.identity.name, c.refusal and c.refusal.reason) for c in judged if c] == [
+                ("robot-1", "revoked"),
+                ("robot-2", None),
+            ]
+            await ended(bad)
+            assert gate.refused == {"revoked": 1}
+            writer.write(b"x")
+            assert await reader.readexactly(1) == b"x"
+            writer.close()
+
+    asyncio.run(run())
