@@ -31,6 +31,7 @@ class Views:
         self._clouds = [sidecar for sidecar in ready if sidecar.role is Role.CLOUD]
         self._of_robots: dict[Group, tuple[Peer, ...]] = {}
         self._of_clouds: dict[tuple[CallPermit, ...], tuple[Peer, ...]] = {}
+        self._offers: dict[tuple[NodeName, CallPermit], Peer] = {}
         self._servers: dict[Group, Mapping[NodeName, CallPermit]] = {}
 
     def peers_of(self, sidecar: Sidecar) -> tuple[Peer, ...]:
@@ -41,7 +42,7 @@ class Views:
         peers = self._of_robots.get(group)
         if peers is None:
             servers = self.servers_of(sidecar.name)
-            peers = tuple(_offering(cloud, servers[cloud.name]) for cloud in self._clouds if cloud.name in servers)
+            peers = tuple(self._offering(cloud, servers[cloud.name]) for cloud in self._clouds if cloud.name in servers)
             self._of_robots[group] = peers
         return peers
 
@@ -53,6 +54,15 @@ class Views:
             found = ((cloud.name, self._permits.of(group, cloud)) for cloud in self._clouds)
             servers = self._servers[group] = {name: permit for name, permit in found if permit}
         return servers
+
+    def _offering(self, cloud: Sidecar, permit: CallPermit) -> Peer:
+        key = cloud.name, permit
+        peer = self._offers.get(key)
+        if peer is None:
+            peer = cloud.as_peer()
+            offers = tuple(offer for offer in peer.offers if offer.name in permit)
+            peer = self._offers[key] = dataclasses.replace(peer, offers=offers)
+        return peer
 
     def _robots_for(self, cloud: Sidecar) -> tuple[Peer, ...]:
         permits = tuple(self._permits.of(self._permits.group(robot.name), cloud) for robot in self._robots)
@@ -77,8 +87,3 @@ class Views:
         cloud = other if other.role is Role.CLOUD else sidecar
         # A cloud that has not offered anything yet forbids nothing: it may be on its way back.
         return RemovalReason.FORBIDDEN if cloud.offered else RemovalReason.LEASE_EXPIRED
-
-
-def _offering(cloud: Sidecar, permit: CallPermit) -> Peer:
-    peer = cloud.as_peer()
-    return dataclasses.replace(peer, offers=tuple(offer for offer in peer.offers if offer.name in permit))
