@@ -22,6 +22,7 @@ from controlplane.core.plan import Plan
 from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
+from controlplane.core.token_bucket import TokenBucket
 from controlplane.mailbox import Mailbox
 from protos.identity import REVOKED, CertificateError
 
@@ -43,6 +44,9 @@ log = logging.getLogger(__name__)
 
 MAX_SERVICES_LOGGED = 8
 """Services named in one log line."""
+
+ENDED_LINES_PER_S, ENDED_LINES_BURST = 1.0, 20.0
+"""Log lines on streams that were ended for breaking the rules."""
 
 METRICS_INTERVAL_S = 1.0
 """How old what is scraped may be: Prometheus scrapes every few seconds at most."""
@@ -90,6 +94,7 @@ class ControlLoop:
         self._callers: dict[NodeName, Caller] = {}
         self._superseded = 0
         self._wake = asyncio.Event()
+        self._ended_lines = TokenBucket(rate=ENDED_LINES_PER_S, burst=ENDED_LINES_BURST, now=self._loop.time())
         self._stopping = False
         self._matcher = _LateMatcher()
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
@@ -208,7 +213,9 @@ class ControlLoop:
     def stream_ended(self, peer: str, code: str, details: str) -> None:
         """A stream was ended by us; `peer` is where it came from."""
         self._metrics.streams_ended.labels(code).inc()
-        log.warning("stream of %s ended: %s: %s", peer, code, details)
+        # A member that breaks the rules as often as it can must not fill the disk; the counter tells how often.
+        if self._ended_lines.take(self._loop.time()):
+            log.warning("stream of %s ended: %s: %s", peer, code, details)
 
     # ── the loop ──
 

@@ -8,6 +8,7 @@ import queue
 import random
 import socket
 import ssl
+import time
 from typing import TYPE_CHECKING, Any
 
 import grpc
@@ -32,7 +33,10 @@ MB = 1e6
 DATAGRAMS_A_MESSAGE = 100
 """`--fuzz-datagrams` counts datagrams; a stream's message costs a hundred times as much."""
 MESSAGES_A_STREAM = 20
-GROWTH_BYTES = 32 * MB
+LINES = 21
+SOLVER_LOADED_S = 5.0
+"""The first plan makes the control plane load its solver, some 40 MB."""
+GROWTH_BYTES = 24 * MB
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 CLIENT_HELLO = bytes.fromhex("1603010200010001fc0303")
 REFUSALS = {
@@ -130,17 +134,21 @@ def test_a_member_that_sends_anything(fleet: Fleet, fuzz_datagrams: int) -> None
     fleet.assert_fine()
     codes = set()
     before = 0
-    count = max(20, fuzz_datagrams // DATAGRAMS_A_MESSAGE // MESSAGES_A_STREAM)
+    began = time.monotonic()
+    count = max(3 * LINES, fuzz_datagrams // DATAGRAMS_A_MESSAGE // MESSAGES_A_STREAM)
     with fleet.channel() as channel:
         for number in range(count):
             register = registration(fleet.fuzzer, "fuzzer", Role.ROBOT)
             first = mutated(register, rng) if number % 4 == 0 else register
             code, _ = talk(channel, [first, *(mutated(sane(rng, register), rng) for _ in range(MESSAGES_A_STREAM))])
             codes.add(code)
-            if number == count // 4:
+            if number == count // 2:
+                time.sleep(SOLVER_LOADED_S)
                 before = fleet.resident()
     assert codes <= REFUSALS
     assert grpc.StatusCode.INVALID_ARGUMENT in codes
+    told = [line for line in fleet.plane.lines if " ended: " in line]
+    assert len(told) <= LINES + time.monotonic() - began, "a member can not fill the disk with log lines"
     assert fleet.resident() - before < GROWTH_BYTES
     fleet.assert_fine()
 
