@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from controlplane.core.fading import FadedCount, FadedHistogram, sum_exceeds
-from controlplane.core.posterior import Estimate, FadedTrials
+from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 
 K = TypeVar("K")
 V = TypeVar("V")
-
-IGNORANCE = Estimate(0.5, 0.5)
-"""Jeffreys' prior: a pair of which nothing is known misses one request in two."""
 
 MODEL_REQUESTS = 5.0
 """What the estimate from round trips is worth in real requests, however many probes back it: probes are small, so it

@@ -5,18 +5,31 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+MEMORIES = ((1.0, 1.0), (1 / 4, 0.3), (1 / 15, 0.3))
+"""Half-lives of the memories beside each other, as parts of the configured one, and how likely each is to be the best
+before anything is known: a steady path is known best by a long memory, one that enters a tunnel by a short one."""
+
+SCORE_HALF_LIFE = 1 / 3
+"""Half-life, as a part of the configured one, of the record of how well each memory predicted."""
+
+HANDED_ON = 2.0
+"""Trials that a memory's ratio is worth to the next shorter one, which starts from it."""
+
 BATCH_S = 5.0
 """Outcomes are summed up over this long before their spread is looked at: a handover is within, an outage spans a
 few."""
 
 USUAL_STREAK = 5.0
-"""By how much streaks usually inflate the variance of a miss ratio: the median over recorded drives is 3 to 8."""
+"""By how much streaks usually inflate the variance of a miss ratio."""
 
 USUAL_STREAK_BATCHES = 4.0
 """How many batches that experience weighs."""
 
 MAX_BATCH_CORRELATION = 0.9
 """Nothing that fades within a minute can tell a longer memory from a change."""
+
+_SURE = 1e-6
+"""No ratio is believed to be nearer to 0 or 1 when predictions are scored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,87 +55,136 @@ class Estimate:
         return cls(mean * weight, (1.0 - mean) * weight)
 
 
-class FadedTrials:
-    """Trials and those among them that missed, fading with a half-life in seconds, and how they streak.
+IGNORANCE = Estimate(0.5, 0.5)
+"""Jeffreys' prior: of what nothing is known, one in two misses."""
 
-    Misses come in streaks, so n trials say less than n independent ones. The variance of sums over batches of
-    `BATCH_S` beside that of independent trials, times (1 + r) / (1 - r) for the correlation r of neighbouring batches,
-    is the design effect; n divided by it is what the trials are worth.
-    """
+
+class _Memory:
+    """Trials and misses that fade with one half-life, and the log-likelihood of what it predicted."""
+
+    __slots__ = ("half_life_s", "misses", "score", "share", "trials")
+
+    def __init__(self, half_life_s: float, share: float) -> None:
+        self.half_life_s = half_life_s
+        self.share = share
+        self.trials = self.misses = self.score = 0.0
+
+
+class _Streaks:
+    """How much more batches of misses spread around what was predicted than independent misses would."""
 
     __slots__ = (
-        "_at",
-        "_batch_misses",
-        "_batch_since",
-        "_batch_trials",
         "_batches",
-        "_half_life_s",
+        "_expected",
         "_independent",
         "_last",
         "_misses",
         "_neighbours",
+        "_since",
         "_spread",
-        "_trials",
+        "_variance",
     )
 
-    def __init__(self, half_life_s: float, now: float) -> None:
-        self._half_life_s = half_life_s
-        self._at = now
-        self._trials = self._misses = 0.0
-        self._batch_since = now
-        self._batch_trials = self._batch_misses = 0.0
+    def __init__(self, now: float) -> None:
+        self._since = now
+        self._misses = self._expected = self._variance = 0.0
         self._batches = self._spread = self._neighbours = self._independent = self._last = 0.0
 
-    def add(self, trials: float, misses: float, now: float) -> None:
-        """Count trials, `misses` of them missed."""
-        self._fade(now)
-        self._trials += trials
-        self._misses += misses
-        self._batch_trials += trials
-        self._batch_misses += misses
-        if now - self._batch_since >= BATCH_S:
-            self._close_batch(now)
-
-    def _fade(self, now: float) -> None:
-        factor = math.exp2((self._at - now) / self._half_life_s)
-        self._at = now
-        self._trials *= factor
-        self._misses *= factor
+    def fade(self, factor: float) -> None:
         self._batches *= factor
         self._spread *= factor
         self._neighbours *= factor
         self._independent *= factor
 
-    def _close_batch(self, now: float) -> None:
-        ratio = (self._misses + 0.5) / (self._trials + 1.0)
-        residual = self._batch_misses - ratio * self._batch_trials
-        self._batches += 1.0
-        self._spread += residual * residual
-        self._neighbours += residual * self._last
-        self._independent += self._batch_trials * ratio * (1.0 - ratio)
-        self._last = residual
-        self._batch_since = now
-        self._batch_trials = self._batch_misses = 0.0
-
-    def counts(self, now: float) -> tuple[float, float]:
-        """(trials, misses) as they weigh by now."""
-        factor = math.exp2((self._at - now) / self._half_life_s)
-        return self._trials * factor, self._misses * factor
+    def add(self, trials: float, misses: float, predicted: float, now: float) -> None:
+        self._misses += misses
+        self._expected += trials * predicted
+        self._variance += trials * predicted * (1.0 - predicted)
+        if now - self._since >= BATCH_S:
+            residual = self._misses - self._expected
+            self._batches += 1.0
+            self._spread += residual * residual
+            self._neighbours += residual * self._last
+            self._independent += self._variance
+            self._last = residual
+            self._since = now
+            self._misses = self._expected = self._variance = 0.0
 
     def design_effect(self) -> float:
-        """By how much streaks inflate the variance of the ratio, at least 1."""
-        usual = USUAL_STREAK * USUAL_STREAK_BATCHES
         if self._batches < 1.0 or self._independent <= 0.0:
             return USUAL_STREAK
         each = self._independent / self._batches
-        dispersion = (self._spread / each + usual) / (self._batches + USUAL_STREAK_BATCHES)
+        experience = self._batches + USUAL_STREAK_BATCHES
+        dispersion = (self._spread / each + USUAL_STREAK * USUAL_STREAK_BATCHES) / experience
         correlation = self._neighbours / self._spread if self._spread else 0.0
-        correlation *= self._batches / (self._batches + USUAL_STREAK_BATCHES)
-        correlation = min(max(correlation, 0.0), MAX_BATCH_CORRELATION)
+        correlation = min(max(correlation * self._batches / experience, 0.0), MAX_BATCH_CORRELATION)
         return max(1.0, dispersion * (1.0 + correlation) / (1.0 - correlation))
 
+
+class FadedTrials:
+    """Trials and those among them that missed, fading, with what they tell of the next one.
+
+    Several memories of different length stand beside each other. Each shorter one starts from the ratio of the longer
+    one before it, and all are averaged by how well they predicted lately: weights proportional to the likelihood of
+    what came, as in Bayesian model averaging with forgetting. Misses come in streaks, so n trials say less than n
+    independent ones: the variance of the prediction's errors over batches of `BATCH_S` beside that of independent
+    trials, times (1 + r) / (1 - r) for the correlation r of neighbouring batches, is the design effect; n divided by it
+    is what the trials are worth.
+    """
+
+    __slots__ = ("_at", "_half_life_s", "_memories", "_streaks")
+
+    def __init__(self, half_life_s: float, now: float) -> None:
+        self._half_life_s = half_life_s
+        self._at = now
+        self._memories = tuple(_Memory(half_life_s * part, share) for part, share in MEMORIES)
+        self._streaks = _Streaks(now)
+
+    def add(self, trials: float, misses: float, now: float) -> None:
+        """Count trials, `misses` of them missed."""
+        passed_s = now - self._at
+        self._at = now
+        ratios = self._ratios(IGNORANCE, 0.0)
+        predicted, _ = self._average(ratios, 0.0)
+        score_fade = math.exp2(-passed_s / (self._half_life_s * SCORE_HALF_LIFE))
+        for memory, ratio in zip(self._memories, ratios, strict=True):
+            sure = min(max(ratio, _SURE), 1.0 - _SURE)
+            surprise = misses * math.log(sure) + (trials - misses) * math.log1p(-sure)
+            memory.score = memory.score * score_fade + surprise
+            fade = math.exp2(-passed_s / memory.half_life_s)
+            memory.trials = memory.trials * fade + trials
+            memory.misses = memory.misses * fade + misses
+        self._streaks.fade(math.exp2(-passed_s / self._half_life_s))
+        self._streaks.add(trials, misses, predicted, now)
+
+    def _ratios(self, prior: Estimate, passed_s: float) -> list[float]:
+        """Of each memory after so many more seconds, each from the one before, the longest from the prior."""
+        ratios: list[float] = []
+        start = prior
+        for memory in self._memories:
+            fade = math.exp2(-passed_s / memory.half_life_s)
+            ratio = (memory.misses * fade + start.misses) / (memory.trials * fade + start.weight)
+            ratios.append(ratio)
+            start = Estimate.of(ratio, HANDED_ON)
+        return ratios
+
+    def _average(self, ratios: list[float], passed_s: float) -> tuple[float, float]:
+        """(ratio, trials) over all memories, by how well each predicted."""
+        best = max(memory.score for memory in self._memories)
+        shares = [memory.share * math.exp(memory.score - best) for memory in self._memories]
+        trials = [memory.trials * math.exp2(-passed_s / memory.half_life_s) for memory in self._memories]
+        total = sum(shares)
+        return (
+            sum(share * ratio for share, ratio in zip(shares, ratios, strict=True)) / total,
+            sum(share * count for share, count in zip(shares, trials, strict=True)) / total,
+        )
+
+    def design_effect(self) -> float:
+        """By how much streaks inflate the variance of the ratio, at least 1."""
+        return self._streaks.design_effect()
+
     def posterior(self, prior: Estimate, now: float) -> Estimate:
-        """The prior, and what the trials are worth: their mean counts every trial, the weight only what they say."""
-        trials, misses = self.counts(now)
-        mean = (misses + prior.misses) / (trials + prior.weight)
+        """The prior, and what the trials say: their mean counts every trial, the weight only what they are worth."""
+        passed_s = now - self._at
+        mean, trials = self._average(self._ratios(prior, passed_s), passed_s)
         return Estimate.of(mean, trials / self.design_effect() + prior.weight)

@@ -60,11 +60,32 @@ def test_few_trials_take_the_usual_streaks_for_granted() -> None:
 
 def test_trials_fade_and_the_prior_comes_back() -> None:
     trials, now = fed([True] * 1000, half_life_s=10.0)
-    count, misses = trials.counts(now + 10.0)
-    assert count == misses == pytest.approx(trials.counts(now)[0] / 2)
+    fresh, faded = trials.posterior(PRIOR, now), trials.posterior(PRIOR, now + 10.0)
+    assert fresh.mean > faded.mean
+    assert fresh.weight > faded.weight > 1.0
     assert trials.posterior(PRIOR, now + 1000.0).mean == pytest.approx(0.5)
 
 
 def test_a_steady_miss_ratio_has_no_design_effect_below_one() -> None:
     trials, _ = fed([False, True] * 5000, each_report=10)
     assert trials.design_effect() == 1.0
+
+
+def test_a_path_that_dies_is_noticed_within_seconds_and_a_steady_one_is_known_well() -> None:
+    steady = [number % 10 == 0 for number in range(2000)]
+    trials, now = fed(steady, half_life_s=60.0)
+    assert trials.posterior(PRIOR, now).mean == pytest.approx(0.1, abs=0.02)
+    for _ in range(10):
+        now += STEP_S
+        trials.add(5, 5, now)
+    assert trials.posterior(PRIOR, now).mean > 0.5, "five seconds after a steady 0.1"
+    for _ in range(20):
+        now += STEP_S
+        trials.add(5, 0, now)
+    assert trials.posterior(PRIOR, now).mean < 0.2, "and its return as well"
+
+
+def test_one_early_miss_does_not_condemn() -> None:
+    trials, now = fed([True, False, False, False, False], half_life_s=60.0)
+    prior = Estimate.of(0.01, 20.0)
+    assert trials.posterior(prior, now).mean < 0.1
