@@ -21,7 +21,7 @@ from controlplane.core.control_events import (
     Send,
     Settings,
 )
-from controlplane.core.debounce import Change, Debounce, settle
+from controlplane.core.debounce import Change, Debounce
 from controlplane.core.estimator import Estimator
 from controlplane.core.permits import Permits
 from controlplane.core.picture import Picture, draw
@@ -30,6 +30,7 @@ from controlplane.core.problem import Problem
 from controlplane.core.publisher import Publisher
 from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import Admission, Refusal, Registry, StreamId
+from controlplane.core.stability import Stability
 from protos.errors import DecodeError
 from protos.model import (
     Ack,
@@ -71,6 +72,7 @@ class ControlCore:
         self.plan = Plan({})
         self._picture = Picture(Problem(()))
         self._debounce = Debounce()
+        self._stability = Stability()
         warm_until = now + settings.warm_up_s if settings.warm_up_s else None
         self._publisher = Publisher(self.registry, version_epoch=version_epoch, warm_until=warm_until)
         self._streams: dict[StreamId, NodeName] = {}
@@ -278,7 +280,7 @@ class ControlCore:
     def solved(self, picture: Picture, plan: Plan, now: float) -> None:
         """The solver's answer to the problem of `start_solving`; what is worth a change is published."""
         self._debounce.finished(now)
-        settled = settle(picture.problem, plan, self.plan)
+        settled = self._stability.settle(picture.problem, plan, self.plan, now)
         self.counters.solved += 1
         self.counters.unproven += plan.unproven
         if settled.relaxed and settled.relaxed != self.plan.relaxed:

@@ -28,6 +28,8 @@ class BlockPlan:
     """Probability that all copies miss, see `objectives.joint_miss`."""
     excess: int = 0
     """By how many interfaces the block's own capacity is exceeded."""
+    why: str = ""
+    """What made it change last; empty if it never did."""
 
 
 @dataclass(frozen=True, slots=True)

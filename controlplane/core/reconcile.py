@@ -96,6 +96,8 @@ def _standby(
 def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objective) -> str:
     """One short line; without figures that change with every report, as a new reason is a new version."""
     parts = [LEAST[objective]]
+    if block.why:
+        parts.append(block.why)
     if notes.all_dark:
         parts.append("no path is up, so all known pairs were considered")
     if notes.dark:

@@ -1,0 +1,181 @@
+"""What of a new plan is worth a change of the running one.
+
+Blocks whose choice differs are judged together where one needs the room that another leaves, and else each on its
+own. A change that need not be has to win by enough, and no service of a robot has more than a few of
+them in a minute. Every
+change carries its reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+from controlplane.core.objectives import block_cost, joint_miss
+from controlplane.core.plan import choice_of, make_plan
+from controlplane.core.problem import FleetKey, Objective, block_excess, loads
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from controlplane.core.plan import Plan
+    from controlplane.core.problem import Block, BlockKey, Choice, Problem
+
+IMPROVEMENT_SHARE = 0.1
+IMPROVEMENT_MIN = 0.002
+"""What a change must save of its blocks' sum of miss probabilities, as a share and in all: below, it is the noise of
+the reports, and a change itself costs the requests in flight a detour."""
+
+IMPROVEMENT_LOG = -math.log(1 - IMPROVEMENT_SHARE)
+"""The same share where logarithms are summed, for each block that changes."""
+
+IMPROVEMENT_MIN_ALL_MISS = 1e-4
+"""What it must save there of the expected number of requests that miss, one of each block: products are smaller."""
+
+MAX_CHANGES = 4
+CHANGE_WINDOW_S = 60.0
+"""So often in so long a robot's service moves to something better. What died, or has no room, is left at once."""
+
+
+class _Difference(NamedTuple):
+    """A block whose new choice is not its running one."""
+
+    block: Block
+    new: Choice
+    old: Choice | None
+    """None where it is not valid any more."""
+    load: Mapping[FleetKey, int]
+    """Interfaces that each limit over all robots gets more, or less, of the block with the new choice."""
+
+
+class Stability:
+    """Decides which changes are made. Times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        self._changed: dict[BlockKey, deque[float]] = {}
+
+    def settle(self, problem: Problem, new: Plan, running: Plan, now: float) -> Plan:
+        """Take of the new plan, which answers this problem, what is worth it; keep the rest of the running one.
+
+        A change is made if the running choice is not valid any more (a path or a server of it is gone, an interface
+        came), if it ends some excess over the capacities, or if it saves enough at today's epsilons.
+        """
+        old = {block.key: choice_of(block, running.blocks.get(block.key)) for block in problem.blocks}
+        choices = {key: choice for key, choice in old.items() if choice is not None}
+        why = {key: block.why for key, block in running.blocks.items()}
+        self._changed = {key: times for key, times in self._changed.items() if key in old}
+        load: Counter[FleetKey] = Counter()
+        for block in problem.blocks:
+            if block.key in choices:
+                load.update(_limited(problem, block, choices[block.key]))
+        for together in _linked(problem, _differences(problem, new, old), load):
+            if not self._is_made(problem, together, load, now):
+                continue
+            for difference in together:
+                key = difference.block.key
+                choices[key] = difference.new
+                if key in running.blocks:
+                    why[key] = _reason(difference)
+                    self._changed.setdefault(key, deque(maxlen=MAX_CHANGES)).append(now)
+        plan = make_plan(problem, choices, bound=new.bound, unproven=new.unproven)
+        return replace(plan, blocks={key: replace(block, why=why.get(key, "")) for key, block in plan.blocks.items()})
+
+    def _is_made(
+        self, problem: Problem, together: Sequence[_Difference], load: Mapping[FleetKey, int], now: float
+    ) -> bool:
+        if any(difference.old is None for difference in together):
+            return True
+        more = _more_excess(problem, together, load)
+        if more:
+            return more < 0
+        spent = any(self._is_spent(difference.block.key, now) for difference in together)
+        return not spent and _is_worth_it(problem.objective, together)
+
+    def _is_spent(self, key: BlockKey, now: float) -> bool:
+        times = self._changed.get(key, ())
+        return sum(now - time < CHANGE_WINDOW_S for time in times) >= MAX_CHANGES
+
+
+def _differences(problem: Problem, new: Plan, old: Mapping[BlockKey, Choice | None]) -> list[_Difference]:
+    found: list[_Difference] = []
+    for block in problem.blocks:
+        choice = choice_of(block, new.blocks.get(block.key))
+        if choice is None:
+            raise ValueError("the plan does not fit the problem")
+        before = old[block.key]
+        if choice != before:
+            gained = _limited(problem, block, choice)
+            lost = _limited(problem, block, before) if before is not None else {}
+            change = {key: gained.get(key, 0) - lost.get(key, 0) for key in gained | lost}
+            found.append(_Difference(block, choice, before, {key: count for key, count in change.items() if count}))
+    return found
+
+
+def _limited(problem: Problem, block: Block, choice: Choice) -> dict[FleetKey, int]:
+    """Interfaces that the choice gives each limit over all robots."""
+    counts = zip(block.servers, loads(choice, len(block.servers)), strict=True)
+    found = {FleetKey(server, block.key.service): count for server, count in counts if count}
+    return {key: count for key, count in found.items() if key in problem.fleet_capacity}
+
+
+def _linked(
+    problem: Problem, differences: Sequence[_Difference], load: Mapping[FleetKey, int]
+) -> list[list[_Difference]]:
+    """Put those together that touch a limit which would be exceeded if all came that want and none went."""
+    coming: Counter[FleetKey] = Counter()
+    touching: dict[FleetKey, list[int]] = {}
+    for number, difference in enumerate(differences):
+        for key, count in difference.load.items():
+            touching.setdefault(key, []).append(number)
+            coming[key] += max(0, count)
+    leader = list(range(len(differences)))
+
+    def find(number: int) -> int:
+        while leader[number] != number:
+            leader[number] = number = leader[leader[number]]
+        return number
+
+    for key, numbers in touching.items():
+        if load.get(key, 0) + coming[key] > problem.fleet_capacity[key]:
+            for number in numbers[1:]:
+                leader[find(number)] = find(numbers[0])
+    groups: dict[int, list[_Difference]] = {}
+    for number, difference in enumerate(differences):
+        groups.setdefault(find(number), []).append(difference)
+    return list(groups.values())
+
+
+def _more_excess(problem: Problem, together: Sequence[_Difference], load: Mapping[FleetKey, int]) -> int:
+    """By how many more interfaces capacities are exceeded with these changes."""
+    more = 0
+    change: Counter[FleetKey] = Counter()
+    for difference in together:
+        before = difference.old or ()
+        more += block_excess(difference.block, difference.new) - block_excess(difference.block, before)
+        change.update(difference.load)
+    for key, count in change.items():
+        over = load.get(key, 0) - problem.fleet_capacity[key]
+        more += max(0, over + count) - max(0, over)
+    return more
+
+
+def _is_worth_it(objective: Objective, together: Sequence[_Difference]) -> bool:
+    """Whether these changes save enough at today's estimates."""
+    pairs = [(difference.block, difference.new, difference.old or ()) for difference in together]
+    then = sum(block_cost(objective, block, old) for block, _, old in pairs)
+    saved = then - sum(block_cost(objective, block, new) for block, new, _ in pairs)
+    if objective is Objective.SUM:
+        return saved > max(IMPROVEMENT_MIN, IMPROVEMENT_SHARE * then)
+    fewer = sum(joint_miss(block, old) - joint_miss(block, new) for block, new, old in pairs)
+    return saved > IMPROVEMENT_LOG * len(pairs) and fewer > IMPROVEMENT_MIN_ALL_MISS
+
+
+def _reason(difference: _Difference) -> str:
+    if difference.old is None:
+        return "moved as a path of it went or came"
+    then, now = (joint_miss(difference.block, choice) for choice in (difference.old, difference.new))
+    if then <= now:
+        return "moved to make room for others"
+    return f"moved as all copies would have missed with probability {then:.2g}, now {now:.2g}"
