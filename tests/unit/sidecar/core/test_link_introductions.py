@@ -1,0 +1,160 @@
+"""How a link introduces its session and takes the introductions of others: they prove little and move nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from protos.model import InterfaceId, NodeName
+from sidecar.core import frame
+from sidecar.core.frame import Probe, ProbeReply
+from sidecar.core.introduction import Introduction
+from sidecar.core.link_events import (
+    PathChanged,
+    SetCredential,
+)
+from sidecar.core.path_id import PathId, PathState
+from sidecar.core.path_table import MAX_PATHS_OF_A_PEER
+from sidecar.core.paths import FIRST_PROBE_S
+from tests.unit.sidecar.core.builders import (
+    PEER_ADDRESS,
+    WLAN,
+    A,
+    Bench,
+)
+from tests.unit.sidecar.core.test_link import (
+    ELSEWHERE,
+    OUR_INTRODUCTION,
+    PROBE,
+    numbers,
+    state_changes,
+    up,
+)
+
+NEW_INTERFACE = InterfaceId(8)
+NEW_PATH = PathId(WLAN, A, NEW_INTERFACE)
+
+
+def introduce(bench: Bench, number: int, **changes: Any) -> None:
+    """The peer introduces itself from an interface that no view has named."""
+    bench.receive_datagram(bench.introduction(**{"number": number, "interface": NEW_INTERFACE, **changes}))
+
+
+def test_a_peers_new_interface_is_known_by_its_introduction_before_any_view_names_it() -> None:
+    bench = up()
+    introduce(bench, 0)
+    reply, probe = bench.frames(bench.sent())
+    assert reply == ProbeReply(77)
+    assert isinstance(probe, Probe)
+    answer = bench.datagram(frame.encode_probe_reply(ProbeReply(probe.id)), number=1, interface=NEW_INTERFACE)
+    bench.now += 0.01
+    bench.receive_datagram(answer)
+    assert PathChanged(NEW_PATH, PathState.UP, "answers") in bench.events()
+    bench.know()  # a view that still does not name it
+    assert state_changes(bench) == []
+    assert bench.link.in_use(PEER_ADDRESS)
+
+
+def test_an_introduction_is_answered_where_it_came_from_in_fewer_bytes_and_moves_nothing() -> None:
+    bench = up()
+    question = bench.introduction(number=50)
+    bench.receive_datagram(question, ELSEWHERE)
+    (answer,) = bench.link.batches_to_send(bench.now)
+    assert answer.address == ELSEWHERE
+    assert len(answer.data) < len(question)
+    assert bench.events() == []
+    assert bench.link.in_use(PEER_ADDRESS)
+    assert not bench.link.in_use(ELSEWHERE)
+
+
+def test_who_introduces_itself_again_after_an_answer_is_introduced_to_at_that_place() -> None:
+    """It can not read the answer of a session that it does not know yet."""
+    bench = up()
+    for number in (0, 1):
+        bench.receive_datagram(bench.introduction(number=number, interface=NEW_INTERFACE), ELSEWHERE)
+        answers = bench.frames(bench.sent() + bench.wait(FIRST_PROBE_S))
+        assert any(isinstance(item, Introduction) for item in answers) is (number == 1)
+
+
+def test_a_credential_signed_anew_is_introduced_from_then_on() -> None:
+    bench = Bench()
+    (before,) = bench.frames(bench.sent())
+    renewed = replace(bench.own.credential, certificate=b"renewed", signature=b"again")
+    bench.execute(SetCredential(renewed.encode()))
+    (after,) = bench.frames(bench.wait(FIRST_PROBE_S * 1.2))
+    assert before == OUR_INTRODUCTION
+    assert after == Introduction(1, renewed)
+
+
+def test_introductions_that_find_the_path_down_bring_few_of_ours_to_where_they_come_from() -> None:
+    """The peer may not know our session; but who knows its token must not make us flood others."""
+    bench = Bench()
+    bench.wait(10.0)
+    ours = 0
+    start = bench.now
+    for number in range(1000):
+        bench.now += 0.001
+        bench.receive_datagram(bench.introduction(number=number), ELSEWHERE)
+        for batch in bench.link.batches_to_send(bench.now):
+            if batch.address == ELSEWHERE:
+                ours += sum(isinstance(item, Introduction) for item in bench.frames(map(bytes, batch.cut())))
+    assert 1 <= ours <= (bench.now - start) / FIRST_PROBE_S + 1
+
+
+def test_an_introduction_that_comes_again_is_not_answered_once_something_newer_was_authentic() -> None:
+    bench = up()
+    again = bench.introduction(number=5)
+    bench.receive(PROBE, number=6)
+    bench.sent()
+    bench.receive_datagram(again, ELSEWHERE)
+    assert bench.sent() == []
+    assert bench.link.stats.dropped == {"duplicate": 1}
+
+
+def test_introductions_do_not_keep_sealed_datagrams_out() -> None:
+    """Whoever knows the token could send one with the largest packet number."""
+    bench = up()
+    bench.receive_datagram(bench.introduction(number=2**64 - 1))
+    bench.sent()
+    bench.receive(PROBE)
+    assert bench.frames(bench.sent()) == [ProbeReply(1)]
+    assert bench.link.stats.dropped == {}
+
+
+def test_a_wrong_token_introduces_nobody_and_nothing_changed_on_the_way_does() -> None:
+    bench = up()
+    introduce(bench, 0, token=bytes(16))
+    introduce(bench, 0, receiver=NodeName("robot-2"))
+    changed = bytearray(bench.introduction(number=0, interface=NEW_INTERFACE))
+    changed[60] ^= 1
+    bench.receive_datagram(bytes(changed))
+    introduce(bench, 0, name=NodeName("cloud-b"))
+    assert bench.sent() == []
+    assert bench.link.stats.dropped == {"unknown_introducer": 1, "unauthentic": 2, "malformed": 1}
+
+
+def test_introduced_paths_are_capped_and_unproven_ones_make_room() -> None:
+    bench = up()
+    for interface in range(10, 10 + MAX_PATHS_OF_A_PEER):
+        introduce(bench, 0, interface=InterfaceId(interface))
+    assert len(bench.link._paths) == MAX_PATHS_OF_A_PEER
+    assert (A, InterfaceId(0)) in bench.link._paths, "the one that the view names and that lives"
+    for path in bench.link._paths.values():
+        path.remote = path.remote or ELSEWHERE
+    introduce(bench, 0)
+    assert bench.link.stats.dropped == {"paths_full": 1}
+    bench.wait(1.0)
+
+
+def test_an_introduced_path_that_is_down_is_forgotten_with_the_next_view_but_its_numbers_are_not() -> None:
+    bench = up()
+    introduce(bench, 0)
+    bench.sent()
+    sealed = bench.datagram(PROBE, number=1, interface=NEW_INTERFACE)
+    bench.receive_datagram(sealed)
+    first = numbers(bench.sent())
+    bench.know()
+    introduce(bench, 2)
+    bench.receive_datagram(sealed)
+    assert bench.link.stats.dropped == {"duplicate": 1}
+    assert numbers(bench.sent())[0] > first[-1], "packet numbers go on"
