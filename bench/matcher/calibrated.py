@@ -1,4 +1,4 @@
-"""Section `calibration`: are predicted miss ratios those observed?"""
+"""Section `calibration`: are predicted miss ratios those observed, and does it help to choose by them?"""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ from statistics import fmean
 from typing import TYPE_CHECKING
 
 from bench.dataplane.section import Figure, Findings, Plot, Table
-from bench.matcher.calibration import DEADLINES_S, FEWEST_MISSES, KINDS, Cell, cells_of, paired, share_calibrated
+from bench.matcher.calibration import (
+    DEADLINES_S,
+    FEWEST_MISSES,
+    KINDS,
+    Cell,
+    cells_of,
+    paired,
+    predict,
+    share_calibrated,
+)
+from bench.matcher.choosing import RIVALS, Chosen, choose
 from bench.matcher.races import replay, workloads_for
 from bench.matcher.sources import load
 
@@ -27,20 +37,48 @@ def measure(folder: Path | None, say: Callable[[str], None], *, quick: bool) -> 
     if quick:
         traces = list({trace.name.rpartition("-")[0]: (trace, kind) for trace, kind in traces}.values())
     cells: list[Cell] = []
+    chosen: list[Chosen] = []
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         for (trace, _), found in zip(traces, pool.map(_cells, traces), strict=True):
             say(f"calibration: {trace.name}")
-            cells += found
+            cells += found[0]
+            chosen += found[1]
     findings = Findings(notes=[note] if note else [])
-    findings.figures = _figures(cells, len(traces))
-    findings.tables = [_by_deadline(cells), _by_family(cells), _misfits(cells)]
+    findings.figures = _figures(cells, len(traces)) | _choice_figures(chosen)
+    findings.tables = [_by_deadline(cells), _by_family(cells), _misfits(cells), _choices(chosen)]
     findings.plots = [_plot(cells)]
     return findings
 
 
-def _cells(source: tuple[Trace, str]) -> list[Cell]:
+def _cells(source: tuple[Trace, str]) -> tuple[list[Cell], list[Chosen]]:
     trace, kind = source
-    return [cell for workload in workloads_for(kind) for cell in cells_of(replay(trace, workload))]
+    cells: list[Cell] = []
+    chosen: list[Chosen] = []
+    for workload in workloads_for(kind):
+        races = replay(trace, workload)
+        for deadline_s in DEADLINES_S:
+            predicted = predict(races, deadline_s)
+            cells += cells_of(races, deadline_s, predicted)
+            chosen.append(choose(races, predicted))
+    return cells, chosen
+
+
+def _choice_figures(chosen: Sequence[Chosen]) -> dict[str, Figure]:
+    matcher = sum(one.misses["matcher"] for one in chosen)
+    figures: dict[str, Figure] = {}
+    for rival in RIVALS:
+        misses = sum(one.misses[rival] for one in chosen)
+        figures[f"choice_over_{rival.lower().replace(' ', '_')}"] = matcher / misses if misses else None
+    minutes = sum(one.duration_s for one in chosen) / 60.0
+    figures["choice_switches_per_minute"] = sum(one.switches for one in chosen) / minutes if minutes else None
+    return figures
+
+
+def _choices(chosen: Sequence[Chosen]) -> Table:
+    requests = sum(one.requests for one in chosen)
+    rows = [(name, sum(one.misses[name] for one in chosen) / requests) for name in ("matcher", *RIVALS)]
+    switches = sum(one.switches for one in chosen)
+    return Table(f"one path at a time, miss ratio; the matcher switched {switches} times", ("", "missed"), tuple(rows))
 
 
 def _figures(cells: Sequence[Cell], traces: int) -> dict[str, Figure]:

@@ -66,33 +66,31 @@ class Cell:
         return self.expected / NEAR <= self.observed <= self.expected * NEAR
 
 
-def cells_of(races: Races) -> Iterator[Cell]:
-    """All cells of one replay."""
-    for deadline_s in DEADLINES_S:
-        counts, estimates, misses = _predict(races, deadline_s)
-        first, second = estimates[..., 0], estimates[..., 1]
-        low, mean, high = beta.ppf(0.05, first, second), first / (first + second), beta.ppf(0.95, first, second)
-        expected, lows, highs = (counts @ values for values in (mean, low, high))
-        observed = misses.sum(axis=0)
-        for kind, which in zip(KINDS, (0, 1, 2, 2), strict=True):
-            column = KINDS.index(kind)
-            yield Cell(
-                races.trace,
-                races.workload.name,
-                deadline_s,
-                kind,
-                int(counts.sum()),
-                float(expected[column]),
-                float(lows[column]),
-                float(highs[column]),
-                int(observed[which]),
-            )
+def cells_of(races: Races, deadline_s: float, predicted: Arrays) -> Iterator[Cell]:
+    """The cells of one replay by one deadline."""
+    counts, estimates, misses = predicted
+    first, second = estimates[..., 0], estimates[..., 1]
+    low, mean, high = beta.ppf(0.05, first, second), first / (first + second), beta.ppf(0.95, first, second)
+    expected, lows, highs = (counts @ values for values in (mean, low, high))
+    observed = misses.sum(axis=0)
+    for column, (kind, which) in enumerate(zip(KINDS, (0, 1, 2, 2), strict=True)):
+        yield Cell(
+            races.trace,
+            races.workload.name,
+            deadline_s,
+            kind,
+            int(counts.sum()),
+            float(expected[column]),
+            float(lows[column]),
+            float(highs[column]),
+            int(observed[which]),
+        )
 
 
 Arrays = tuple["np.ndarray[tuple[int, ...], np.dtype[np.float64]]", ...]
 
 
-def _predict(races: Races, deadline_s: float) -> Arrays:
+def predict(races: Races, deadline_s: float) -> Arrays:
     """For each report's interval: requests; Beta parameters of each kind; misses on a, on b, on both."""
     reporter = Reporter(deadline_s, random.Random(zlib.crc32(races.trace.encode())))
     estimator = Estimator(half_life_s=HALF_LIFE_S)

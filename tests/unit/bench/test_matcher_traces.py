@@ -7,7 +7,8 @@ import random
 
 import pytest
 
-from bench.matcher.calibration import Cell, cells_of, paired, share_calibrated
+from bench.matcher.calibration import DEADLINES_S, Cell, cells_of, paired, predict, share_calibrated
+from bench.matcher.choosing import choose
 from bench.matcher.feed import LIFETIME_S, Reporter
 from bench.matcher.fifo import FifoLink, FifoPath
 from bench.matcher.races import Probe, Race, Workload, replay
@@ -15,7 +16,6 @@ from bench.matcher.sources import synthetic
 from bench.netlab.profile import LinkProfile
 from bench.netlab.traces import TraceStep
 from protos.convert import report_from_proto, report_to_proto
-from sidecar.core.copies import OBSERVED_ONE_IN
 
 KBPS = 1000.0
 """125 bytes a millisecond."""
@@ -111,11 +111,16 @@ def test_of_a_request_that_is_no_full_race_only_the_pair_is_told() -> None:
 def test_predictions_meet_what_is_observed_on_random_paths() -> None:
     races = replay(synthetic(3), Workload("20 kB", 20_000, 10.0))
     assert races == replay(synthetic(3), Workload("20 kB", 20_000, 10.0)), "the same every time"
-    cells = list(cells_of(races))
+    predicted = {deadline_s: predict(races, deadline_s) for deadline_s in DEADLINES_S}
+    cells = [cell for deadline_s in DEADLINES_S for cell in cells_of(races, deadline_s, predicted[deadline_s])]
     share = share_calibrated(cells)
     assert share is not None
     assert share > 0.75
     assert len({(cell.deadline_s, cell.kind) for cell in cells}) == len(cells)
+    chosen = choose(races, predicted[0.5])
+    assert chosen.misses["matcher"] <= 1.15 * chosen.misses["best fixed"]
+    assert chosen.misses["matcher"] < min(chosen.misses["random"], chosen.misses["round robin"])
+    assert 0 < chosen.switches < races.duration_s / 10
     for product, joint in paired(cells):
         assert joint.kind == "joint"
         assert product.observed == joint.observed
@@ -132,4 +137,3 @@ def test_the_judge_counts_what_is_near_or_inside() -> None:
     assert share_calibrated([cell(160, half=60.0)]) == 1.0
     assert share_calibrated([cell(5, expected=20.0)]) is None
     assert cell(100).log_error == 0.0
-    assert OBSERVED_ONE_IN > 1
