@@ -9,7 +9,8 @@ URGENT_DELAY_S = 0.05
 interfaces of a robot that enters a tunnel), and little beside the second a human would notice."""
 
 ROUTINE_INTERVAL_S = 1.0
-"""Between two solvings for the sake of new reports alone: epsilons move with a half-life of about a minute."""
+"""Between two solvings for the sake of new reports alone: estimates follow reports, which come twice a second,
+and solving a large fleet takes about this long."""
 
 ROUTINE_TIMES = 4.0
 """Routine solvings of a large fleet start this many times their own duration apart, to leave time for the rest."""
