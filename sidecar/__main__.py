@@ -20,6 +20,7 @@ from protos.errors import ConfigError
 from protos.tls_files import load_tls_files
 from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
 from sidecar.logging_setup import Logging
+from sidecar.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -123,7 +124,7 @@ def _run(config: SidecarConfig) -> int:
     # Late: it takes a second to import, and a wrong configuration is to be told at once.
     from sidecar.runtime import run
 
-    stop = threading.Event()
+    stop = StopRequest()
     with Logging(config.log_level.value, sys.stderr):
         failure = _stop_on_signals_and_crashes(stop)
         try:
@@ -136,7 +137,7 @@ def _run(config: SidecarConfig) -> int:
     return EXIT_FAILURE if failure.is_set() else code
 
 
-def _stop_on_signals_and_crashes(stop: threading.Event) -> threading.Event:
+def _stop_on_signals_and_crashes(stop: StopRequest) -> threading.Event:
     """Set `stop` on SIGTERM, SIGINT and when a thread dies; returns what is set in the last case."""
     failure = threading.Event()
     stopping_since = math.inf
@@ -147,17 +148,15 @@ def _stop_on_signals_and_crashes(stop: threading.Event) -> threading.Event:
         if now - stopping_since > IMPATIENT_AFTER_S:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
-        if not stop.is_set():
-            stopping_since = now
-            log.info("stopping on %s", signal.Signals(number).name)
-            stop.set()
+        stopping_since = min(stopping_since, now)
+        stop.set(f"on {signal.Signals(number).name}")
 
     def on_crash(crash: threading.ExceptHookArgs) -> None:
         name = crash.thread.name if crash.thread else "a thread"
         value = crash.exc_value or crash.exc_type()
         log.critical("%s died: stopping", name, exc_info=(crash.exc_type, value, crash.exc_traceback))
         failure.set()
-        stop.set()
+        stop.set(f"as {name} died")
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)

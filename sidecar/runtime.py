@@ -26,13 +26,12 @@ from sidecar.start_session import signed, start_session
 from sidecar.state_store import StateDirError, StateStore
 
 if TYPE_CHECKING:
-    import threading
-
     from protos.metrics_server import MetricsServer
     from protos.model import Assignment, InterfaceName, MappingSet, PeerSet, Report, ServiceName, Welcome
     from protos.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
     from sidecar.core.stun_events import StunEvent
+    from sidecar.stop_request import StopRequest
 
 log = logging.getLogger(__name__)
 
@@ -234,7 +233,7 @@ def _open_store(config: SidecarConfig) -> StateStore:
         raise ConfigError("the configuration", "state_dir", f"{error} ({config.state_dir})") from error
 
 
-def run(config: SidecarConfig, version: str, stopping: threading.Event) -> int:
+def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
     """Run a sidecar until `stopping` is set; returns the exit code.
 
     Raises:
@@ -250,8 +249,7 @@ def run(config: SidecarConfig, version: str, stopping: threading.Event) -> int:
     gc.collect()
     gc.freeze()
     notifier.notify("READY=1")
-    stopping.wait()
-    log.info("stopping: no new requests, finishing those in flight")
+    log.info("stopping %s: no new requests, finishing those in flight", stopping.wait())
     notifier.notify("STOPPING=1")
     sidecar.stop()
     return 0
