@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.permits import Permits
+    from controlplane.core.posterior import Estimate
     from controlplane.core.problem import Objective, Path
     from controlplane.core.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceName, ServiceUse
@@ -111,14 +112,13 @@ def _block(
     reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
     overhead_s = estimator.overhead(robot.name, use.name, now)
 
-    def epsilon(interface: InterfaceName, server: NodeName) -> float | None:
+    def estimate(interface: InterfaceName, server: NodeName) -> Estimate | None:
         if (interface, server) not in up:
             return None
-        return estimator.estimate(
-            robot.name, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s
-        ).mean
+        return estimator.estimate(robot.name, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s)
 
-    epsilons = tuple(tuple(epsilon(interface, server) for server in reached) for interface in lit)
+    estimates = [[estimate(interface, server) for server in reached] for interface in lit]
+    epsilons = tuple(tuple(found.mean if found else None for found in row) for row in estimates)
     block = Block(
         key=BlockKey(robot.name, use.name),
         interfaces=lit,
@@ -127,6 +127,7 @@ def _block(
         capacity=capacity,
         idempotent=use.idempotent,
         lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
+        weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
     dark = tuple(interface for interface in interfaces if interface not in lit)
     return block, BlockNotes(servers, dark, all_dark)

@@ -18,6 +18,8 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
+from controlplane.core.posterior import Estimate
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
@@ -67,6 +69,16 @@ class Block:
     idempotent: bool = True
     lifts: Mapping[tuple[Path, Path], float] = field(default_factory=dict)
     """P(both miss) / (epsilon_1 epsilon_2) of two paths, that of the lower interface first; 1 where not named."""
+    weights: tuple[tuple[float, ...], ...] = ()
+    """By interface, then server: how many independent requests that epsilon is worth; empty if all are exact."""
+
+    def estimate(self, path: Path) -> Estimate | None:
+        """What is believed of a path's miss probability; None if there is no path, or its epsilon is exact."""
+        interface, server = path
+        epsilon = self.epsilon[interface][server]
+        if epsilon is None or not self.weights:
+            return None
+        return Estimate.of(epsilon, self.weights[interface][server])
 
 
 @dataclass(frozen=True, slots=True)

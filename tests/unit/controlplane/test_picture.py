@@ -9,6 +9,7 @@ from controlplane.core.objectives import joint_miss
 from controlplane.core.permits import Permits
 from controlplane.core.picture import BlockNotes, Picture, draw
 from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.posterior import IGNORANCE
 from controlplane.core.problem import BlockKey, FleetKey, Objective
 from controlplane.core.registry import Sidecar
 from protos.model import (
@@ -84,6 +85,12 @@ def test_only_paths_that_are_up_are_candidates() -> None:
     assert block.epsilon[1][0] is None
     assert block.epsilon[1][1] is not None
     assert block.epsilon[1][1] > 0.9
+    probed, guessed = block.estimate((0, 0)), block.estimate((0, 1))
+    assert probed is not None
+    assert guessed == IGNORANCE
+    assert probed.mean == pytest.approx(block.epsilon[0][0])
+    assert probed.weight > guessed.weight
+    assert block.estimate((1, 0)) is None
     assert drawn.notes[KEY] == BlockNotes(servers=(NodeName("a"), NodeName("b")))
 
 
