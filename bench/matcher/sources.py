@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import random
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.netlab.profile import LinkProfile
-from bench.netlab.traces import Trace, TraceStep, load_trace
+from bench.netlab.trace_folder import DEFAULT_FOLDER, INDEX, read_folder
+from bench.netlab.traces import Trace, TraceStep
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-DEFAULT_FOLDER = Path(__file__).resolve().parents[3] / "shared" / "traces"
-"""Beside the project's root."""
+    from pathlib import Path
 
 SYNTHETIC = 6
 SYNTHETIC_STEPS = 600
@@ -27,13 +23,11 @@ def load(folder: Path | None) -> tuple[list[tuple[Trace, str]], str]:
         LabConfigError: a trace is not readable.
     """
     folder = folder or DEFAULT_FOLDER
-    index = folder / "index.json"
-    if not index.is_file():
-        traces = [(synthetic(number), "rate") for number in range(SYNTHETIC)]
-        return traces, f"no {index}: {SYNTHETIC} random traces instead, whose figures say little of real networks"
-    entries: Sequence[dict[str, str]] = json.loads(index.read_text(encoding="utf-8"))
-    entries = sorted(entries, key=lambda entry: entry["name"])
-    return [(load_trace(folder / f"{entry['name']}.csv.gz"), entry["kind"]) for entry in entries], ""
+    entries = read_folder(folder)
+    if not entries:
+        note = f"no {folder / INDEX}: {SYNTHETIC} random traces instead, whose figures say little of real networks"
+        return [(synthetic(number), "rate") for number in range(SYNTHETIC)], note
+    return [(entry.load(), entry.kind) for entry in entries], ""
 
 
 def synthetic(seed: int) -> Trace:

@@ -1,24 +1,16 @@
-"""The offline replay: what a message on a recorded path takes, what a sidecar reports when, and the judge."""
+"""The offline replay: what a sidecar reports when, and the judge."""
 
 from __future__ import annotations
 
 import math
 import random
 
-import pytest
-
 from bench.matcher.calibration import DEADLINES_S, Cell, cells_of, paired, predict, share_calibrated
 from bench.matcher.choosing import choose
 from bench.matcher.feed import LIFETIME_S, Reporter
-from bench.matcher.fifo import FifoLink, FifoPath
 from bench.matcher.races import Probe, Race, Workload, replay
 from bench.matcher.sources import synthetic
-from bench.netlab.profile import LinkProfile
-from bench.netlab.traces import TraceStep
 from protos.convert import report_from_proto, report_to_proto
-
-KBPS = 1000.0
-"""125 bytes a millisecond."""
 
 
 class Full(random.Random):
@@ -30,51 +22,6 @@ class Full(random.Random):
 
     def randrange(self, *_: object, **__: object) -> int:
         return 0 if self.full else 1
-
-
-def steps(*rates: float, delay_ms: float = 10.0, loss: float = 0.0, queue: int = 100_000) -> tuple[TraceStep, ...]:
-    profiles = [LinkProfile(delay_ms=delay_ms, loss=loss, rate_kbps=rate, queue_bytes=queue) for rate in rates]
-    return tuple(TraceStep(float(at), profile, profile) for at, profile in enumerate(profiles))
-
-
-def sent(link: FifoLink, *messages: tuple[float, int]) -> list[float]:
-    rng = random.Random(0)
-    return [link.send(at, size, rng) for at, size in messages]
-
-
-def test_messages_take_their_size_at_the_rate_and_wait_for_those_before() -> None:
-    link = FifoLink(steps(KBPS, KBPS), up=True)
-    assert sent(link, (0.0, 12_500), (0.05, 12_500)) == pytest.approx([0.11, 0.21])
-
-
-def test_an_outage_holds_messages_back_and_a_full_queue_drops_the_newest() -> None:
-    link = FifoLink(steps(KBPS, 0.0, KBPS, queue=16_000), up=True)
-    arrivals = sent(link, (0.95, 12_500), (1.5, 12_500), (1.6, 1250))
-    assert arrivals == pytest.approx([2.06, math.inf, 2.07])
-
-
-def test_the_end_of_the_trace_in_an_outage_loses_what_waits() -> None:
-    assert sent(FifoLink(steps(KBPS, 0.0), up=True), (1.5, 1000)) == [math.inf]
-
-
-def test_loss_costs_a_round_trip_or_twice_lost_the_message() -> None:
-    always = FifoLink(steps(KBPS, loss=1.0), up=True)
-    assert sent(always, (0.0, 1250)) == [math.inf]
-
-    class Once(random.Random):
-        draws = 0
-
-        def random(self) -> float:
-            self.draws += 1
-            return 0.0 if self.draws == 1 else 0.99
-
-    link = FifoLink(steps(KBPS, loss=0.5), up=True)
-    assert link.send(0.0, 1250, Once()) == pytest.approx(0.01 + 0.01 + 2 * 0.01)
-
-
-def test_a_request_goes_up_is_processed_and_comes_down() -> None:
-    path = FifoPath(steps(KBPS, KBPS))
-    assert path.request(0.0, 12_500, 1250, 0.02, random.Random(0)) == pytest.approx(0.11 + 0.02 + 0.02)
 
 
 def race(a: float, b: float) -> Race:
