@@ -9,20 +9,26 @@ Layout 1::
     beside the buckets: `lost`, requests that were never answered
 
 A value reported at the geometric middle of its bucket is off by less than 2 %. Histograms of the same layout
-merge by adding counts, which is exact and independent of the order.
+merge by adding counts, which is exact and independent of the order; an earlier state of a histogram that only grew is
+subtracted as exactly. Old samples fade in `controlplane.core.fading`, where there is a clock to fade by.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from array import array
 from bisect import bisect_right
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from protos.errors import DecodeError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike, NDArray
 
 LAYOUT = 1
 """Number of the bucket layout above; another layout gets another number, never this one changed."""
@@ -55,6 +61,10 @@ MIDS: tuple[float, ...] = (
 )
 """The value that stands for a bucket, seconds: its geometric middle; for overflow its lower edge."""
 
+_EDGES = np.array(EDGES)
+_MIDS = np.array(MIDS)
+_EMPTY = bytes(8 * BUCKETS)
+
 MAX_COUNT = 1 << 40
 """Largest count accepted from the network: more than any sidecar sends in a lifetime, and far from
 where a 64-bit sum or a float would lose it."""
@@ -69,7 +79,8 @@ class Histogram:
     __hash__ = None  # type: ignore[assignment]  # Python's own way to say so
 
     def __init__(self) -> None:
-        self._counts = [0] * BUCKETS
+        # Of Python's integers in a row one is counted up twice as fast as in numpy, which computes on the same memory.
+        self._counts = array("q", _EMPTY)
         self._lost = 0
 
     def record(self, seconds: float) -> None:
@@ -79,6 +90,13 @@ class Histogram:
             raise ValueError("a latency is not NaN")
         self._counts[bisect_right(EDGES, seconds)] += 1
 
+    def record_many(self, seconds: ArrayLike) -> None:
+        """Count many answered requests, as `record` counts one; if one of them is NaN, none is."""
+        values = np.asarray(seconds, dtype=np.float64).ravel()
+        if np.isnan(values).any():
+            raise ValueError("a latency is not NaN")
+        self.counts[:] += np.bincount(np.searchsorted(_EDGES, values, side="right"), minlength=BUCKETS)
+
     def record_lost(self, n: int = 1) -> None:
         """Count `n` requests that were never answered."""
         if n < 0:
@@ -87,19 +105,31 @@ class Histogram:
 
     def merge(self, other: Histogram) -> None:
         """Add the counts of `other` to this one."""
-        self._counts = [a + b for a, b in zip(self._counts, other._counts, strict=True)]
+        self.counts[:] += other.counts
         self._lost += other._lost
+
+    def subtract(self, earlier: Histogram) -> None:
+        """Take away what was counted before: what is left came since.
+
+        Raises ValueError, and leaves all as it was, if `earlier` counts more anywhere: then it is not this histogram's
+        past.
+        """
+        left = self.counts - earlier.counts
+        if self._lost < earlier._lost or (left < 0).any():
+            raise ValueError("the histogram to subtract counts what this one does not")
+        self.counts[:] = left
+        self._lost -= earlier._lost
 
     def copy(self) -> Histogram:
         """A histogram of its own with the same counts."""
         twin = Histogram()
-        twin._counts = self._counts.copy()
+        twin._counts = self._counts[:]
         twin._lost = self._lost
         return twin
 
     def clear(self) -> None:
         """Forget everything."""
-        self._counts = [0] * BUCKETS
+        self._counts = array("q", _EMPTY)
         self._lost = 0
 
     def take(self) -> Histogram:
@@ -110,9 +140,9 @@ class Histogram:
         return taken
 
     @property
-    def counts(self) -> tuple[int, ...]:
-        """Count of each bucket, `BUCKETS` of them."""
-        return tuple(self._counts)
+    def counts(self) -> NDArray[np.int64]:
+        """Count of each bucket, `BUCKETS` of them: a view, which later records change."""
+        return np.frombuffer(self._counts, dtype=np.int64)
 
     @property
     def lost(self) -> int:
@@ -159,24 +189,19 @@ class Histogram:
         if not total:
             return math.nan
         rank = max(1, math.ceil(q * total))
-        seen = 0
-        for count, mid in zip(self._counts, MIDS, strict=True):
-            seen += count
-            if seen >= rank:
-                return mid
-        return math.inf
+        index = int(np.searchsorted(self.counts.cumsum(), rank))
+        return MIDS[index] if index < BUCKETS else math.inf
 
     def mean(self) -> float:
         """Mean latency of the answered requests, within 2 %; NaN if there are none."""
         answered = self.answered
-        if not answered:
-            return math.nan
-        return sum(count * mid for count, mid in zip(self._counts, MIDS, strict=True)) / answered
+        return float(self.counts @ _MIDS) / answered if answered else math.nan
 
     def to_sparse(self) -> tuple[list[int], list[int], int]:
         """Indices of the buckets in use, ascending, their counts, and the lost."""
-        indices = [index for index, count in enumerate(self._counts) if count]
-        return indices, [self._counts[index] for index in indices], self._lost
+        counts = self.counts
+        used = np.flatnonzero(counts)
+        return used.tolist(), counts[used].tolist(), self._lost
 
     @classmethod
     def from_sparse(

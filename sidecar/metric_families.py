@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import functools
-from bisect import bisect_left
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from protos.histogram import MIDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from numpy.typing import NDArray
 
     from protos.histogram import Histogram
 
@@ -48,20 +50,12 @@ def by_one(values: Mapping[S, float]) -> dict[tuple[str, ...], float]:
 
 def cumulative(histogram: Histogram) -> tuple[list[tuple[str, float]], float]:
     """Return (upper bound, count up to it) and the sum of seconds, each bucket counted whole by its middle (2 %)."""
-    counts = histogram.counts
-    below = [0] * (len(DURATION_BOUNDS_S) + 1)
-    for position, count in zip(_bucket_positions(), counts, strict=True):
-        below[position] += count
-    buckets = []
-    so_far = 0
-    for bound, count in zip((*map(str, DURATION_BOUNDS_S), "+Inf"), below, strict=True):
-        so_far += count
-        buckets.append((bound, float(so_far)))
-    return buckets, sum(count * middle for count, middle in zip(counts, MIDS, strict=True) if count)
+    inside = np.bincount(_bucket_positions(), weights=histogram.counts, minlength=len(DURATION_BOUNDS_S) + 1)
+    names = (*map(str, DURATION_BOUNDS_S), "+Inf")
+    return list(zip(names, inside.cumsum().tolist(), strict=True)), float(histogram.counts @ np.array(MIDS))
 
 
 @functools.cache
-def _bucket_positions() -> tuple[int, ...]:
+def _bucket_positions() -> NDArray[np.intp]:
     """For each bucket of the histogram, which exported bucket it belongs to; the overflow to +Inf."""
-    inside = (bisect_left(DURATION_BOUNDS_S, middle) for middle in MIDS[:-1])
-    return (*inside, len(DURATION_BOUNDS_S))
+    return np.array([*np.searchsorted(DURATION_BOUNDS_S, MIDS[:-1]), len(DURATION_BOUNDS_S)])

@@ -37,6 +37,9 @@ AT_MOST = {
 }
 """Speed and exactness of the matcher, on two cores; misses of its choice over those of others."""
 
+AT_LEAST = {"histogram_million_records_per_s": 1.0}
+"""Speed of what it rests on."""
+
 PARTS = ("calibration", "speed")
 
 
@@ -95,6 +98,10 @@ def _verdicts(findings: Findings) -> dict[str, bool]:
         value = figures.get(name)
         if value is not None:
             verdicts[f"{name} at most {most:g}"] = value <= most
+    for name, least in AT_LEAST.items():
+        value = figures.get(name)
+        if value is not None:
+            verdicts[f"{name} at least {least:g}"] = value >= least
     return verdicts
 
 

@@ -8,10 +8,13 @@ from dataclasses import replace
 from statistics import median
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from bench.dataplane.section import Figure, Findings, Table
 from bench.matcher.fleets import flow_optimum, random_fleet
 from controlplane.core.plan import relative_gap
 from controlplane.matcher import Matcher
+from protos.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,6 +23,7 @@ FLEETS = ((100, 2, 20), (1000, 2, 20), (5000, 4, 50))
 """Robots, interfaces of each, servers."""
 QUICK_FLEETS = FLEETS[:2]
 TIME_LIMIT_S = 60.0
+RECORDS = 1_000_000
 CHANGES = 60
 """Robots whose estimates change, one after the other."""
 
@@ -39,6 +43,8 @@ def measure(say: Callable[[str], None], *, quick: bool) -> Findings:
     findings.tables.append(
         Table("whole fleets, from nothing", ("fleet", "s", "CPU s", "gap to own bound", "gap to flow"), tuple(rows))
     )
+    say("speed: histogram")
+    findings.figures |= _histogram()
     for lifts in (False, True):
         name = "one_of_1000" + ("_lifts" if lifts else "")
         say(f"speed: {name}")
@@ -83,4 +89,22 @@ def _one_by_one(name: str, lifts: bool, findings: Findings) -> None:
         f"resolve_{name}_worst_ms": max(took) * 1e3,
         f"resolve_{name}_alone": matcher.incremental,
         f"resolve_{name}_gap": plan.gap,
+    }
+
+
+def _histogram() -> dict[str, Figure]:
+    """Million records a second of CPU time, one by one and in batches."""
+    values = np.random.default_rng(1).lognormal(-3.0, 1.0, RECORDS)
+    histogram = Histogram()
+    began = time.process_time()
+    histogram.record_many(values)
+    batch = time.process_time() - began
+    singles = values.tolist()
+    began = time.process_time()
+    for value in singles:
+        histogram.record(value)
+    one_by_one = time.process_time() - began
+    return {
+        "histogram_million_records_per_s": RECORDS / batch / 1e6,
+        "histogram_million_single_records_per_s": RECORDS / one_by_one / 1e6,
     }

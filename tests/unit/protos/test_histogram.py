@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protos.convert.types import histogram_to_proto
 from protos.errors import DecodeError
 from protos.histogram import BUCKETS, EDGES, GROWTH, LAYOUT, MAX_COUNT, MAX_S, MIDS, MIN_S, Histogram
 
@@ -89,6 +90,34 @@ def test_merging_equals_recording_together(a: list[float], b: list[float], lost_
     assert right == histogram_of(b, lost_b)
 
 
+@given(samples, samples)
+def test_a_batch_equals_one_by_one(before: list[float], values: list[float]) -> None:
+    batch = histogram_of(before)
+    batch.record_many(values)
+    assert batch == histogram_of(before + values)
+
+
+@given(samples, samples, st.integers(0, 9), st.integers(0, 9))
+def test_subtracting_the_past_leaves_what_came_since(a: list[float], b: list[float], lost_a: int, lost_b: int) -> None:
+    total = histogram_of(a + b, lost_a + lost_b)
+    total.subtract(histogram_of(a, lost_a))
+    assert total == histogram_of(b, lost_b)
+
+
+@pytest.mark.parametrize("other", [histogram_of([0.1, 0.1]), histogram_of([0.2]), histogram_of([], lost=2)])
+def test_what_never_was_in_it_is_not_subtracted(other: Histogram) -> None:
+    histogram = histogram_of([0.1], lost=1)
+    with pytest.raises(ValueError, match="does not"):
+        histogram.subtract(other)
+    assert histogram == histogram_of([0.1], lost=1)
+
+
+def test_the_wire_form_is_compact() -> None:
+    """A second of a busy path: 1000 latencies spread over a decade."""
+    spread = histogram_to_proto(histogram_of([0.02 * 10 ** (number / 1000) for number in range(1000)]))
+    assert len(spread.SerializeToString()) < 200
+
+
 @given(samples, st.integers(0, 9))
 def test_sparse_form_round_trips(values: list[float], lost: int) -> None:
     histogram = histogram_of(values, lost)
@@ -163,6 +192,8 @@ def test_take_returns_what_was_and_empties() -> None:
 def test_nan_and_negative_counts_are_programming_errors() -> None:
     with pytest.raises(ValueError, match="NaN"):
         Histogram().record(math.nan)
+    with pytest.raises(ValueError, match="NaN"):
+        Histogram().record_many([0.1, math.nan])
     with pytest.raises(ValueError, match="negative"):
         Histogram().record_lost(-1)
     with pytest.raises(ValueError, match="quantile"):
