@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from controlplane.core.pattern_index import PatternIndex
 from controlplane.core.registry import MAX_SIDECARS
 from protos.model import ALL_CALLS, NO_POLICY, CallPermit
 
@@ -20,7 +21,7 @@ MAX_GROUPED = 2 * MAX_SIDECARS
 """Robots whose group is kept; then all are worked out anew."""
 
 MAX_KEPT_PERMITS = 65_536
-"""Permits kept, of some hundred bytes each; then all are worked out anew."""
+"""Permits kept, of some hundred bytes each, and verdicts on offers; then all are worked out anew."""
 
 Group = frozenset[int]
 """Indices of the `calls` rules that are about a robot."""
@@ -31,7 +32,10 @@ class Permits:
 
     def __init__(self, policy: Policy | None) -> None:
         self._policy = policy
+        self._robots = PatternIndex(rule.robots for rule in (policy.calls if policy else ()))
+        self._clouds = PatternIndex(rule.clouds for rule in (policy.offers if policy else ()))
         self._groups: dict[NodeName, Group] = {}
+        self._may_offer: dict[tuple[NodeName, ServiceName], bool] = {}
         self._permits: dict[tuple[Group, NodeName], tuple[frozenset[ServiceName], CallPermit]] = {}
         self.fingerprint = NO_POLICY if policy is None else policy.fingerprint
 
@@ -46,7 +50,7 @@ class Permits:
             return frozenset()
         group = self._groups.get(robot)
         if group is None:
-            group = frozenset(index for index, rule in enumerate(self._policy.calls) if rule.concerns(robot))
+            group = self._robots.matching(robot)
             if len(self._groups) >= MAX_GROUPED:
                 self._groups.clear()
             self._groups[robot] = group
@@ -66,8 +70,7 @@ class Permits:
         names = frozenset(
             service
             for service in cloud.offered
-            if self._policy.offer_rule(cloud.name, service) is not None
-            and any(rule.lets_call(service, cloud.name) for rule in rules)
+            if self.may_offer(cloud.name, service) and any(rule.lets_call(service, cloud.name) for rule in rules)
         )
         permit = CallPermit(names)
         if len(self._permits) >= MAX_KEPT_PERMITS:
@@ -77,7 +80,16 @@ class Permits:
 
     def may_offer(self, cloud: NodeName, service: ServiceName) -> bool:
         """Whether a cloud may offer a service."""
-        return self._policy is None or self._policy.offer_rule(cloud, service) is not None
+        if self._policy is None:
+            return True
+        known = self._may_offer.get((cloud, service))
+        if known is None:
+            rules = (self._policy.offers[index] for index in self._clouds.matching(cloud))
+            known = any(rule.lets_offer(cloud, service) for rule in rules)
+            if len(self._may_offer) >= MAX_KEPT_PERMITS:
+                self._may_offer.clear()
+            self._may_offer[cloud, service] = known
+        return known
 
     def refused_offers(self, cloud: Sidecar) -> tuple[ServiceName, ...]:
         """What a cloud offers now and may not."""

@@ -30,14 +30,17 @@ class Views:
         self._robots = [sidecar for sidecar in ready if sidecar.role is Role.ROBOT]
         self._clouds = [sidecar for sidecar in ready if sidecar.role is Role.CLOUD]
         self._of_robots: dict[Group, tuple[Peer, ...]] = {}
-        self._of_clouds: dict[tuple[CallPermit, ...], tuple[Peer, ...]] = {}
+        self._of_clouds: dict[NodeName, tuple[Peer, ...]] = {}
+        self._permitted: dict[tuple[CallPermit, ...], tuple[Peer, ...]] = {}
         self._offers: dict[tuple[NodeName, CallPermit], Peer] = {}
         self._servers: dict[Group, Mapping[NodeName, CallPermit]] = {}
 
     def peers_of(self, sidecar: Sidecar) -> tuple[Peer, ...]:
         """The peers a sidecar is told of, by name."""
         if sidecar.role is Role.CLOUD:
-            return self._robots_for(sidecar)
+            if sidecar.name not in self._of_clouds:
+                self._of_clouds[sidecar.name] = self._robots_for(sidecar)
+            return self._of_clouds[sidecar.name]
         group = self._permits.group(sidecar.name)
         peers = self._of_robots.get(group)
         if peers is None:
@@ -66,11 +69,11 @@ class Views:
 
     def _robots_for(self, cloud: Sidecar) -> tuple[Peer, ...]:
         permits = tuple(self._permits.of(self._permits.group(robot.name), cloud) for robot in self._robots)
-        peers = self._of_clouds.get(permits)
+        peers = self._permitted.get(permits)
         if peers is None:
             pairs = zip(self._robots, permits, strict=True)
             peers = tuple(dataclasses.replace(robot.as_peer(), may_call=permit) for robot, permit in pairs if permit)
-            self._of_clouds[permits] = peers
+            self._permitted[permits] = peers
         return peers
 
     def removed(self, sidecar: Sidecar, known_names: Collection[NodeName]) -> tuple[RemovedPeer, ...]:
