@@ -22,9 +22,10 @@ from controlplane.core.control_events import (
     Settings,
 )
 from controlplane.core.debounce import Change, Debounce
+from controlplane.core.drawing import Drawing
 from controlplane.core.estimator import Estimator
 from controlplane.core.permits import Permits
-from controlplane.core.picture import Picture, draw
+from controlplane.core.picture import Picture
 from controlplane.core.plan import Plan
 from controlplane.core.problem import Problem
 from controlplane.core.publisher import Publisher
@@ -71,6 +72,11 @@ class ControlCore:
         self.counters = Counters()
         self.plan = Plan({})
         self._picture = Picture(Problem(()))
+        self._drawing = Drawing(
+            default_capacity_interfaces=settings.default_capacity_interfaces, objective=settings.objective
+        )
+        self._drawing_since: float | None = None
+        """When the drawing of the next problem began, None while none is drawn."""
         self._debounce = Debounce()
         self._stability = Stability()
         warm_until = now + settings.warm_up_s if settings.warm_up_s else None
@@ -97,7 +103,7 @@ class ControlCore:
             self._events.append(Close(result.replaced, CloseReason.REPLACED))
         self._streams[stream] = name
         if result.new_run:
-            self.estimator.forget_paths(name)
+            self._forget_paths(name)
         self._publisher.begin_stream(registration)
         self._events.append(Send(stream, self._welcome()))
         self._members_changed(now)
@@ -140,6 +146,9 @@ class ControlCore:
             return
         self.counters.reports += 1
         changed = self.estimator.merge(name, report, now)
+        self._drawing.reported(name, report)
+        if changed:
+            self._drawing.robot_changed(name)
         self._debounce.note(Change.PATH if changed else Change.REPORT, now)
         if self._publisher.waits_for(name, (path.server for path in report.paths)):
             self._publish_soon(now)
@@ -182,6 +191,7 @@ class ControlCore:
             return
         self._end_stream(sidecar, CloseReason.REVOKED)
         self._forget(name, RemovalReason.REVOKED)
+        self._drawing.members_changed()
         self._debounce.note(Change.MEMBERS, now)
         self._publish()
 
@@ -231,6 +241,7 @@ class ControlCore:
             self.registry.next_expiry(),
             self._publish_at,
             self._debounce.next_time(),
+            self._drawing_since,
             self._publisher.warm_until,
         )
         return min((time for time in times if time is not None), default=None)
@@ -249,11 +260,16 @@ class ControlCore:
 
     def _forget(self, name: NodeName, reason: RemovalReason) -> None:
         self._events.append(DepartureNotice(name, reason))
-        self.estimator.forget_paths(name)
+        self._forget_paths(name)
         self._refused_offers.forget(name)
         self._publisher.forget(name)
 
+    def _forget_paths(self, name: NodeName) -> None:
+        self.estimator.forget_paths(name)
+        self._drawing.robot_changed(name)
+
     def _members_changed(self, now: float) -> None:
+        self._drawing.members_changed()
         self._debounce.note(Change.MEMBERS, now)
         self._publish_soon(now)
 
@@ -264,18 +280,21 @@ class ControlCore:
     # ── solving ──
 
     def start_solving(self, now: float) -> Picture | None:
-        """The problem to solve now, if it is time to; `solved` has to follow."""
-        if not self._debounce.start(now):
-            return None
+        """The problem to solve now, if it is time to and the problem is drawn; `solved` has to follow.
+
+        Drawing takes several calls in a large fleet: until it is done `next_timer` stays in the past.
+        """
+        if self._drawing_since is None:
+            change = self._debounce.start(now)
+            if change is None:
+                return None
+            self._drawing_since = now
+            self._drawing.begin(routine=change is Change.REPORT)
         ready = (sidecar for sidecar in self.registry if sidecar.ready)
-        return draw(
-            ready,
-            self.permits,
-            self.estimator,
-            now,
-            default_capacity_interfaces=self._settings.default_capacity_interfaces,
-            objective=self._settings.objective,
-        )
+        if not self._drawing.advance(ready, self.permits, self.estimator, now):
+            return None
+        self._drawing_since = None
+        return self._drawing.picture()
 
     def solved(self, picture: Picture, plan: Plan, now: float) -> None:
         """The solver's answer to the problem of `start_solving`; what is worth a change is published."""

@@ -31,36 +31,46 @@ class Debounce:
     """Says when to solve. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        self._due: float | None = None
-        self._started = float("-inf")
+        self._urgent: Change | None = None
+        self._urgent_at = float("-inf")
+        self._reported_at: float | None = None
         self._next_routine = float("-inf")
+        self._started = float("-inf")
         self._running = False
 
     def note(self, change: Change, now: float) -> None:
         """The picture changed."""
         if change is Change.REPORT:
-            at = max(now, self._next_routine)
-        else:
-            at = now + URGENT_DELAY_S
-        self._due = at if self._due is None else min(self._due, at)
+            self._reported_at = self._reported_at if self._reported_at is not None else now
+        elif self._urgent is None:
+            self._urgent = change
+            self._urgent_at = now + URGENT_DELAY_S
 
     def next_time(self) -> float | None:
         """When to solve; None while nothing changed, or while a solving runs."""
-        return None if self._running else self._due
+        if self._running:
+            return None
+        times = [self._urgent_at] if self._urgent is not None else []
+        if self._reported_at is not None:
+            times.append(max(self._reported_at, self._next_routine))
+        return min(times, default=None)
 
-    def start(self, now: float) -> bool:
-        """Whether to solve now; if so, `finished` has to follow."""
+    def start(self, now: float) -> Change | None:
+        """What to solve for now, if anything; then `finished` has to follow. `REPORT`: for everything."""
         due = self.next_time()
         if due is None or due > now:
-            return False
-        self._due = None
+            return None
+        routine = self._reported_at is not None and self._next_routine <= now
+        change = Change.REPORT if routine else self._urgent
+        self._urgent = None
+        if routine:
+            self._reported_at = None
+            self._next_routine = now + ROUTINE_INTERVAL_S
         self._started = now
-        self._next_routine = now + ROUTINE_INTERVAL_S
         self._running = True
-        return True
+        return change
 
     def finished(self, now: float) -> None:
         """The solving that `start` began has ended."""
         self._running = False
-        interval = max(ROUTINE_INTERVAL_S, ROUTINE_TIMES * (now - self._started))
-        self._next_routine = self._started + interval
+        self._next_routine = max(self._next_routine, self._started + ROUTINE_TIMES * (now - self._started))

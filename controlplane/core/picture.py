@@ -1,22 +1,23 @@
-"""From who is there and what was measured to the assignment problem."""
+"""From what was measured to the assignment problem: a block, and what the mapping says beside its plan.
+
+Which blocks there are, and when each is drawn, is for `drawing`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem import Block, BlockKey, FleetKey, Problem
-from protos.model import Role
+from controlplane.core.problem import Block, BlockKey, Problem
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
     from controlplane.core.estimator import Estimator
-    from controlplane.core.permits import Permits
     from controlplane.core.posterior import Estimate
-    from controlplane.core.problem import Objective, Path
+    from controlplane.core.problem import Path
     from controlplane.core.registry import Sidecar
-    from protos.model import InterfaceName, NodeName, ServiceName, ServiceUse
+    from protos.model import InterfaceName, NodeName, ServiceUse
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,92 +42,53 @@ class Picture:
     notes: Mapping[BlockKey, BlockNotes] = field(default_factory=dict)
 
 
-def draw(
-    sidecars: Iterable[Sidecar],
-    permits: Permits,
-    estimator: Estimator,
-    now: float,
-    *,
-    default_capacity_interfaces: int,
-    objective: Objective,
-) -> Picture:
-    """Build the problem. Only paths that are up are candidates, unless none of a robot's is for a service."""
-    robots: list[Sidecar] = []
-    servers: dict[tuple[ServiceName, str], list[Sidecar]] = {}
-    fleet_capacity: dict[FleetKey, int] = {}
-    for sidecar in sorted(sidecars, key=lambda sidecar: sidecar.name):
-        if sidecar.role is Role.ROBOT:
-            robots.append(sidecar)
-            continue
-        if sidecar.draining:
-            continue
-        for offer in sidecar.offers:
-            servers.setdefault((offer.name, offer.type), []).append(sidecar)
-            if offer.capacity:
-                fleet_capacity[FleetKey(sidecar.name, offer.name)] = offer.capacity
-    blocks: list[Block] = []
-    notes: dict[BlockKey, BlockNotes] = {}
-    for robot in robots:
-        for use in robot.uses:
-            key = BlockKey(robot.name, use.name)
-            offering = servers.get((use.name, use.type), ())
-            group = permits.group(robot.name)
-            found = tuple(cloud.name for cloud in offering if use.name in permits.of(group, cloud))
-            if offering and not found:
-                notes[key] = BlockNotes(unserved="the access policy lets this robot call it on no live server")
-                continue
-            block, notes[key] = _block(robot, use, found, estimator, now, default_capacity_interfaces)
-            if block is not None:
-                blocks.append(block)
-    return Picture(Problem(tuple(blocks), fleet_capacity, objective), notes)
-
-
 def interfaces_of(sidecar: Sidecar) -> tuple[InterfaceName, ...]:
     """Its interfaces, in the order of their first candidate."""
     return tuple(dict.fromkeys(candidate.interface for candidate in sidecar.candidates or ()))
 
 
-def _block(
-    robot: Sidecar,
+def draw_block(
+    robot: NodeName,
     use: ServiceUse,
+    interfaces: tuple[InterfaceName, ...],
     servers: tuple[NodeName, ...],
     estimator: Estimator,
     now: float,
+    *,
     capacity: int,
-) -> tuple[Block | None, BlockNotes]:
-    if not servers:
-        return None, BlockNotes(unserved=f"no live server offers it as {use.type}")
-    interfaces = interfaces_of(robot)
-    if not interfaces:
-        return None, BlockNotes(servers, unserved="the robot has told no address yet")
+) -> tuple[Block, BlockNotes]:
+    """One robot's use of a service over its interfaces, of which there is one at least as of servers.
+
+    Only paths that are up are candidates, unless none is.
+    """
     up = {
         (interface, server)
         for interface in interfaces
         for server in servers
-        if estimator.path_up(robot.name, interface, server)
+        if estimator.path_up(robot, interface, server)
     }
     all_dark = not up
     if all_dark:
         up = {(interface, server) for interface in interfaces for server in servers}
     lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
     reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
-    overhead_s = estimator.overhead(robot.name, use.name, now)
+    overhead_s = estimator.overhead(robot, use.name, now)
 
     def estimate(interface: InterfaceName, server: NodeName) -> Estimate | None:
         if (interface, server) not in up:
             return None
-        return estimator.estimate(robot.name, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s)
+        return estimator.estimate(robot, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s)
 
     estimates = [[estimate(interface, server) for server in reached] for interface in lit]
     epsilons = tuple(tuple(found.mean if found else None for found in row) for row in estimates)
     block = Block(
-        key=BlockKey(robot.name, use.name),
+        key=BlockKey(robot, use.name),
         interfaces=lit,
         servers=reached,
         epsilon=epsilons,
         capacity=capacity,
         idempotent=use.idempotent,
-        lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
+        lifts=_lifts(BlockKey(robot, use.name), lit, reached, epsilons, estimator, now),
         weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
     dark = tuple(interface for interface in interfaces if interface not in lit)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from controlplane.core.drawing import Drawing
 from controlplane.core.estimator import Estimator
 from controlplane.core.objectives import joint_miss
 from controlplane.core.permits import Permits
-from controlplane.core.picture import BlockNotes, Picture, draw
+from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.posterior import IGNORANCE
 from controlplane.core.problem import BlockKey, FleetKey, Objective
@@ -39,7 +40,6 @@ from tests.unit.controlplane.samples import (
     use,
 )
 
-OBJECTIVE = Objective.JOINT
 KEY = BlockKey(NodeName("robot"), PLAN)
 
 
@@ -59,9 +59,13 @@ def picture(
     estimator = Estimator(half_life_s=60.0)
     if paths:
         estimator.merge(NodeName("robot"), Report(paths=paths), 0.0)
-    return draw(
-        sidecars, Permits(policy), estimator, 0.0, default_capacity_interfaces=capacity, objective=Objective.SUM
-    )
+    return drawn_by(estimator, *sidecars, capacity=capacity, policy=policy)
+
+
+def drawn_by(estimator: Estimator, *sidecars: Sidecar, capacity: int = 1, policy: Policy | None = None) -> Picture:
+    drawing = Drawing(default_capacity_interfaces=capacity, objective=Objective.SUM)
+    assert drawing.advance(sidecars, Permits(policy), estimator, 0.0)
+    return drawing.picture()
 
 
 def test_only_paths_that_are_up_are_candidates() -> None:
@@ -166,7 +170,7 @@ def test_paths_that_were_seen_to_fail_together_get_a_lift_whatever_the_order_of_
     )
     backwards = robot(candidates=interfaces("wwan0", "wlan0"))
     seen = [backwards, cloud("a"), cloud("b")]
-    drawn = draw(seen, Permits(None), estimator, 0.0, default_capacity_interfaces=1, objective=OBJECTIVE)
+    drawn = drawn_by(estimator, *seen)
     (block,) = drawn.problem.blocks
     assert block.interfaces == ("wwan0", "wlan0")
     assert block.lifts == {((0, 1), (1, 0)): pytest.approx(10.0, rel=0.1)}

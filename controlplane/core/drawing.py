@@ -1,0 +1,266 @@
+"""The picture, of which only what may have changed is drawn anew.
+
+A use of a robot is drawn again at once when a path of it goes up or down, or when who offers what to it changes. New
+reports alone make it wait for the next routine solving, those first whose robots missed more deadlines than was
+believed, then those drawn longest ago, and no more of them at a time than `ROUTINE_PAIRS`: so the work for a large
+fleet is bounded, and a robot whose network goes bad does not wait for its turn. A block that came out as before,
+within what a change of the mapping could be worth, stays the very same object, which the matcher need not solve again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from controlplane.core.picture import BlockNotes, Picture, draw_block, interfaces_of
+from controlplane.core.problem import BlockKey, FleetKey, Problem
+from protos.model import Role
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from controlplane.core.estimator import Estimator
+    from controlplane.core.permits import Group, Permits
+    from controlplane.core.problem import Block, Objective
+    from controlplane.core.registry import Sidecar
+    from protos.model import InterfaceName, NodeName, Report, ServiceName, ServiceUse
+
+SLICE_PAIRS = 200
+"""Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""
+
+ROUTINE_PAIRS = 4000
+"""Pairs estimated between two routine solvings because of reports alone: a tenth of a processor."""
+
+SURPRISE_MISSES = 2.0
+"""Misses beyond those believed in that let a robot go before others."""
+
+STALE_S = 30.0
+"""A robot that does not report is drawn again this often, as old measurements fade."""
+
+EPSILON_SHARE, EPSILON_LEAST = 0.05, 1e-5
+"""Closer to what it was, an epsilon counts as the same: half of what a change must win (`stability`)."""
+
+LIFT_SHARE = 0.1
+WEIGHT_SHARE = 0.25
+"""The same for lifts, and for the weight of an epsilon, whose root counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Inputs:
+    """What a block is drawn from beside the measurements."""
+
+    interfaces: tuple[InterfaceName, ...]
+    use: ServiceUse
+    servers: tuple[NodeName, ...]
+    unserved: str
+
+
+@dataclass(slots=True)
+class _Drawn:
+    """A use of a robot as drawn last."""
+
+    inputs: _Inputs
+    block: Block | None
+    notes: BlockNotes
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """Who is there, and what each robot could call where."""
+
+    uses: Mapping[NodeName, tuple[tuple[BlockKey, _Inputs], ...]]
+    fleet_capacity: Mapping[FleetKey, int]
+
+
+class Drawing:
+    """Keeps the picture up to date. Times are monotonic seconds."""
+
+    def __init__(self, *, default_capacity_interfaces: int, objective: Objective) -> None:
+        self._capacity = default_capacity_interfaces
+        self._objective = objective
+        self._frame: _Frame | None = None
+        self._drawn: dict[BlockKey, _Drawn] = {}
+        self._at: dict[NodeName, float] = {}
+        """When each robot was drawn last."""
+        self._urgent: dict[NodeName, None] = {}
+        self._surprise: dict[NodeName, float] = {}
+        """Robots that reported since they were drawn, and their misses beyond those believed in."""
+        self._routine = False
+        self._queue: list[NodeName] | None = None
+        """Robots still to be drawn for the next picture, the last one first; None until looked for."""
+
+    # ── what changed ──
+
+    def members_changed(self) -> None:
+        """A sidecar, its addresses or services, or the policy changed."""
+        self._frame = None
+
+    def robot_changed(self, robot: NodeName) -> None:
+        """Draw this robot in the next picture whatever it costs."""
+        self._urgent[robot] = None
+
+    def reported(self, robot: NodeName, report: Report) -> None:
+        """A robot's report was merged into the estimates."""
+        surprise = self._surprise.get(robot, 0.0)
+        for latency in report.latencies:
+            if not latency.missed:
+                continue
+            drawn = self._drawn.get(BlockKey(robot, latency.service))
+            believed = _epsilon(drawn.block, latency.interface, latency.server) if drawn and drawn.block else 0.0
+            surprise += max(0.0, latency.missed - latency.requests * believed)
+        self._surprise[robot] = surprise
+
+    # ── drawing ──
+
+    def begin(self, *, routine: bool) -> None:
+        """The next picture is wanted; unless `routine`, new reports alone do not matter for it."""
+        self._routine = routine
+        self._queue = None
+
+    def advance(self, sidecars: Iterable[Sidecar], permits: Permits, estimator: Estimator, now: float) -> bool:
+        """Draw some of what has to be drawn for the next picture; True once that is complete.
+
+        `sidecars` are those ready. To be called again until it returns True, with other work in between.
+        """
+        if self._frame is None:
+            self._frame = self._look_around(sidecars, permits)
+        if self._queue is None:
+            self._queue = self._next_routine(self._frame, now) if self._routine else []
+        self._queue += reversed(self._urgent)
+        self._urgent.clear()
+        pairs = 0
+        while self._queue and pairs < SLICE_PAIRS:
+            pairs += self._draw_robot(self._queue.pop(), self._frame, estimator, now)
+        return not self._queue
+
+    def picture(self) -> Picture:
+        """What was drawn."""
+        frame = self._frame or _Frame({}, {})
+        keys = [key for uses in frame.uses.values() for key, _ in uses if key in self._drawn]
+        blocks = tuple(block for key in keys if (block := self._drawn[key].block) is not None)
+        notes = {key: self._drawn[key].notes for key in keys}
+        return Picture(Problem(blocks, frame.fleet_capacity, self._objective), notes)
+
+    def _look_around(self, sidecars: Iterable[Sidecar], permits: Permits) -> _Frame:
+        clouds: dict[tuple[ServiceName, str], list[Sidecar]] = {}
+        fleet_capacity: dict[FleetKey, int] = {}
+        robots: list[Sidecar] = []
+        for sidecar in sorted(sidecars, key=lambda sidecar: sidecar.name):
+            if sidecar.role is Role.ROBOT:
+                robots.append(sidecar)
+                continue
+            if sidecar.draining:
+                continue
+            for offer in sidecar.offers:
+                clouds.setdefault((offer.name, offer.type), []).append(sidecar)
+                if offer.capacity:
+                    fleet_capacity[FleetKey(sidecar.name, offer.name)] = offer.capacity
+        callable_by: dict[tuple[Group, ServiceName, str], tuple[NodeName, ...]] = {}
+        uses: dict[NodeName, tuple[tuple[BlockKey, _Inputs], ...]] = {}
+        for robot in robots:
+            group = permits.group(robot.name)
+            interfaces = interfaces_of(robot)
+            found = []
+            for use in robot.uses:
+                offering = clouds.get((use.name, use.type), ())
+                kind = group, use.name, use.type
+                if kind not in callable_by:
+                    allowed = (cloud.name for cloud in offering if use.name in permits.of(group, cloud))
+                    callable_by[kind] = tuple(allowed)
+                servers = callable_by[kind]
+                key = BlockKey(robot.name, use.name)
+                found.append((key, _Inputs(interfaces, use, servers, _unserved(use, offering, servers, interfaces))))
+            uses[robot.name] = tuple(found)
+        self._forget_others(uses)
+        for name, wanted in uses.items():
+            if any(key not in self._drawn or self._drawn[key].inputs != inputs for key, inputs in wanted):
+                self._urgent[name] = None
+        return _Frame(uses, fleet_capacity)
+
+    def _forget_others(self, uses: Mapping[NodeName, tuple[tuple[BlockKey, _Inputs], ...]]) -> None:
+        keys = {key for wanted in uses.values() for key, _ in wanted}
+        self._drawn = {key: drawn for key, drawn in self._drawn.items() if key in keys}
+        self._at = {name: at for name, at in self._at.items() if name in uses}
+        self._surprise = {name: surprise for name, surprise in self._surprise.items() if name in uses}
+
+    def _next_routine(self, frame: _Frame, now: float) -> list[NodeName]:
+        """Robots to draw because of reports, those last that are drawn first."""
+        routine = [name for name in frame.uses if name not in self._urgent and self._is_due(name, now)]
+        routine.sort(key=lambda name: (-self._surprised(name), self._at.get(name, 0.0)))
+        pairs, taken = 0, 0
+        for name in routine:
+            pairs += sum(len(inputs.interfaces) * len(inputs.servers) for _, inputs in frame.uses[name])
+            taken += 1
+            if pairs >= ROUTINE_PAIRS:
+                break
+        return routine[:taken][::-1]
+
+    def _is_due(self, robot: NodeName, now: float) -> bool:
+        return robot in self._surprise or now - self._at.get(robot, now) >= STALE_S
+
+    def _surprised(self, robot: NodeName) -> float:
+        surprise = self._surprise.get(robot, 0.0)
+        return surprise if surprise >= SURPRISE_MISSES else 0.0
+
+    def _draw_robot(self, robot: NodeName, frame: _Frame, estimator: Estimator, now: float) -> int:
+        """Returns the pairs that were estimated."""
+        pairs = 0
+        for key, inputs in frame.uses.get(robot, ()):
+            before = self._drawn.get(key)
+            if inputs.unserved:
+                self._drawn[key] = _Drawn(inputs, None, BlockNotes(inputs.servers, unserved=inputs.unserved))
+                continue
+            block, notes = draw_block(
+                robot, inputs.use, inputs.interfaces, inputs.servers, estimator, now, capacity=self._capacity
+            )
+            if before is not None and before.block is not None and is_alike(block, before.block):
+                block = before.block
+            self._drawn[key] = _Drawn(inputs, block, notes)
+            pairs += len(inputs.interfaces) * len(inputs.servers)
+        self._at[robot] = now
+        self._surprise.pop(robot, None)
+        return pairs
+
+
+def _unserved(
+    use: ServiceUse, offering: Iterable[Sidecar], servers: tuple[NodeName, ...], interfaces: tuple[InterfaceName, ...]
+) -> str:
+    if servers:
+        return "" if interfaces else "the robot has told no address yet"
+    if any(True for _ in offering):
+        return "the access policy lets this robot call it on no live server"
+    return f"no live server offers it as {use.type}"
+
+
+def _epsilon(block: Block, interface: InterfaceName, server: NodeName) -> float:
+    if interface not in block.interfaces or server not in block.servers:
+        return 0.0
+    return block.epsilon[block.interfaces.index(interface)][block.servers.index(server)] or 0.0
+
+
+def is_alike(block: Block, before: Block) -> bool:
+    """Whether a block differs from what it was by no more than no change of the mapping could be worth."""
+    if replace(block, epsilon=before.epsilon, lifts=before.lifts, weights=before.weights) != before:
+        return False
+    if len(block.weights) != len(before.weights) or block.lifts.keys() != before.lifts.keys():
+        return False
+    return (
+        _are_near(_flat(block.epsilon), _flat(before.epsilon), EPSILON_SHARE)
+        and _are_near(_flat(block.weights), _flat(before.weights), WEIGHT_SHARE)
+        and all(abs(lift - before.lifts[pair]) <= LIFT_SHARE * before.lifts[pair] for pair, lift in block.lifts.items())
+    )
+
+
+def _flat(rows: Iterable[Iterable[float | None]]) -> Iterator[float | None]:
+    for row in rows:
+        yield from row
+
+
+def _are_near(values: Iterable[float | None], before: Iterable[float | None], share: float) -> bool:
+    for value, then in zip(values, before, strict=True):
+        if value is None or then is None:
+            if value is not then:
+                return False
+        elif abs(value - then) > max(EPSILON_LEAST, share * then):
+            return False
+    return True

@@ -1,0 +1,181 @@
+"""Which robots are drawn anew, and when a block counts as the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from controlplane.core.drawing import (
+    EPSILON_SHARE,
+    LIFT_SHARE,
+    ROUTINE_PAIRS,
+    SLICE_PAIRS,
+    STALE_S,
+    SURPRISE_MISSES,
+    WEIGHT_SHARE,
+    Drawing,
+    is_alike,
+)
+from controlplane.core.estimator import Estimator
+from controlplane.core.permits import Permits
+from controlplane.core.problem import Block, BlockKey, Objective
+from controlplane.core.registry import Sidecar
+from protos.model import InterfaceName, NodeName, Report, Role, ServiceSet
+from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
+
+ALL_UP = tuple(path(interface, server) for interface in ("wlan0", "wwan0") for server in ("a", "b"))
+ONE_DOWN = (path("wlan0", "a", up=False), *ALL_UP[1:])
+
+
+class Fleet:
+    """Robots with two interfaces, two clouds, and the drawing of them."""
+
+    def __init__(self, robots: int) -> None:
+        self.now = 0.0
+        self.names = [NodeName(f"robot-{number:04d}") for number in range(robots)]
+        self.estimator = Estimator(half_life_s=60.0)
+        self.drawing = Drawing(default_capacity_interfaces=1, objective=Objective.JOINT)
+        self.permits = Permits(None)
+        self.sidecars = [self._cloud(name) for name in ("a", "b")] + [
+            Sidecar(registration(name), 1e9, stream(2), interfaces("wlan0", "wwan0"), ServiceSet((), (use(),)))
+            for name in self.names
+        ]
+        for name in self.names:
+            self.report(name, Report(paths=ALL_UP))
+        self.draw(routine=True)
+
+    def _cloud(self, name: str) -> Sidecar:
+        services = ServiceSet((offer(),))
+        return Sidecar(registration(name, Role.CLOUD), 1e9, stream(1), interfaces("eth0"), services)
+
+    def report(self, robot: NodeName, report: Report) -> None:
+        if self.estimator.merge(robot, report, self.now):
+            self.drawing.robot_changed(robot)
+        self.drawing.reported(robot, report)
+
+    def draw(self, *, routine: bool) -> int:
+        """Returns in how many slices."""
+        self.drawing.begin(routine=routine)
+        slices = 1
+        while not self.drawing.advance(self.sidecars, self.permits, self.estimator, self.now):
+            slices += 1
+        return slices
+
+    def blocks(self) -> dict[NodeName, Block]:
+        return {block.key.robot: block for block in self.drawing.picture().problem.blocks}
+
+    def moved(self, before: dict[NodeName, Block]) -> set[NodeName]:
+        return {name for name, block in self.blocks().items() if block is not before.get(name)}
+
+
+def missed(times: int) -> Report:
+    return Report((latency("wlan0", "a", histogram(1.0, times=times)),), ALL_UP)
+
+
+def test_a_dead_path_draws_its_robot_alone_at_once() -> None:
+    fleet = Fleet(3)
+    before = fleet.blocks()
+    fleet.report(fleet.names[1], Report(paths=ONE_DOWN))
+    fleet.report(fleet.names[2], missed(50))
+    fleet.draw(routine=False)
+    assert fleet.moved(before) == {fleet.names[1]}
+    fleet.draw(routine=True)
+    assert fleet.moved(before) == set(fleet.names[1:])
+
+
+def test_blocks_whose_estimates_stay_are_the_same_objects() -> None:
+    fleet = Fleet(2)
+    good = Report((latency("wlan0", "a", histogram(0.01, times=200)),), ALL_UP)
+    for _ in range(20):
+        fleet.report(fleet.names[0], good)
+    fleet.draw(routine=True)
+    before = fleet.blocks()
+    fleet.report(fleet.names[0], Report((latency("wlan0", "a", histogram(0.01)),), ALL_UP))
+    fleet.draw(routine=True)
+    assert not fleet.moved(before)
+
+
+def test_a_change_of_the_members_draws_those_it_concerns() -> None:
+    fleet = Fleet(2)
+    before = fleet.blocks()
+    fleet.drawing.members_changed()
+    fleet.draw(routine=False)
+    assert not fleet.moved(before), "nothing about the robots changed"
+    fleet.sidecars[2] = replace(fleet.sidecars[2], candidates=interfaces("wlan0"))
+    del fleet.sidecars[3]
+    fleet.drawing.members_changed()
+    fleet.draw(routine=False)
+    assert fleet.moved(before) == {fleet.names[0]}
+    assert set(fleet.blocks()) == {fleet.names[0]}
+    assert fleet.blocks()[fleet.names[0]].interfaces == ("wlan0",)
+
+
+def test_a_large_fleet_is_drawn_in_slices_and_those_that_miss_come_first() -> None:
+    pairs = 4
+    at_once = ROUTINE_PAIRS // pairs
+    fleet = Fleet(at_once + 40)
+    before = fleet.blocks()
+    fleet.now = 1.0
+    for name in fleet.names[:-1]:
+        fleet.report(name, Report((latency("wlan0", "a", histogram(0.01, times=9)),), ALL_UP))
+    fleet.report(fleet.names[-1], missed(int(SURPRISE_MISSES) * 2))
+    assert fleet.draw(routine=True) == ROUTINE_PAIRS // SLICE_PAIRS
+    moved = fleet.moved(before)
+    assert len(moved) == at_once
+    assert fleet.names[-1] in moved
+    fleet.draw(routine=True)
+    assert fleet.moved(before) == set(fleet.names)
+
+
+def test_robots_that_say_nothing_are_drawn_now_and_then() -> None:
+    fleet = Fleet(1)
+    fleet.report(fleet.names[0], missed(50))
+    fleet.draw(routine=True)
+    before = fleet.blocks()
+    fleet.now = STALE_S - 1.0
+    fleet.draw(routine=True)
+    assert not fleet.moved(before)
+    fleet.now = STALE_S * 3
+    fleet.draw(routine=True)
+    assert fleet.moved(before)
+
+
+BLOCK = Block(
+    BlockKey(NodeName("robot"), PLAN),
+    (InterfaceName("wlan0"), InterfaceName("wwan0")),
+    (NodeName("a"), NodeName("b")),
+    ((0.1, None), (0.2, 0.3)),
+    lifts={((0, 0), (1, 1)): 2.0},
+    weights=((10.0, 0.0), (10.0, 10.0)),
+)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize(("times", "alike"), [(0.9, True), (1.1, False)])
+def test_a_little_is_nothing(sign: int, times: float, alike: bool) -> None:
+    def moved(share: float) -> float:
+        return 1.0 + sign * times * share
+
+    epsilon = ((0.1, None), (0.2 * moved(EPSILON_SHARE), 0.3))
+    lifts = {((0, 0), (1, 1)): 2.0 * moved(LIFT_SHARE)}
+    weights = ((10.0 * moved(WEIGHT_SHARE), 0.0), (10.0, 10.0))
+    assert is_alike(replace(BLOCK, epsilon=epsilon), BLOCK) is alike
+    assert is_alike(replace(BLOCK, lifts=lifts), BLOCK) is alike
+    assert is_alike(replace(BLOCK, weights=weights), BLOCK) is alike
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        replace(BLOCK, epsilon=((0.1, 0.1), (0.2, 0.3))),
+        replace(BLOCK, epsilon=((None, 0.1), (0.2, 0.3))),
+        replace(BLOCK, lifts={}),
+        replace(BLOCK, weights=()),
+        replace(BLOCK, capacity=2),
+        replace(BLOCK, servers=(NodeName("a"), NodeName("c"))),
+    ],
+)
+def test_another_shape_is_another_block(other: Block) -> None:
+    assert not is_alike(other, BLOCK)
+    assert not is_alike(BLOCK, other)
