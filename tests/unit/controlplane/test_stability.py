@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -69,6 +70,21 @@ def test_logarithms_change_for_a_share_and_for_misses_that_count(
     old = running([[0.1, 0.2], [0.2, 0.1]], (0, 1), objective)
     settled = settled_of(problem, solve(problem, time_limit_s=60), old)
     assert (settled.blocks[part.key].assignments != old.blocks[part.key].assignments) == changes
+
+
+@pytest.mark.parametrize(("requests", "changes"), [(2.0, False), (200.0, True)])
+def test_what_is_hardly_known_to_be_better_is_not_taken_yet(requests: float, changes: bool) -> None:
+    part = replace(block([[0.30, 0.25]]), weights=((200.0, requests),))
+    problem = Problem((part,))
+    settled = settled_of(problem, make_plan(problem, {part.key: (1,)}), make_plan(problem, {part.key: (0,)}))
+    assert (settled.blocks[part.key].assignments == (("if0", "cloud-1"),)) == changes
+
+
+def test_a_path_that_got_bad_is_left_though_rare_misses_make_the_good_one_uncertain() -> None:
+    part = replace(block([[0.2, 0.005]]), weights=((10.0, 10.0),))
+    problem = Problem((part,))
+    settled = settled_of(problem, make_plan(problem, {part.key: (1,)}), make_plan(problem, {part.key: (0,)}))
+    assert settled.blocks[part.key].assignments == (("if0", "cloud-1"),)
 
 
 def test_a_plan_over_a_dead_path_is_replaced_however_little_is_gained() -> None:
