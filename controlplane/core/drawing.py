@@ -9,7 +9,7 @@ within what a change of the mapping could be worth, stays the very same object, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from controlplane.core.picture import BlockNotes, Picture, draw_block, interfaces_of
@@ -17,13 +17,13 @@ from controlplane.core.problem import BlockKey, FleetKey, Problem
 from protos.model import Role
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.permits import Group, Permits
     from controlplane.core.problem import Block, Objective
     from controlplane.core.registry import Sidecar
-    from protos.model import InterfaceName, NodeName, Report, ServiceName, ServiceUse
+    from protos.model import InterfaceName, NodeName, Registration, Report, ServiceName, ServiceOffer, ServiceUse
 
 SLICE_PAIRS = 200
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""
@@ -47,12 +47,19 @@ WEIGHT_SHARE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class _Inputs:
-    """What a block is drawn from beside the measurements."""
+    """What a block is drawn from beside the measurements; equal if that is the same."""
 
     interfaces: tuple[InterfaceName, ...]
     use: ServiceUse
-    servers: tuple[NodeName, ...]
+    offers: tuple[tuple[Registration, ServiceOffer], ...]
     unserved: str
+    robot: Sidecar = field(compare=False)
+    clouds: tuple[Sidecar, ...] = field(compare=False)
+
+    @property
+    def pairs(self) -> int:
+        """Pairs to estimate."""
+        return len(self.interfaces) * len(self.clouds)
 
 
 @dataclass(slots=True)
@@ -155,21 +162,17 @@ class Drawing:
                 clouds.setdefault((offer.name, offer.type), []).append(sidecar)
                 if offer.capacity:
                     fleet_capacity[FleetKey(sidecar.name, offer.name)] = offer.capacity
-        callable_by: dict[tuple[Group, ServiceName, str], tuple[NodeName, ...]] = {}
+        callable_by: dict[tuple[Group, ServiceName, str], tuple[Sidecar, ...]] = {}
         uses: dict[NodeName, tuple[tuple[BlockKey, _Inputs], ...]] = {}
         for robot in robots:
             group = permits.group(robot.name)
-            interfaces = interfaces_of(robot)
             found = []
             for use in robot.uses:
-                offering = clouds.get((use.name, use.type), ())
                 kind = group, use.name, use.type
+                offering = clouds.get((use.name, use.type), [])
                 if kind not in callable_by:
-                    allowed = (cloud.name for cloud in offering if use.name in permits.of(group, cloud))
-                    callable_by[kind] = tuple(allowed)
-                servers = callable_by[kind]
-                key = BlockKey(robot.name, use.name)
-                found.append((key, _Inputs(interfaces, use, servers, _unserved(use, offering, servers, interfaces))))
+                    callable_by[kind] = tuple(cloud for cloud in offering if use.name in permits.of(group, cloud))
+                found.append((BlockKey(robot.name, use.name), _inputs(robot, use, offering, callable_by[kind])))
             uses[robot.name] = tuple(found)
         self._forget_others(uses)
         for name, wanted in uses.items():
@@ -189,7 +192,7 @@ class Drawing:
         routine.sort(key=lambda name: (-self._surprised(name), self._at.get(name, 0.0)))
         pairs, taken = 0, 0
         for name in routine:
-            pairs += sum(len(inputs.interfaces) * len(inputs.servers) for _, inputs in frame.uses[name])
+            pairs += sum(inputs.pairs for _, inputs in frame.uses[name])
             taken += 1
             if pairs >= ROUTINE_PAIRS:
                 break
@@ -208,28 +211,30 @@ class Drawing:
         for key, inputs in frame.uses.get(robot, ()):
             before = self._drawn.get(key)
             if inputs.unserved:
-                self._drawn[key] = _Drawn(inputs, None, BlockNotes(inputs.servers, unserved=inputs.unserved))
+                servers = tuple(cloud.name for cloud in inputs.clouds)
+                self._drawn[key] = _Drawn(inputs, None, BlockNotes(servers, unserved=inputs.unserved))
                 continue
-            block, notes = draw_block(
-                robot, inputs.use, inputs.interfaces, inputs.servers, estimator, now, capacity=self._capacity
-            )
+            block, notes = draw_block(inputs.robot, inputs.use, inputs.clouds, estimator, now, capacity=self._capacity)
             if before is not None and before.block is not None and is_alike(block, before.block):
                 block = before.block
             self._drawn[key] = _Drawn(inputs, block, notes)
-            pairs += len(inputs.interfaces) * len(inputs.servers)
+            pairs += inputs.pairs
         self._at[robot] = now
         self._surprise.pop(robot, None)
         return pairs
 
 
-def _unserved(
-    use: ServiceUse, offering: Iterable[Sidecar], servers: tuple[NodeName, ...], interfaces: tuple[InterfaceName, ...]
-) -> str:
-    if servers:
-        return "" if interfaces else "the robot has told no address yet"
-    if any(True for _ in offering):
-        return "the access policy lets this robot call it on no live server"
-    return f"no live server offers it as {use.type}"
+def _inputs(robot: Sidecar, use: ServiceUse, offering: Sequence[Sidecar], clouds: tuple[Sidecar, ...]) -> _Inputs:
+    """Of those who offer the service the robot may call it on `clouds`."""
+    interfaces = interfaces_of(robot)
+    if not offering:
+        unserved = f"no live server offers it as {use.type}"
+    elif not clouds:
+        unserved = "the access policy lets this robot call it on no live server"
+    else:
+        unserved = "" if interfaces else "the robot has told no address yet"
+    offers = tuple((cloud.registration, offer) for cloud in clouds for offer in cloud.offers if offer.name == use.name)
+    return _Inputs(interfaces, use, offers, unserved, robot, clouds)
 
 
 def _epsilon(block: Block, interface: InterfaceName, server: NodeName) -> float:

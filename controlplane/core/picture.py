@@ -48,47 +48,48 @@ def interfaces_of(sidecar: Sidecar) -> tuple[InterfaceName, ...]:
 
 
 def draw_block(
-    robot: NodeName,
+    robot: Sidecar,
     use: ServiceUse,
-    interfaces: tuple[InterfaceName, ...],
-    servers: tuple[NodeName, ...],
+    clouds: tuple[Sidecar, ...],
     estimator: Estimator,
     now: float,
     *,
     capacity: int,
 ) -> tuple[Block, BlockNotes]:
-    """One robot's use of a service over its interfaces, of which there is one at least as of servers.
+    """One robot's use of a service on these clouds, of which there is one at least, as of its interfaces.
 
     Only paths that are up are candidates, unless none is.
     """
+    interfaces = interfaces_of(robot)
+    servers = tuple(cloud.name for cloud in clouds)
     up = {
         (interface, server)
         for interface in interfaces
         for server in servers
-        if estimator.path_up(robot, interface, server)
+        if estimator.path_up(robot.name, interface, server)
     }
     all_dark = not up
     if all_dark:
         up = {(interface, server) for interface in interfaces for server in servers}
     lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
     reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
-    overhead_s = estimator.overhead(robot, use.name, now)
+    overhead_s = estimator.overhead(robot.name, use.name, now)
 
     def estimate(interface: InterfaceName, server: NodeName) -> Estimate | None:
         if (interface, server) not in up:
             return None
-        return estimator.estimate(robot, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s)
+        return estimator.estimate(robot.name, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s)
 
     estimates = [[estimate(interface, server) for server in reached] for interface in lit]
     epsilons = tuple(tuple(found.mean if found else None for found in row) for row in estimates)
     block = Block(
-        key=BlockKey(robot, use.name),
+        key=BlockKey(robot.name, use.name),
         interfaces=lit,
         servers=reached,
         epsilon=epsilons,
         capacity=capacity,
         idempotent=use.idempotent,
-        lifts=_lifts(BlockKey(robot, use.name), lit, reached, epsilons, estimator, now),
+        lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
         weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
     dark = tuple(interface for interface in interfaces if interface not in lit)
