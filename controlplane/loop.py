@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from controlplane.metrics import Metrics
     from controlplane.stun_server import StunServer
     from controlplane.tls_gate import Caller
+    from protos.explanation import Explanation
     from protos.identity import Trust
     from protos.model import NodeName, Registration, ServiceName, SidecarMessage, SidecarStatus
 
@@ -142,6 +143,10 @@ class ControlLoop:
     def status(self) -> list[SidecarStatus]:
         """Every registered sidecar."""
         return self._core.status(self._loop.time())
+
+    def explain(self, robot: NodeName, service: ServiceName) -> Explanation:
+        """Why requests go where they go. Raises UnknownNameError if the robot, or its service, is not known."""
+        return self._core.explain(robot, service, self._loop.time())
 
     def set_policy(self, policy: Policy | None) -> None:
         """Another policy is in force from now on."""

@@ -238,6 +238,7 @@ def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
         ["reason"],
         {
             ("histogram_evicted",): core.estimator.dropped,
+            ("mapping_history_evicted",): core.history.dropped,
             ("removal_forgotten",): core.registry.counters.removals_forgotten,
             ("stale_answer",): core.counters.stale_answers,
             ("old_stream",): core.counters.old_stream_messages,

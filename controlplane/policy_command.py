@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
+from controlplane.arguments import checked_name
 from controlplane.config import load_config
 from controlplane.core.policy_explain import explain
-from protos.errors import ConfigError, DecodeError
+from protos.errors import ConfigError
 from protos.names import node_name, service_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    import argparse
+
+    from controlplane.arguments import Commands
 
 EXIT_ALLOWED = 0
 EXIT_DENIED = 1
 EXIT_USAGE = 2
-
-N = TypeVar("N")
-
-if TYPE_CHECKING:
-    Commands = argparse._SubParsersAction[argparse.ArgumentParser]
 
 
 def add_to(commands: Commands) -> None:
@@ -35,20 +32,10 @@ def add_to(commands: Commands) -> None:
         epilog="exit codes: 0 allowed, 1 denied, 2 bad usage or configuration",
     )
     check.add_argument("--config", type=Path, required=True, metavar="FILE", help="the control plane's configuration")
-    check.add_argument("--robot", type=_checked(node_name), required=True, metavar="NAME")
-    check.add_argument("--service", type=_checked(service_name), required=True, metavar="NAME")
-    check.add_argument("--cloud", type=_checked(node_name), required=True, metavar="NAME")
+    check.add_argument("--robot", type=checked_name(node_name), required=True, metavar="NAME")
+    check.add_argument("--service", type=checked_name(service_name), required=True, metavar="NAME")
+    check.add_argument("--cloud", type=checked_name(node_name), required=True, metavar="NAME")
     check.set_defaults(run=_check)
-
-
-def _checked(check: Callable[[str, str], N]) -> Callable[[str], N]:
-    def parse(text: str) -> N:
-        try:
-            return check(text, "the name")
-        except DecodeError as error:
-            raise argparse.ArgumentTypeError(str(error)) from error
-
-    return parse
 
 
 def _check(arguments: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from controlplane.text_table import columns
 from protos.model import Role, SyncState
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ def render(sidecars: Sequence[SidecarStatus]) -> str:
     """One row a sidecar, then what each robot was told and on which paths it rests."""
     if not sidecars:
         return "no sidecars"
-    lines = [*_columns([_HEADER, *(_row(status) for status in sidecars)])]
+    lines = [*columns([_HEADER, *(_row(status) for status in sidecars)])]
     for status in sidecars:
         details = [*_details(status)]
         if details:
@@ -52,7 +53,7 @@ def _details(status: SidecarStatus) -> Iterator[str]:
         yield f"REFUSED by the policy: {', '.join(status.refused_offers)} (offered here, told to no robot)"
     for mapping in status.services:
         yield _mapping(mapping)
-    yield from _columns([_path(path) for path in status.paths])
+    yield from columns([_path(path) for path in status.paths])
 
 
 def _rejection(resource: ResourceStatus) -> str:
@@ -70,11 +71,3 @@ def _path(path: PathReport) -> tuple[str, ...]:
     rtt = f"rtt {median * 1000:.1f} ms" if math.isfinite(median) else "rtt -"
     lost = f"lost {path.datagrams_lost} of {path.datagrams_sent} since the last report"
     return (f"{path.interface} -> {path.server}", "up" if path.up else "DOWN", rtt, lost)
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    if not rows:
-        return
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    for row in rows:
-        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -24,10 +24,12 @@ from controlplane.core.control_events import (
 from controlplane.core.debounce import Change, Debounce
 from controlplane.core.drawing import Drawing
 from controlplane.core.estimator import Estimator
+from controlplane.core.explanation import explain, find
+from controlplane.core.mapping_history import MappingHistory
 from controlplane.core.permits import Permits
 from controlplane.core.picture import Picture
 from controlplane.core.plan import Plan
-from controlplane.core.problem import Problem
+from controlplane.core.problem import BlockKey, Problem
 from controlplane.core.publisher import Publisher
 from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import Admission, Refusal, Registry, StreamId
@@ -38,6 +40,7 @@ from protos.model import (
     CandidateSet,
     Drain,
     Heartbeat,
+    MappingSet,
     Nack,
     Registration,
     RemovalReason,
@@ -54,6 +57,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.policy import Policy
     from controlplane.core.registry import Sidecar
+    from protos.explanation import Explanation
     from protos.model import NodeName, ServiceName, SidecarMessage, SyncState
 
 PUBLISH_DELAY_S = 0.02
@@ -79,6 +83,7 @@ class ControlCore:
         """When the drawing of the next problem began, None while none is drawn."""
         self._debounce = Debounce()
         self._stability = Stability()
+        self.history = MappingHistory()
         warm_until = now + settings.warm_up_s if settings.warm_up_s else None
         self._publisher = Publisher(self.registry, version_epoch=version_epoch, warm_until=warm_until)
         self._streams: dict[StreamId, NodeName] = {}
@@ -193,7 +198,7 @@ class ControlCore:
         self._forget(name, RemovalReason.REVOKED)
         self._drawing.members_changed()
         self._debounce.note(Change.MEMBERS, now)
-        self._publish()
+        self._publish(now)
 
     def end_stream(self, name: NodeName, reason: CloseReason) -> None:
         """End a sidecar's stream; it stays registered until its lease ends."""
@@ -256,7 +261,7 @@ class ControlCore:
             self._publisher.end_warm_up()
             self._publish_soon(now)
         if self._publish_at is not None and self._publish_at <= now:
-            self._publish()
+            self._publish(now)
 
     def _forget(self, name: NodeName, reason: RemovalReason) -> None:
         self._events.append(DepartureNotice(name, reason))
@@ -306,16 +311,19 @@ class ControlCore:
             self.counters.relaxations += 1
         self.plan = settled
         self._picture = picture
-        self._publish()
+        self._publish(now)
 
     def solving_failed(self, now: float) -> None:
         """The solver raised: the plan in force stays, and it is tried again with the next routine solving."""
         self._debounce.finished(now)
         self._debounce.note(Change.REPORT, now)
 
-    def _publish(self) -> None:
+    def _publish(self, now: float) -> None:
         self._publish_at = None
-        self._events.extend(self._publisher.publish(self.permits, self.plan, self._picture))
+        for send in self._publisher.publish(self.permits, self.plan, self._picture):
+            if isinstance(send.message, MappingSet):
+                self.history.note(self._streams[send.stream], send.message, now)
+            self._events.append(send)
 
     def next_event(self) -> Event | None:
         """What the driver has to do next."""
@@ -343,6 +351,20 @@ class ControlCore:
                 )
             )
         return found
+
+    def explain(self, robot: NodeName, service: ServiceName, now: float) -> Explanation:
+        """Why requests go where they go. Raises UnknownNameError if the robot, or its service, is not known."""
+        sidecar, use = find(self.registry, robot, service)
+        return explain(
+            sidecar,
+            use,
+            picture=self._picture,
+            plan=self.plan,
+            estimator=self.estimator,
+            snapshots=self._publisher[robot],
+            history=self.history.of(BlockKey(robot, service)),
+            now=now,
+        )
 
     def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
         """How far every registered sidecar follows; clouds get no mapping."""

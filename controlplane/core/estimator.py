@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from controlplane.core.fading import FadedCount, FadedHistogram, sum_exceeds
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
+from protos.explanation import SAMPLE
+from protos.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -73,6 +75,17 @@ class PathState:
         """Share of what was sent that got lost, as datagrams or as probes, whichever is worse."""
         found = [ratio for ratio in (self.datagrams.ratio(), self.rtt.lost_share()) if not math.isnan(ratio)]
         return max(found, default=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What an estimate rests on; histograms count `protos.explanation.SAMPLE` for a sample that has not faded."""
+
+    requests: float
+    probes: float
+    rtt: Histogram
+    latency: Histogram
+    compute: Histogram
 
 
 class _PairLatency:
@@ -262,6 +275,34 @@ class Estimator:
                 prior = Estimate.of(mean, min(MODEL_REQUESTS, probes + IGNORANCE.weight))
         latency = tables.latencies.get((interface, server, service))
         return latency.outcomes.posterior(prior, now) if latency is not None else prior
+
+    def evidence(self, robot: NodeName, path: Assignment, service: ServiceName, now: float) -> Evidence:
+        """What was measured on this pair, for the operator."""
+        tables = self._robots.get(robot)
+        state = tables.paths.get((path.interface, path.server)) if tables is not None else None
+        pair = tables.latencies.get((path.interface, path.server, service)) if tables is not None else None
+        processing = self._processing.get((path.server, service))
+
+        def told(histogram: FadedHistogram | None) -> Histogram:
+            return histogram.scaled(now, SAMPLE) if histogram is not None else Histogram()
+
+        return Evidence(
+            requests=pair.outcomes.counts(now)[0] if pair is not None else 0.0,
+            probes=state.rtt.weight(now) if state is not None else 0.0,
+            rtt=told(state.rtt if state is not None else None),
+            latency=told(pair.histogram if pair is not None else None),
+            compute=told(processing),
+        )
+
+    def raced_counts(
+        self, robot: NodeName, service: ServiceName, now: float
+    ) -> Iterator[tuple[Assignment, Assignment, float, float]]:
+        """The pairs of paths that carried copies of the same requests: how many, and how many missed on both."""
+        tables = self._robots.get(robot)
+        if tables is not None:
+            for (of, first, second), together in tables.joints.items():
+                if of == service:
+                    yield (first, second, *together.counts(now))
 
     def raced_together(self, robot: NodeName, service: ServiceName) -> Iterator[tuple[Assignment, Assignment]]:
         """The pairs of paths that carried copies of the same requests."""

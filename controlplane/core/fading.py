@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protos.histogram import BUCKETS, EDGES, MAX_S, MIDS
+from protos.histogram import BUCKETS, EDGES, MAX_S, MIDS, Histogram
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from protos.histogram import Histogram
 
 _EDGES = np.array(EDGES)
 _MIDS = np.array(MIDS)
@@ -70,6 +68,13 @@ class FadedHistogram:
     def weight(self, now: float) -> float:
         """How many samples it is worth by now, the lost included."""
         return float(self._counts.sum() + self._lost) * math.exp2((self._at - now) / self._half_life_s)
+
+    def scaled(self, now: float, sample: int) -> Histogram:
+        """As a histogram of whole counts, where a sample that has not faded counts `sample`."""
+        scale = sample * math.exp2((self._at - now) / self._half_life_s)
+        counts = np.rint(self._counts * scale).astype(np.int64)
+        used = np.flatnonzero(counts)
+        return Histogram.from_sparse(used.tolist(), counts[used].tolist(), round(self._lost * scale))
 
     def fraction_over(self, seconds: float) -> float:
         """Share of all samples slower than `seconds`, the lost included; NaN without samples."""

@@ -179,6 +179,11 @@ class FadedTrials:
             sum(share * count for share, count in zip(shares, trials, strict=True)) / total,
         )
 
+    def counts(self, now: float) -> tuple[float, float]:
+        """Trials and misses that the longest memory still holds."""
+        fade = math.exp2((self._at - now) / self._half_life_s)
+        return self._memories[0].trials * fade, self._memories[0].misses * fade
+
     def design_effect(self) -> float:
         """By how much streaks inflate the variance of the ratio, at least 1."""
         return self._streaks.design_effect()

@@ -17,6 +17,7 @@ from protos.convert.control import (
     sidecar_message_from_proto,
     sidecar_message_to_proto,
 )
+from protos.convert.explanation import explain_request_from_proto, explanation_from_proto, explanation_to_proto
 from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
 from protos.convert.reports import report_from_proto, report_to_proto
 from protos.convert.types import (
@@ -41,6 +42,9 @@ __all__ = [
     "candidate_to_proto",
     "control_message_from_proto",
     "control_message_to_proto",
+    "explain_request_from_proto",
+    "explanation_from_proto",
+    "explanation_to_proto",
     "histogram_from_proto",
     "histogram_to_proto",
     "mapping_set_from_proto",

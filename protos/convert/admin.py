@@ -53,8 +53,8 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         lease_left_s=duration(message.lease_left_us, "lease_left_us", zero=True),
         software_version=text(message.software_version, "software_version"),
         uses=each(message.uses, MAX_USES, "uses", use_from_proto),
-        peers=_resource_from_proto(message.peers),
-        mapping=_resource_from_proto(message.mapping),
+        peers=resource_from_proto(message.peers),
+        mapping=resource_from_proto(message.mapping),
         services=each(message.services, MAX_MAPPED_SERVICES, "services", service_mapping_from_proto),
         paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
         refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
@@ -68,15 +68,16 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         lease_left_us=microseconds(status.lease_left_s),
         software_version=clean_text(status.software_version),
         uses=map(use_to_proto, status.uses),
-        peers=_resource_to_proto(status.peers),
-        mapping=_resource_to_proto(status.mapping),
+        peers=resource_to_proto(status.peers),
+        mapping=resource_to_proto(status.mapping),
         services=map(service_mapping_to_proto, status.services),
         paths=map(path_to_proto, status.paths),
         refused_offers=status.refused_offers,
     )
 
 
-def _resource_from_proto(message: admin_pb2.ResourceStatus) -> ResourceStatus:
+def resource_from_proto(message: admin_pb2.ResourceStatus) -> ResourceStatus:
+    """Check how far a sidecar follows."""
     return ResourceStatus(
         version_sent=version(message.version_sent, "version_sent"),
         version_acked=version(message.version_acked, "version_acked"),
@@ -85,7 +86,8 @@ def _resource_from_proto(message: admin_pb2.ResourceStatus) -> ResourceStatus:
     )
 
 
-def _resource_to_proto(status: ResourceStatus) -> admin_pb2.ResourceStatus:
+def resource_to_proto(status: ResourceStatus) -> admin_pb2.ResourceStatus:
+    """Encode how far a sidecar follows."""
     return admin_pb2.ResourceStatus(
         version_sent=status.version_sent,
         version_acked=status.version_acked,

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from protos.convert import (
     control_message_to_proto,
+    explanation_from_proto,
+    explanation_to_proto,
     parse_control_message,
     parse_sidecar_message,
     sidecar_message_to_proto,
@@ -28,6 +30,7 @@ valid_bytes = st.one_of(
     some.sidecar_messages.map(lambda value: sidecar_message_to_proto(value).SerializeToString()),
     some.control_messages.map(lambda value: control_message_to_proto(value).SerializeToString()),
     st.lists(some.statuses, max_size=2).map(lambda value: status_to_proto(value).SerializeToString()),
+    some.explanations.map(lambda value: explanation_to_proto(value).SerializeToString()),
 )
 
 
@@ -42,6 +45,9 @@ def parse_as_everything(data: bytes) -> None:
     with contextlib.suppress(DecodeError, ProtobufDecodeError):
         status = status_from_proto(admin_pb2.GetStatusResponse.FromString(data))
         assert status_from_proto(status_to_proto(status)) == status
+    with contextlib.suppress(DecodeError, ProtobufDecodeError):
+        explanation = explanation_from_proto(admin_pb2.ExplainResponse.FromString(data))
+        assert explanation_from_proto(explanation_to_proto(explanation)) == explanation
 
 
 @given(st.binary(max_size=200))

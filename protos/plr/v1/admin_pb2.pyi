@@ -45,6 +45,71 @@ SYNC_STATE_SYNCED: SyncState.ValueType  # 3
 SYNC_STATE_REJECTED: SyncState.ValueType  # 4
 Global___SyncState: _TypeAlias = SyncState  # noqa: Y015
 
+class _PathState:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _PathStateEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_PathState.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    PATH_STATE_UNSPECIFIED: _PathState.ValueType  # 0
+    PATH_STATE_UP: _PathState.ValueType  # 1
+    PATH_STATE_DOWN: _PathState.ValueType  # 2
+    PATH_STATE_UNKNOWN: _PathState.ValueType  # 3
+    """Never reported."""
+
+class PathState(_PathState, metaclass=_PathStateEnumTypeWrapper): ...
+
+PATH_STATE_UNSPECIFIED: PathState.ValueType  # 0
+PATH_STATE_UP: PathState.ValueType  # 1
+PATH_STATE_DOWN: PathState.ValueType  # 2
+PATH_STATE_UNKNOWN: PathState.ValueType  # 3
+"""Never reported."""
+Global___PathState: _TypeAlias = PathState  # noqa: Y015
+
+class _Correlation:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _CorrelationEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Correlation.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    CORRELATION_UNSPECIFIED: _Correlation.ValueType  # 0
+    CORRELATION_TOGETHER: _Correlation.ValueType  # 1
+    CORRELATION_INDEPENDENT: _Correlation.ValueType  # 2
+    CORRELATION_APART: _Correlation.ValueType  # 3
+
+class Correlation(_Correlation, metaclass=_CorrelationEnumTypeWrapper): ...
+
+CORRELATION_UNSPECIFIED: Correlation.ValueType  # 0
+CORRELATION_TOGETHER: Correlation.ValueType  # 1
+CORRELATION_INDEPENDENT: Correlation.ValueType  # 2
+CORRELATION_APART: Correlation.ValueType  # 3
+Global___Correlation: _TypeAlias = Correlation  # noqa: Y015
+
+class _AlternativeKind:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _AlternativeKindEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_AlternativeKind.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    ALTERNATIVE_KIND_UNSPECIFIED: _AlternativeKind.ValueType  # 0
+    ALTERNATIVE_KIND_OTHER: _AlternativeKind.ValueType  # 1
+    """The best ones that are not in force."""
+    ALTERNATIVE_KIND_ALONE: _AlternativeKind.ValueType  # 2
+    """One interface alone, to the server that suits it best."""
+    ALTERNATIVE_KIND_WITHOUT: _AlternativeKind.ValueType  # 3
+    """All interfaces, without one server."""
+
+class AlternativeKind(_AlternativeKind, metaclass=_AlternativeKindEnumTypeWrapper): ...
+
+ALTERNATIVE_KIND_UNSPECIFIED: AlternativeKind.ValueType  # 0
+ALTERNATIVE_KIND_OTHER: AlternativeKind.ValueType  # 1
+"""The best ones that are not in force."""
+ALTERNATIVE_KIND_ALONE: AlternativeKind.ValueType  # 2
+"""One interface alone, to the server that suits it best."""
+ALTERNATIVE_KIND_WITHOUT: AlternativeKind.ValueType  # 3
+"""All interfaces, without one server."""
+Global___AlternativeKind: _TypeAlias = AlternativeKind  # noqa: Y015
+
 @_typing.final
 class GetStatusRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
@@ -165,3 +230,299 @@ class GetStatusResponse(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___GetStatusResponse: _TypeAlias = GetStatusResponse  # noqa: Y015
+
+@_typing.final
+class ExplainRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    ROBOT_FIELD_NUMBER: _builtins.int
+    SERVICE_FIELD_NUMBER: _builtins.int
+    robot: _builtins.str
+    service: _builtins.str
+    def __init__(
+        self,
+        *,
+        robot: _builtins.str = ...,
+        service: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["robot", b"robot", "service", b"service"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ExplainRequest: _TypeAlias = ExplainRequest  # noqa: Y015
+
+@_typing.final
+class Belief(_message.Message):
+    """A probability in [0, 1], and the ends of the interval that holds it with 90 %."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MEAN_FIELD_NUMBER: _builtins.int
+    LOW_FIELD_NUMBER: _builtins.int
+    HIGH_FIELD_NUMBER: _builtins.int
+    mean: _builtins.float
+    low: _builtins.float
+    high: _builtins.float
+    def __init__(
+        self,
+        *,
+        mean: _builtins.float = ...,
+        low: _builtins.float = ...,
+        high: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["high", b"high", "low", b"low", "mean", b"mean"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Belief: _TypeAlias = Belief  # noqa: Y015
+
+@_typing.final
+class ExplainedPair(_message.Message):
+    """What is known of requests over one interface to one server. Samples fade: histograms count thousandths of a sample."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    PATH_FIELD_NUMBER: _builtins.int
+    CHOSEN_FIELD_NUMBER: _builtins.int
+    STATE_FIELD_NUMBER: _builtins.int
+    MISS_FIELD_NUMBER: _builtins.int
+    REQUESTS_FIELD_NUMBER: _builtins.int
+    PROBES_FIELD_NUMBER: _builtins.int
+    RTT_FIELD_NUMBER: _builtins.int
+    LATENCY_FIELD_NUMBER: _builtins.int
+    COMPUTE_FIELD_NUMBER: _builtins.int
+    chosen: _builtins.bool
+    state: Global___PathState.ValueType
+    requests: _builtins.float
+    """Requests and probes that are remembered."""
+    probes: _builtins.float
+    @_builtins.property
+    def path(self) -> _control_pb2.Assignment: ...
+    @_builtins.property
+    def miss(self) -> Global___Belief:
+        """Its probability to miss the deadline as the matcher took it; absent if it was no candidate."""
+
+    @_builtins.property
+    def rtt(self) -> _types_pb2.Histogram: ...
+    @_builtins.property
+    def latency(self) -> _types_pb2.Histogram:
+        """Of requests, from submit to this copy's response."""
+
+    @_builtins.property
+    def compute(self) -> _types_pb2.Histogram:
+        """What the server needed for the service, whoever asked."""
+
+    def __init__(
+        self,
+        *,
+        path: _control_pb2.Assignment | None = ...,
+        chosen: _builtins.bool = ...,
+        state: Global___PathState.ValueType = ...,
+        miss: Global___Belief | None = ...,
+        requests: _builtins.float = ...,
+        probes: _builtins.float = ...,
+        rtt: _types_pb2.Histogram | None = ...,
+        latency: _types_pb2.Histogram | None = ...,
+        compute: _types_pb2.Histogram | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "rtt", b"rtt"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["chosen", b"chosen", "compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "probes", b"probes", "requests", b"requests", "rtt", b"rtt", "state", b"state"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ExplainedPair: _TypeAlias = ExplainedPair  # noqa: Y015
+
+@_typing.final
+class ExplainedJoint(_message.Message):
+    """What became of requests that went over two paths at once."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FIRST_FIELD_NUMBER: _builtins.int
+    SECOND_FIELD_NUMBER: _builtins.int
+    REQUESTS_FIELD_NUMBER: _builtins.int
+    BOTH_MISSED_FIELD_NUMBER: _builtins.int
+    BOTH_MISS_FIELD_NUMBER: _builtins.int
+    PRODUCT_FIELD_NUMBER: _builtins.int
+    CORRELATION_FIELD_NUMBER: _builtins.int
+    SHARED_FIELD_NUMBER: _builtins.int
+    requests: _builtins.float
+    both_missed: _builtins.float
+    product: _builtins.float
+    """What the probability that both miss would be if they were independent; above 0."""
+    correlation: Global___Correlation.ValueType
+    @_builtins.property
+    def first(self) -> _control_pb2.Assignment: ...
+    @_builtins.property
+    def second(self) -> _control_pb2.Assignment: ...
+    @_builtins.property
+    def both_miss(self) -> Global___Belief: ...
+    @_builtins.property
+    def shared(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """What the two have in common, in words."""
+
+    def __init__(
+        self,
+        *,
+        first: _control_pb2.Assignment | None = ...,
+        second: _control_pb2.Assignment | None = ...,
+        requests: _builtins.float = ...,
+        both_missed: _builtins.float = ...,
+        both_miss: Global___Belief | None = ...,
+        product: _builtins.float = ...,
+        correlation: Global___Correlation.ValueType = ...,
+        shared: _abc.Iterable[_builtins.str] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["both_miss", b"both_miss", "first", b"first", "second", b"second"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["both_miss", b"both_miss", "both_missed", b"both_missed", "correlation", b"correlation", "first", b"first", "product", b"product", "requests", b"requests", "second", b"second", "shared", b"shared"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ExplainedJoint: _TypeAlias = ExplainedJoint  # noqa: Y015
+
+@_typing.final
+class Alternative(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    KIND_FIELD_NUMBER: _builtins.int
+    ASSIGNMENTS_FIELD_NUMBER: _builtins.int
+    PREDICTED_MISS_FIELD_NUMBER: _builtins.int
+    WITHOUT_FIELD_NUMBER: _builtins.int
+    NOTE_FIELD_NUMBER: _builtins.int
+    kind: Global___AlternativeKind.ValueType
+    predicted_miss: _builtins.float
+    without: _builtins.str
+    """The server that is left out."""
+    note: _builtins.str
+    """What speaks against it, in words."""
+    @_builtins.property
+    def assignments(self) -> _containers.RepeatedCompositeFieldContainer[_control_pb2.Assignment]:
+        """None if there is no such mapping."""
+
+    def __init__(
+        self,
+        *,
+        kind: Global___AlternativeKind.ValueType = ...,
+        assignments: _abc.Iterable[_control_pb2.Assignment] | None = ...,
+        predicted_miss: _builtins.float = ...,
+        without: _builtins.str = ...,
+        note: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["assignments", b"assignments", "kind", b"kind", "note", b"note", "predicted_miss", b"predicted_miss", "without", b"without"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Alternative: _TypeAlias = Alternative  # noqa: Y015
+
+@_typing.final
+class MappingChange(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    AGE_US_FIELD_NUMBER: _builtins.int
+    VERSION_FIELD_NUMBER: _builtins.int
+    MAPPING_FIELD_NUMBER: _builtins.int
+    age_us: _builtins.int
+    version: _builtins.int
+    @_builtins.property
+    def mapping(self) -> _control_pb2.ServiceMapping: ...
+    def __init__(
+        self,
+        *,
+        age_us: _builtins.int = ...,
+        version: _builtins.int = ...,
+        mapping: _control_pb2.ServiceMapping | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_us", b"age_us", "mapping", b"mapping", "version", b"version"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___MappingChange: _TypeAlias = MappingChange  # noqa: Y015
+
+@_typing.final
+class ExplainResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    ROBOT_FIELD_NUMBER: _builtins.int
+    SERVICE_FIELD_NUMBER: _builtins.int
+    DEADLINE_US_FIELD_NUMBER: _builtins.int
+    IDEMPOTENT_FIELD_NUMBER: _builtins.int
+    OBJECTIVE_FIELD_NUMBER: _builtins.int
+    MAPPING_FIELD_NUMBER: _builtins.int
+    SYNC_FIELD_NUMBER: _builtins.int
+    IN_FORCE_US_FIELD_NUMBER: _builtins.int
+    OBSERVED_MISS_FIELD_NUMBER: _builtins.int
+    PAIRS_FIELD_NUMBER: _builtins.int
+    PAIRS_LEFT_OUT_FIELD_NUMBER: _builtins.int
+    JOINTS_FIELD_NUMBER: _builtins.int
+    ALTERNATIVES_FIELD_NUMBER: _builtins.int
+    CHANGES_FIELD_NUMBER: _builtins.int
+    robot: _builtins.str
+    service: _builtins.str
+    deadline_us: _builtins.int
+    idempotent: _builtins.bool
+    objective: _builtins.str
+    """What is minimised: a value of the control plane's configuration key `objective`."""
+    in_force_us: _builtins.int
+    """Since when requests go where they go; absent if that is forgotten."""
+    observed_miss: _builtins.float
+    """Share of recent requests that missed the deadline or failed; absent without any."""
+    pairs_left_out: _builtins.int
+    """Pairs that were too many to be told of."""
+    @_builtins.property
+    def mapping(self) -> _control_pb2.ServiceMapping:
+        """As last sent; absent if nothing was."""
+
+    @_builtins.property
+    def sync(self) -> Global___ResourceStatus: ...
+    @_builtins.property
+    def pairs(self) -> _containers.RepeatedCompositeFieldContainer[Global___ExplainedPair]: ...
+    @_builtins.property
+    def joints(self) -> _containers.RepeatedCompositeFieldContainer[Global___ExplainedJoint]: ...
+    @_builtins.property
+    def alternatives(self) -> _containers.RepeatedCompositeFieldContainer[Global___Alternative]: ...
+    @_builtins.property
+    def changes(self) -> _containers.RepeatedCompositeFieldContainer[Global___MappingChange]:
+        """The last ones, the newest first."""
+
+    def __init__(
+        self,
+        *,
+        robot: _builtins.str = ...,
+        service: _builtins.str = ...,
+        deadline_us: _builtins.int = ...,
+        idempotent: _builtins.bool = ...,
+        objective: _builtins.str = ...,
+        mapping: _control_pb2.ServiceMapping | None = ...,
+        sync: Global___ResourceStatus | None = ...,
+        in_force_us: _builtins.int | None = ...,
+        observed_miss: _builtins.float | None = ...,
+        pairs: _abc.Iterable[Global___ExplainedPair] | None = ...,
+        pairs_left_out: _builtins.int = ...,
+        joints: _abc.Iterable[Global___ExplainedJoint] | None = ...,
+        alternatives: _abc.Iterable[Global___Alternative] | None = ...,
+        changes: _abc.Iterable[Global___MappingChange] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "sync", b"sync"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "alternatives", b"alternatives", "changes", b"changes", "deadline_us", b"deadline_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "robot", b"robot", "service", b"service", "sync", b"sync"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__in_force_us: _TypeAlias = _typing.Literal["in_force_us"]  # noqa: Y015
+    _WhichOneofArgType__in_force_us: _TypeAlias = _typing.Literal["_in_force_us", b"_in_force_us"]  # noqa: Y015
+    _WhichOneofReturnType__observed_miss: _TypeAlias = _typing.Literal["observed_miss"]  # noqa: Y015
+    _WhichOneofArgType__observed_miss: _TypeAlias = _typing.Literal["_observed_miss", b"_observed_miss"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__in_force_us) -> _WhichOneofReturnType__in_force_us | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__observed_miss) -> _WhichOneofReturnType__observed_miss | None: ...
+
+Global___ExplainResponse: _TypeAlias = ExplainResponse  # noqa: Y015

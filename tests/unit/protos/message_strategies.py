@@ -9,6 +9,16 @@ from typing import TypeVar
 from hypothesis import strategies as st
 
 from protos.convert.fields import MAX_CAPACITY, MAX_DURATION_S, MAX_EVENTS, MAX_VERSION
+from protos.explanation import (
+    Alternative,
+    AlternativeKind,
+    Belief,
+    Correlation,
+    Explanation,
+    JointExplanation,
+    MappingChange,
+    PairExplanation,
+)
 from protos.histogram import BUCKETS, MAX_COUNT, Histogram
 from protos.model import (
     ALL_CALLS,
@@ -212,4 +222,55 @@ statuses = st.builds(
     _tuples(service_mappings),
     _tuples(paths),
     _tuples(service_names),
+)
+
+beliefs = st.tuples(probabilities, probabilities, probabilities).map(lambda three: Belief(three[0], *sorted(three[1:])))
+weights = st.floats(0.0, MAX_EVENTS)
+explained_pairs = st.builds(
+    PairExplanation,
+    assignments,
+    st.booleans(),
+    st.sampled_from((True, False, None)),
+    st.none() | beliefs,
+    weights,
+    weights,
+    histograms(),
+    histograms(),
+    histograms(),
+)
+explained_joints = st.builds(
+    JointExplanation,
+    assignments,
+    assignments,
+    weights,
+    weights,
+    beliefs,
+    probabilities.filter(bool),
+    st.sampled_from(Correlation),
+    _tuples(texts),
+)
+alternatives = st.builds(
+    Alternative,
+    st.sampled_from(AlternativeKind),
+    _tuples(assignments),
+    probabilities,
+    st.none() | node_names,
+    texts,
+)
+explanations = st.builds(
+    Explanation,
+    node_names,
+    service_names,
+    durations,
+    st.booleans(),
+    texts,
+    resource_statuses,
+    st.none() | service_mappings,
+    st.none() | durations,
+    st.none() | probabilities,
+    _tuples(explained_pairs),
+    events,
+    _tuples(explained_joints),
+    _tuples(alternatives),
+    _tuples(st.builds(MappingChange, durations, versions, service_mappings)),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given, settings
@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from protos.convert import (
     control_message_from_proto,
     control_message_to_proto,
+    explanation_from_proto,
+    explanation_to_proto,
     parse_control_message,
     parse_sidecar_message,
     peer_from_proto,
@@ -47,6 +49,9 @@ from protos.names import MAX_STRING_BYTES, clean_text
 from protos.plr.v1 import admin_pb2, control_pb2, types_pb2
 from tests.unit.protos import message_strategies as some
 
+if TYPE_CHECKING:
+    from protos.explanation import Explanation
+
 PEERS = control_pb2.RESOURCE_KIND_PEERS
 LEFT = control_pb2.REMOVAL_REASON_LEFT
 
@@ -68,6 +73,27 @@ def test_control_messages_round_trip(value: ControlMessage) -> None:
 @settings(deadline=None, max_examples=30)
 def test_statuses_round_trip(statuses: list[SidecarStatus]) -> None:
     assert status_from_proto(status_to_proto(statuses)) == tuple(statuses)
+
+
+@given(some.explanations)
+@settings(deadline=None, max_examples=30)
+def test_explanations_round_trip(explanation: Explanation) -> None:
+    assert explanation_from_proto(explanation_to_proto(explanation)) == explanation
+
+
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [
+        (admin_pb2.ExplainResponse(), "deadline_us"),
+        (admin_pb2.ExplainResponse(deadline_us=1, observed_miss=1.5), "observed_miss"),
+        (admin_pb2.ExplainResponse(deadline_us=1, pairs=[admin_pb2.ExplainedPair()]), "interface"),
+        (admin_pb2.ExplainResponse(deadline_us=1, alternatives=[admin_pb2.Alternative()]), "kind"),
+    ],
+)
+def test_an_explanation_that_makes_no_sense_is_refused(message: admin_pb2.ExplainResponse, field: str) -> None:
+    message.robot, message.service, message.sync.state = "robot", "/plan", admin_pb2.SYNC_STATE_SYNCED
+    with pytest.raises(DecodeError, match=field):
+        explanation_from_proto(message)
 
 
 def test_a_status_never_carries_a_token() -> None:

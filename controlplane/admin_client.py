@@ -1,0 +1,104 @@
+"""How `plr` asks a running control plane: its options, the connection, and what goes wrong in one line."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import grpc
+
+from protos import tls_advice
+from protos.config_fields import check_remote
+from protos.errors import ConfigError, DecodeError
+from protos.identity import CONTROL_PLANE_DNS
+from protos.plr.v1 import admin_pb2_grpc
+from protos.tls_files import load_tls_files
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.tls_files import TlsFiles
+
+P = TypeVar("P")
+A = TypeVar("A")
+
+DEFAULT_ADDRESS = "127.0.0.1:50051"
+
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+
+_OPTIONS = (
+    # A thousand robots with their paths and histograms are more than gRPC's default of 4 MiB.
+    ("grpc.max_receive_message_length", 256 << 20),
+    # Behaviour comes from the command line, not from the environment.
+    ("grpc.enable_http_proxy", 0),
+    # Whatever its address: the name in the certificate of every control plane of the fleet.
+    ("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),
+)
+
+
+class AskError(Exception):
+    """There is no answer; the text is one line, and `code` the exit code for it."""
+
+    def __init__(self, text: str, code: int) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which control plane is asked, by whom, and how the answer is printed."""
+    parser.add_argument("--address", type=_address, default=DEFAULT_ADDRESS, metavar="HOST:PORT")
+    security = parser.add_mutually_exclusive_group(required=True)
+    security.add_argument(
+        "--tls-dir", type=Path, metavar="DIR", help="folder with an operator's certificate, as plr ca issue writes it"
+    )
+    security.add_argument("--insecure", action="store_true", help="without TLS, for a control plane that has none")
+    parser.add_argument("--timeout-s", type=float, default=5.0, metavar="SECONDS")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+
+
+def _address(text: str) -> str:
+    try:
+        return check_remote(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def ask(
+    arguments: argparse.Namespace,
+    call: Callable[[admin_pb2_grpc.AdminStub, float], P],
+    convert: Callable[[P], A],
+) -> tuple[P, A]:
+    """Make a call with the stub and the time limit in seconds; returns its answer, and that converted.
+
+    Raises:
+        AskError: no answer, or not one that `convert` takes.
+    """
+    files = None
+    address = arguments.address
+    try:
+        files = load_tls_files(arguments.tls_dir) if arguments.tls_dir is not None else None
+        with _open_channel(address, files) as channel:
+            answer = call(admin_pb2_grpc.AdminStub(channel), arguments.timeout_s)
+        return answer, convert(answer)
+    except grpc.RpcError as error:
+        # The error of a call is the call itself, which the stubs do not say.
+        detail = " ".join(str(getattr(error, "details", error.__str__)()).split())
+        code = getattr(error, "code", lambda: None)()
+        if code is grpc.StatusCode.NOT_FOUND:
+            raise AskError(detail, EXIT_FAILED) from error
+        advice = tls_advice.explain(detail, files, time.time()) if code is grpc.StatusCode.UNAVAILABLE else None
+        raise AskError(f"{address}: {advice or detail}", EXIT_FAILED) from error
+    except ConfigError as error:
+        raise AskError(str(error), EXIT_USAGE) from error
+    except DecodeError as error:
+        raise AskError(f"{address}: answers what it must not: {error}", EXIT_FAILED) from error
+
+
+def _open_channel(address: str, files: TlsFiles | None) -> grpc.Channel:
+    if files is None:
+        return grpc.insecure_channel(address, _OPTIONS)
+    credentials = grpc.ssl_channel_credentials(files.ca_pem, files.key_pem, files.certificate_pem)
+    return grpc.secure_channel(address, credentials, _OPTIONS)

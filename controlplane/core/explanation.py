@@ -1,0 +1,204 @@
+"""Why a robot's service goes where it goes, out of what the control plane decided by: its picture and its plan.
+
+Nothing here decides anything, and no epsilon is estimated anew: the explanation is of the mapping in force.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING
+
+from controlplane.core import alternatives
+from controlplane.core.beta import intervals
+from controlplane.core.picture import interfaces_of
+from controlplane.core.problem import BlockKey
+from protos.explanation import Belief, Correlation, Explanation, JointExplanation, MappingChange, PairExplanation
+from protos.model import Assignment, Role
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from controlplane.core.estimator import Estimator
+    from controlplane.core.mapping_history import History
+    from controlplane.core.picture import Picture
+    from controlplane.core.plan import Plan
+    from controlplane.core.posterior import Estimate
+    from controlplane.core.problem import Block
+    from controlplane.core.registry import Registry, Sidecar
+    from controlplane.core.snapshots import Snapshots
+    from protos.model import NodeName, ServiceMapping, ServiceName, ServiceUse
+
+LEVEL = 0.9
+"""Of the intervals told with a probability."""
+
+MAX_PAIRS = 1024
+"""Pairs told of, those in use and then the best ones: what the estimator keeps of one robot."""
+
+MIN_EXPECTED = 3.0
+"""Common misses that chance would have brought, below which their absence says nothing."""
+
+MIN_TOGETHER = 2.0
+"""Common misses that it takes to say that two paths fail together."""
+
+
+class UnknownNameError(Exception):
+    """There is no such robot, or it has no such service; the text says so in one line and names the nearest."""
+
+
+def find(registry: Registry, robot: NodeName, service: ServiceName) -> tuple[Sidecar, ServiceUse]:
+    """The robot and its use of the service. Raises UnknownNameError."""
+    sidecar = registry.get(robot)
+    if sidecar is None:
+        robots = (other.name for other in registry if other.role is Role.ROBOT)
+        raise UnknownNameError(f"no robot {robot} is registered{_nearest(robot, robots)}")
+    if sidecar.role is not Role.ROBOT:
+        raise UnknownNameError(f"{robot} is a cloud: ask about a robot")
+    for use in sidecar.uses:
+        if use.name == service:
+            return sidecar, use
+    raise UnknownNameError(f"{robot} carries no service {service}{_nearest(service, (u.name for u in sidecar.uses))}")
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    known = sorted(known)
+    if not known:
+        return ": there is none"
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def explain(
+    robot: Sidecar,
+    use: ServiceUse,
+    *,
+    picture: Picture,
+    plan: Plan,
+    estimator: Estimator,
+    snapshots: Snapshots,
+    history: History | None,
+    now: float,
+) -> Explanation:
+    """Explain the mapping that is in force for this use of this robot."""
+    key = BlockKey(robot.name, use.name)
+    block = next((block for block in picture.problem.blocks if block.key == key), None)
+    mapping = next((found for found in snapshots.mapping.sent or () if found.service == use.name), None)
+    paths = _paths(robot, picture, key, mapping)
+    return Explanation(
+        robot=robot.name,
+        service=use.name,
+        deadline_s=use.deadline_s,
+        idempotent=use.idempotent,
+        objective=picture.problem.objective.value,
+        mapping=mapping,
+        sync=snapshots.mapping.status,
+        in_force_s=now - history.since if history is not None else None,
+        observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
+        pairs=_pairs(paths, block, estimator, key, mapping, now),
+        pairs_left_out=max(0, len(paths) - MAX_PAIRS),
+        joints=_joints(block, estimator, now) if block is not None else (),
+        alternatives=alternatives.of(picture.problem, plan, block) if block is not None else (),
+        changes=_changes(history, now),
+    )
+
+
+def _paths(robot: Sidecar, picture: Picture, key: BlockKey, mapping: ServiceMapping | None) -> list[Assignment]:
+    notes = picture.notes.get(key)
+    live = notes.servers if notes is not None else ()
+    # What is in force may name a server that is gone since.
+    mapped = (path.server for path in mapping.assignments) if mapping is not None else ()
+    servers = dict.fromkeys((*live, *mapped))
+    return [Assignment(interface, server) for interface in interfaces_of(robot) for server in servers]
+
+
+def _pairs(
+    paths: list[Assignment],
+    block: Block | None,
+    estimator: Estimator,
+    key: BlockKey,
+    mapping: ServiceMapping | None,
+    now: float,
+) -> tuple[PairExplanation, ...]:
+    chosen = set(mapping.assignments) if mapping is not None else set()
+    known = {path: estimate for path in paths if (estimate := _estimate(block, path)) is not None}
+    beliefs = dict(zip(known, _beliefs(list(known.values())), strict=True))
+
+    def rank(path: Assignment) -> tuple[bool, float]:
+        return path not in chosen, beliefs[path].mean if path in beliefs else 2.0
+
+    found: list[PairExplanation] = []
+    for path in sorted(paths, key=rank)[:MAX_PAIRS]:
+        evidence = estimator.evidence(key.robot, path, key.service, now)
+        found.append(
+            PairExplanation(
+                path=path,
+                chosen=path in chosen,
+                up=estimator.path_up(key.robot, path.interface, path.server),
+                miss=beliefs.get(path),
+                requests=evidence.requests,
+                probes=evidence.probes,
+                rtt=evidence.rtt,
+                latency=evidence.latency,
+                compute=evidence.compute,
+            )
+        )
+    return tuple(found)
+
+
+def _estimate(block: Block | None, path: Assignment) -> Estimate | None:
+    if block is None or path.interface not in block.interfaces or path.server not in block.servers:
+        return None
+    return block.estimate((block.interfaces.index(path.interface), block.servers.index(path.server)))
+
+
+def _beliefs(estimates: list[Estimate]) -> Iterator[Belief]:
+    for estimate, (low, high) in zip(estimates, intervals(estimates, LEVEL), strict=True):
+        yield Belief(estimate.mean, low, high)
+
+
+def _joints(block: Block, estimator: Estimator, now: float) -> tuple[JointExplanation, ...]:
+    robot, service = block.key
+    raced = []
+    for first, second, requests, both_missed in estimator.raced_counts(robot, service, now):
+        one, other = _estimate(block, first), _estimate(block, second)
+        if one is None or other is None:
+            continue
+        product = one.mean * other.mean
+        estimate = estimator.both_miss(robot, service, first, second, product, now)
+        raced.append((first, second, requests, both_missed, product, estimate))
+    beliefs = _beliefs([estimate for *_, estimate in raced])
+    return tuple(
+        JointExplanation(
+            first=first,
+            second=second,
+            requests=requests,
+            both_missed=both_missed,
+            both_miss=belief,
+            product=product,
+            correlation=_correlation(belief, product, requests, both_missed),
+            shared=_shared(first, second),
+        )
+        for (first, second, requests, both_missed, product, _), belief in zip(raced, beliefs, strict=True)
+    )
+
+
+def _correlation(both_miss: Belief, product: float, requests: float, both_missed: float) -> Correlation:
+    if both_miss.low > product and both_missed >= MIN_TOGETHER:
+        return Correlation.TOGETHER
+    if both_miss.high < product and requests * product >= MIN_EXPECTED:
+        return Correlation.APART
+    return Correlation.INDEPENDENT
+
+
+def _shared(first: Assignment, second: Assignment) -> tuple[str, ...]:
+    shared = []
+    if first.interface == second.interface:
+        shared.append(f"interface {first.interface}")
+    if first.server == second.server:
+        shared.append(f"server {first.server}")
+    return tuple(shared)
+
+
+def _changes(history: History | None, now: float) -> tuple[MappingChange, ...]:
+    if history is None:
+        return ()
+    return tuple(MappingChange(max(0.0, now - sent.at), sent.version, sent.mapping) for sent in history.changes)

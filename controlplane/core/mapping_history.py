@@ -1,0 +1,68 @@
+"""The last changes of every mapping, for the operator. Times are monotonic seconds."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from controlplane.core.problem import BlockKey
+
+if TYPE_CHECKING:
+    from protos.model import MappingSet, NodeName, ServiceMapping, Version
+
+MAX_CHANGES = 8
+"""Changes remembered of one robot's service: two minutes of the most that are made for the better."""
+
+MAX_HISTORIES = 8192
+"""Services of robots whose changes are remembered, the one changed longest ago goes: 4096 robots with two each."""
+
+
+@dataclass(frozen=True, slots=True)
+class SentMapping:
+    """A mapping that was sent, and told something new."""
+
+    at: float
+    version: Version
+    mapping: ServiceMapping
+
+
+@dataclass(slots=True)
+class History:
+    """What one robot was told of one service."""
+
+    since: float
+    """When its requests went to other places last."""
+    changes: deque[SentMapping] = field(default_factory=lambda: deque(maxlen=MAX_CHANGES))
+
+
+class MappingHistory:
+    """The histories of all robots and services; also of robots that are away, for when they are back."""
+
+    def __init__(self) -> None:
+        self._histories: OrderedDict[BlockKey, History] = OrderedDict()
+        self.dropped = 0
+        """Histories forgotten because there were too many."""
+
+    def note(self, robot: NodeName, sent: MappingSet, now: float) -> None:
+        """A robot is sent this. What tells nothing new but another prediction is not remembered."""
+        for mapping in sent.services:
+            key = BlockKey(robot, mapping.service)
+            history = self._histories.get(key)
+            if history is None:
+                history = self._histories[key] = History(now)
+                if len(self._histories) > MAX_HISTORIES:
+                    self._histories.popitem(last=False)
+                    self.dropped += 1
+            else:
+                before = history.changes[0].mapping
+                if (before.assignments, before.reason) == (mapping.assignments, mapping.reason):
+                    continue
+                if before.assignments != mapping.assignments:
+                    history.since = now
+                self._histories.move_to_end(key)
+            history.changes.appendleft(SentMapping(now, sent.version, mapping))
+
+    def of(self, key: BlockKey) -> History | None:
+        """What a robot was told of a service, the newest first; None if that is forgotten."""
+        return self._histories.get(key)

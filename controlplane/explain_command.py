@@ -1,0 +1,63 @@
+"""`plr explain`: why a robot's requests for a service go where they go."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from google.protobuf import json_format
+
+from controlplane import explanation_text
+from controlplane.admin_client import AskError, add_options, ask
+from controlplane.arguments import checked_name
+from protos.convert import explanation_from_proto
+from protos.names import node_name, service_name
+from protos.plr.v1 import admin_pb2
+
+if TYPE_CHECKING:
+    from controlplane.arguments import Commands
+
+EXIT_OK = 0
+
+_EPILOG = """\
+shows: the mapping in force and its reason; for each pair of an interface and a server what is believed of its
+probability to miss the deadline (epsilon), and by which evidence; which paths fail together; what other mappings would
+give; the last changes. How each is computed: docs/theory.md.
+
+examples:
+  plr explain --tls-dir ~/.plr/alice robot-7 /plan
+  plr explain --insecure --json robot-7 /plan > robot-7.json
+"""
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command to `plr`."""
+    explain = commands.add_parser(
+        "explain",
+        help="why a robot's requests for a service go where they go",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    explain.add_argument("robot", type=checked_name(node_name), metavar="ROBOT")
+    explain.add_argument("service", type=checked_name(service_name), metavar="SERVICE")
+    add_options(explain)
+    explain.set_defaults(run=_explain)
+
+
+def _explain(arguments: argparse.Namespace) -> int:
+    request = admin_pb2.ExplainRequest(robot=arguments.robot, service=arguments.service)
+    try:
+        answer, explanation = ask(
+            arguments, lambda stub, timeout_s: stub.Explain(request, timeout=timeout_s), explanation_from_proto
+        )
+    except AskError as error:
+        sys.stderr.write(f"plr: {error}\n")
+        return error.code
+    text = (
+        json_format.MessageToJson(answer, preserving_proto_field_name=True)
+        if arguments.json
+        else explanation_text.render(explanation)
+    )
+    sys.stdout.write(f"{text}\n")
+    return EXIT_OK

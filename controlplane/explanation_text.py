@@ -1,0 +1,143 @@
+"""An explanation as text for a terminal."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from controlplane.text_table import columns
+from protos.explanation import AlternativeKind
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from protos.explanation import Alternative, Explanation, JointExplanation, MappingChange, PairExplanation
+    from protos.histogram import Histogram
+    from protos.model import Assignment
+
+LEAST_SHOWN = 1e-9
+"""No smaller probability is worth telling: it would take years to see one miss."""
+
+_PAIR_HEADER = (
+    *("", "INTERFACE", "SERVER", "STATE", "MISS", "90 % BETWEEN", "REQUESTS", "PROBES"),
+    *("RTT P50", "P99", "LATENCY P50", "P99", "COMPUTE P50", "P99"),
+)
+
+
+def render(explanation: Explanation) -> str:
+    """The mapping in force, what it rests on, what else there is, and how it came about."""
+    found = explanation
+    kind = "idempotent" if found.idempotent else "not idempotent: one server at a time"
+    lines = [f"{found.robot} {found.service}: deadline {_ms(found.deadline_s)}, {kind}, objective {found.objective}"]
+    for title, section in (
+        ("mapping in force", list(_mapping(found))),
+        ("pairs (times in ms, * in force)", list(_pairs(found))),
+        ("paths that carried copies of the same requests", list(columns([_joint(joint) for joint in found.joints]))),
+        ("what other mappings would give", list(columns([_alternative(other) for other in found.alternatives]))),
+        ("changes, the last first", list(columns([_change(change) for change in found.changes]))),
+    ):
+        if section:
+            lines += ["", f"{title}:", *(f"  {line}" for line in section)]
+    return "\n".join(lines)
+
+
+def _mapping(found: Explanation) -> Iterator[str]:
+    if found.mapping is None:
+        yield "none was sent yet"
+        return
+    yield _paths(found.mapping.assignments)
+    observed = f", observed lately {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
+    yield f"predicted miss {_probability(found.mapping.predicted_miss)}{observed}"
+    age = f", goes there for {_age(found.in_force_s)}" if found.in_force_s is not None else ""
+    refused = f" ({found.sync.error})" if found.sync.error else ""
+    yield f"version {found.sync.version_sent}, {found.sync.state.value}{refused}{age}"
+    yield f"reason: {found.mapping.reason or '-'}"
+
+
+def _pairs(found: Explanation) -> Iterator[str]:
+    if found.pairs:
+        yield from columns([_PAIR_HEADER, *(_pair(pair) for pair in found.pairs)])
+    if found.pairs_left_out:
+        yield f"and {found.pairs_left_out} more"
+
+
+def _pair(pair: PairExplanation) -> tuple[str, ...]:
+    return (
+        "*" if pair.chosen else "",
+        pair.path.interface,
+        pair.path.server,
+        {True: "up", False: "DOWN", None: "unknown"}[pair.up],
+        _probability(pair.miss.mean) if pair.miss is not None else "-",
+        f"{_probability(pair.miss.low)} .. {_probability(pair.miss.high)}" if pair.miss is not None else "-",
+        f"{pair.requests:.0f}",
+        f"{pair.probes:.0f}",
+        *_quantiles(pair.rtt),
+        *_quantiles(pair.latency),
+        *_quantiles(pair.compute),
+    )
+
+
+def _quantiles(histogram: Histogram) -> tuple[str, str]:
+    return _quantile(histogram, 0.5), _quantile(histogram, 0.99)
+
+
+def _quantile(histogram: Histogram, q: float) -> str:
+    value = histogram.quantile(q)
+    if math.isnan(value):
+        return "-"
+    return "lost" if math.isinf(value) else f"{value * 1e3:.1f}"
+
+
+def _joint(joint: JointExplanation) -> tuple[str, ...]:
+    shared = f" (they share {', '.join(joint.shared)})" if joint.shared else ""
+    return (
+        f"{_path(joint.first)} and {_path(joint.second)}:",
+        f"both missed {joint.both_missed:.0f} of {joint.requests:.0f},",
+        f"{joint.lift:.2g} times chance:",
+        f"{joint.correlation.value}{shared}",
+    )
+
+
+def _alternative(other: Alternative) -> tuple[str, ...]:
+    match other.kind:
+        case AlternativeKind.OTHER:
+            what = "instead"
+        case AlternativeKind.ALONE:
+            what = "alone"
+        case AlternativeKind.WITHOUT:
+            what = f"without {other.without}"
+    paths = _paths(other.assignments)
+    return what, _probability(other.predicted_miss), f"{paths} ({other.note})" if other.note else paths
+
+
+def _change(change: MappingChange) -> tuple[str, ...]:
+    mapping = change.mapping
+    return (
+        f"{_age(change.age_s)} ago",
+        _probability(mapping.predicted_miss),
+        f"{_paths(mapping.assignments)}: {mapping.reason}",
+    )
+
+
+def _paths(assignments: Sequence[Assignment]) -> str:
+    return ", ".join(_path(assignment) for assignment in assignments) or "nowhere"
+
+
+def _path(assignment: Assignment) -> str:
+    return f"{assignment.interface} -> {assignment.server}"
+
+
+def _probability(value: float) -> str:
+    return f"{value:.2g}" if value >= LEAST_SHOWN or not value else f"< {LEAST_SHOWN:g}"
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:g} ms"
+
+
+def _age(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    if seconds < 7200.0:
+        return f"{seconds / 60.0:.0f} min"
+    return f"{seconds / 3600.0:.0f} h"

@@ -1,0 +1,136 @@
+"""Why a robot's service goes where it goes, as the control plane tells it to the operator. Times are seconds.
+
+Samples fade, so what the control plane keeps of them are weights, not counts: histograms here count thousandths of a
+sample (`SAMPLE`), and numbers of requests are floats.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protos.histogram import Histogram
+    from protos.model import Assignment, NodeName, ResourceStatus, ServiceMapping, ServiceName, Version
+
+SAMPLE = 1000
+"""What one sample that has not faded counts in a histogram."""
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What is believed of a probability: its expectation, and the ends of the interval that holds it with 90 %."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class PairExplanation:
+    """What is known of requests over one interface to one server."""
+
+    path: Assignment
+    chosen: bool
+    up: bool | None
+    """Whether the path was up when last reported; None if it never was reported."""
+    miss: Belief | None
+    """Its probability to miss the deadline as the matcher took it; None if it was no candidate."""
+    requests: float
+    """Requests whose outcome on this very pair is remembered."""
+    probes: float
+    rtt: Histogram
+    latency: Histogram
+    """Of requests, from submit to this copy's response."""
+    compute: Histogram
+    """What the server needed for the service, whoever asked."""
+
+
+class Correlation(enum.Enum):
+    """Whether two paths miss together."""
+
+    TOGETHER = "fail together"
+    INDEPENDENT = "no sign that one failing says anything of the other"
+    APART = "seldom fail together"
+
+
+@dataclass(frozen=True, slots=True)
+class JointExplanation:
+    """What became of requests that went over two paths at once."""
+
+    first: Assignment
+    second: Assignment
+    requests: float
+    both_missed: float
+    both_miss: Belief
+    product: float
+    """What the probability that both miss would be if they were independent."""
+    correlation: Correlation
+    shared: tuple[str, ...] = ()
+    """What the two have in common, in words."""
+
+    @property
+    def lift(self) -> float:
+        """How many times as often as by chance both miss."""
+        return self.both_miss.mean / self.product
+
+
+class AlternativeKind(enum.Enum):
+    """What is asked about another mapping."""
+
+    OTHER = "other"
+    """The best ones that are not in force."""
+    ALONE = "alone"
+    """One interface alone, to the server that suits it best."""
+    WITHOUT = "without"
+    """All interfaces, without one server."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """Another mapping, and what it would give."""
+
+    kind: AlternativeKind
+    assignments: tuple[Assignment, ...]
+    """None if there is no such mapping."""
+    predicted_miss: float
+    without: NodeName | None = None
+    note: str = ""
+    """What speaks against it, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class MappingChange:
+    """A mapping that was sent."""
+
+    age_s: float
+    version: Version
+    mapping: ServiceMapping
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """Why a robot's requests for a service go where they go."""
+
+    robot: NodeName
+    service: ServiceName
+    deadline_s: float
+    idempotent: bool
+    objective: str
+    """What the matcher minimises, a value of the configuration key `objective`."""
+    sync: ResourceStatus
+    """How far the robot follows its mapping, of all its services."""
+    mapping: ServiceMapping | None = None
+    """As last sent; None if nothing was."""
+    in_force_s: float | None = None
+    """Since when requests go where they go; None if that is forgotten."""
+    observed_miss: float | None = None
+    """Share of recent requests that missed the deadline or failed; None without any."""
+    pairs: tuple[PairExplanation, ...] = ()
+    pairs_left_out: int = 0
+    """Pairs that were too many to be told of."""
+    joints: tuple[JointExplanation, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
+    changes: tuple[MappingChange, ...] = ()
+    """The last ones, the newest first."""

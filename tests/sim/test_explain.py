@@ -1,0 +1,133 @@
+"""`plr explain`'s answer, out of a control plane that measured and decided."""
+
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core.explanation import UnknownNameError
+from controlplane.explanation_text import render
+from protos.explanation import AlternativeKind, Correlation, Explanation
+from protos.model import Assignment, InterfaceName, JointReport, NodeName, Report, ServiceName, SyncState
+from tests.sim.control_world import SimSidecar, World
+from tests.unit.controlplane.samples import PLAN, histogram, latency, path
+
+ROBOT = NodeName("robot")
+LATENCY_S = {("wlan0", "a"): 0.02, ("wlan0", "b"): 0.05, ("wwan0", "a"): 0.04, ("wwan0", "b"): 0.03}
+
+
+def on(interface: str, server: str) -> Assignment:
+    return Assignment(InterfaceName(interface), NodeName(server))
+
+
+def measured(world: World, robot: SimSidecar, *, seconds: int, misses: dict[tuple[str, str], float]) -> None:
+    """Ten full races a second over both paths of each server pairing, of which these shares miss."""
+    for _ in range(seconds):
+        reports = []
+        for pair, seconds_ in LATENCY_S.items():
+            missed = round(100 * misses.get(pair, 0.0))
+            found = histogram(seconds_, times=100 - missed, lost=missed)
+            reports.append(latency(*pair, found, processing=histogram(0.01, times=100)))
+        both = round(100 * min(misses.get(("wlan0", "a"), 0.0), misses.get(("wwan0", "b"), 0.0)))
+        joint = JointReport(PLAN, on("wlan0", "a"), on("wwan0", "b"), 100, both)
+        probes = tuple(path(*pair, rtt=histogram(seconds_ - 0.015)) for pair, seconds_ in LATENCY_S.items())
+        world.say(robot, Report(tuple(reports), probes, joints=(joint,)))
+        world.run(1.0)
+
+
+def asked(world: World) -> Explanation:
+    return world.core.explain(ROBOT, PLAN, world.now)
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.cloud("a")
+    world.cloud("b")
+    world.all_up(world.robot(), ("a", "b"))
+    world.run(2.0)
+    return world
+
+
+def test_it_tells_what_the_mapping_rests_on(world: World) -> None:
+    robot = world.sidecars[ROBOT]
+    measured(world, robot, seconds=60, misses={("wlan0", "a"): 0.1, ("wwan0", "b"): 0.1})
+    found = asked(world)
+    assert found.mapping == robot.services[0]
+    assert (found.sync.state, found.sync.version_acked) == (SyncState.SYNCED, robot.mapping_version)
+    pairs = {pair.path: pair for pair in found.pairs}
+    assert {path for path, pair in pairs.items() if pair.chosen} == set(robot.services[0].assignments)
+    assert found.pairs[0].chosen
+    worst = pairs[on("wlan0", "a")]
+    assert worst.up
+    assert worst.miss is not None
+    assert worst.miss.low < 0.1 < worst.miss.high
+    assert worst.miss.mean == pytest.approx(0.1, rel=0.1)
+    assert worst.requests == pytest.approx(100 / (1 - 0.5 ** (1 / 60)) / 2, rel=0.1)
+    assert worst.rtt.quantile(0.5) == pytest.approx(0.005, rel=0.03)
+    assert worst.compute.quantile(0.99) == pytest.approx(0.01, rel=0.03)
+    (joint,) = found.joints
+    assert joint.correlation is Correlation.TOGETHER
+    assert joint.lift == pytest.approx(10.0, rel=0.2)
+    best = next(other for other in found.alternatives if other.kind is AlternativeKind.OTHER)
+    assert set(best.assignments) == {on("wlan0", "a"), on("wwan0", "b")}
+    assert best.predicted_miss == pytest.approx(0.1, rel=0.2)
+    alone = [other for other in found.alternatives if other.kind is AlternativeKind.ALONE]
+    assert [other.assignments for other in alone] == [(on("wlan0", "b"),), (on("wwan0", "a"),)]
+    without = {other.without: other for other in found.alternatives if other.kind is AlternativeKind.WITHOUT}
+    assert without.keys() == {"a", "b"}
+    text = render(found)
+    assert "fail together" in text
+    assert "capacity for one robot exceeded by 1" in text
+
+
+def test_paths_that_miss_without_each_other_are_not_said_to_fail_together(world: World) -> None:
+    measured(world, world.sidecars[ROBOT], seconds=20, misses={("wlan0", "a"): 0.0, ("wwan0", "b"): 0.1})
+    (joint,) = asked(world).joints
+    assert joint.correlation is Correlation.INDEPENDENT
+
+
+def test_it_remembers_what_changed_and_why(world: World) -> None:
+    robot = world.sidecars[ROBOT]
+    measured(world, robot, seconds=10, misses={})
+    before = asked(world)
+    world.report(robot, path("wlan0", "a", up=False))
+    world.run(3.0)
+    after = asked(world)
+    assert after.changes[0].mapping == robot.services[0]
+    assert after.changes[0].age_s < 3.0
+    assert after.in_force_s == pytest.approx(after.changes[0].age_s)
+    assert [change.version for change in after.changes[1:]] == [change.version for change in before.changes]
+    assert "a path of it went or came" in after.changes[0].mapping.reason
+    down = next(pair for pair in after.pairs if pair.path == on("wlan0", "a"))
+    assert (down.up, down.miss) == (False, None)
+    assert after.changes[0].mapping.reason in render(after)
+
+
+def test_a_service_without_servers_is_explained_too(world: World) -> None:
+    for name in ("a", "b"):
+        world.leave(world.sidecars[NodeName(name)])
+    world.run(2.0)
+    found = asked(world)
+    assert found.mapping is not None
+    assert "no live server" in found.mapping.reason
+    assert found.alternatives == ()
+    assert "nowhere" in render(found)
+
+
+@pytest.mark.parametrize(
+    ("robot", "service", "told"),
+    [
+        ("robt", "/plan", "no robot robt is registered; did you mean robot?"),
+        ("a", "/plan", "a is a cloud: ask about a robot"),
+        ("robot", "/plam", "robot carries no service /plam; did you mean /plan?"),
+    ],
+)
+def test_who_is_not_known_is_told_the_nearest(world: World, robot: str, service: str, told: str) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        world.core.explain(NodeName(robot), ServiceName(service), world.now)
+    assert str(caught.value) == told
+
+
+def test_with_nobody_there_none_is_near() -> None:
+    with pytest.raises(UnknownNameError, match="no robot robot is registered: there is none"):
+        World().core.explain(ROBOT, PLAN, 0.0)

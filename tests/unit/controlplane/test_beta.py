@@ -1,0 +1,29 @@
+"""Quantiles of Beta distributions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import beta
+
+from controlplane.core.beta import intervals, quantiles
+from controlplane.core.posterior import Estimate
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
+def test_they_are_those_of_scipy(share: float) -> None:
+    rng = np.random.default_rng(7)
+    a, b = 10 ** rng.uniform(-3, 3.5, 500), 10 ** rng.uniform(-2, 4, 500)
+    assert quantiles(a, b, share) == pytest.approx(beta.ppf(share, a, b), abs=1e-11)
+
+
+def test_an_interval_holds_what_it_says() -> None:
+    estimates = [Estimate(0.5, 0.5), Estimate(30.0, 970.0)]
+    for estimate, (low, high) in zip(estimates, intervals(estimates, 0.9), strict=True):
+        inside = beta.cdf(high, estimate.misses, estimate.hits) - beta.cdf(low, estimate.misses, estimate.hits)
+        assert inside == pytest.approx(0.9)
+        assert low < estimate.mean < high
+
+
+def test_of_none_there_are_none() -> None:
+    assert intervals([], 0.9) == []
