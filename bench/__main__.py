@@ -4,6 +4,7 @@ examples:
   make bench-dataplane                                     the data plane against its targets, with a page of plots
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
   make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
+  python -m bench scenarios --traces ~/traces              what the evaluation replays
   make bench-matcher BENCH_ARGS='--traces ~/traces'        are the matcher's predictions true?
 """
 
@@ -14,6 +15,7 @@ import sys
 
 from bench.churn import command as churn
 from bench.dataplane import command as dataplane
+from bench.evaluation import scenarios_command as scenarios
 from bench.matcher import command as matcher
 
 
@@ -26,8 +28,11 @@ def main() -> int:
     dataplane.add_arguments(commands.add_parser("dataplane", help="the data plane against its targets"))
     churn.add_arguments(commands.add_parser("churn", help="minutes of trouble: requests lost or doubled, memory grown"))
     matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
+    scenarios.add_arguments(
+        commands.add_parser("scenarios", help="what is replayed; the generator beside traces")
+    )
     options = parser.parse_args(sys.argv[1:] or ["dataplane"])
-    runs = {"churn": churn.run, "dataplane": dataplane.run, "matcher": matcher.run}
+    runs = {"churn": churn.run, "dataplane": dataplane.run, "matcher": matcher.run, "scenarios": scenarios.run}
     return runs[options.command](options)
 
 

@@ -64,13 +64,13 @@ KINDS = {
     ),
     "indoor": Kind(OFFICE_WIFI, FULL_5G, step_s=0.2),
     "two_wifi": Kind(OFFICE_WIFI, replace(OFFICE_WIFI, rtt_ms=18.0), common=0.2, step_s=0.2),
-    "satellite": Kind(STARLINK, ATT),
+    "satellite": Kind(ATT, STARLINK),
     "both_dark": Kind(
         ATT,
         VERIZON,
         common=0.2,
         blackouts=(Blackout("ab", 0.2, 0.27), Blackout("a", 0.5, 0.65), Blackout("ab", 0.6, 0.65)),
     ),
-    "one_operator": Kind(ATT, replace(ATT, rtt_ms=50.0), common=0.95, dead_every_s=120.0, dead_s=15.0),
+    "one_operator": Kind(EVEN_ATT, replace(EVEN_ATT, rtt_ms=50.0), common=0.95, dead_every_s=60.0, dead_s=8.0),
 }
 """By the name that scenario files use."""

@@ -1,0 +1,39 @@
+"""What the networks would have allowed, computed from the trace: nothing is run.
+
+Each path is first in, first out in both directions (`bench.netlab.fifo`) and carries every request; the ideal takes,
+for each request, the faster of the two. Nobody calls losers off here, so a system that does can be better than this
+where a queue builds up.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import zlib
+from typing import TYPE_CHECKING
+
+from bench.evaluation.outcome import Outcome, Request
+from bench.netlab.fifo import FifoPath
+
+if TYPE_CHECKING:
+    from bench.evaluation.scenario import Scenario
+
+IDEALS = {"ideal": ("a", "b"), "ideal-a": ("a",), "ideal-b": ("b",)}
+"""Both paths, and each alone."""
+
+
+def compute(scenario: Scenario, contender: str) -> Outcome:
+    """The outcome of one of `IDEALS`; always the same."""
+    rng = random.Random(zlib.crc32(scenario.name.encode()))
+    traffic = scenario.traffic
+    trace = scenario.trace()
+    paths = [FifoPath(trace.path(name)) for name in IDEALS[contender]]
+    requests = []
+    for number in range(scenario.count):
+        due_s = number / traffic.rate_hz
+        latency_s = min(
+            path.request(due_s, traffic.request_bytes, traffic.answer_bytes, traffic.compute_ms / 1e3, rng)
+            for path in paths
+        )
+        requests.append(Request(due_s, due_s, None if math.isinf(latency_s) else due_s + latency_s))
+    return Outcome(scenario.name, scenario.case, contender, traffic.deadline_ms, tuple(requests))

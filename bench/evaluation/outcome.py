@@ -1,0 +1,98 @@
+"""What became of every request of a run, and the figures that follow: misses first, then latencies.
+
+A request is due when the workload says so; from then on its latency counts, also when its sender was blocked. Whoever
+has no answer after UNANSWERED_S counts as UNANSWERED_S in means and quantiles: else the worse system looks better,
+because only its easy requests are left.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Self
+
+from bench.dataplane.statistics import MS, quantile
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+UNANSWERED_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One request; seconds from the window's begin."""
+
+    due_s: float
+    sent_s: float
+    answered_s: float | None
+    """None: never."""
+
+    @property
+    def latency_s(self) -> float:
+        """From when it was due, UNANSWERED_S at most."""
+        return UNANSWERED_S if self.answered_s is None else min(UNANSWERED_S, self.answered_s - self.due_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Of one run, or of several together."""
+
+    requests: int
+    miss_ratio: float
+    """Share that had no answer by the deadline."""
+    unanswered_ratio: float
+    """Share that had none after UNANSWERED_S."""
+    mean_ms: float
+    p50_ms: float
+    p99_ms: float
+    bytes_per_request: float | None
+    """Bytes of IP packets that the robot sent, over all its interfaces; None: computed, not run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One contender in one scenario."""
+
+    scenario: str
+    case: str
+    contender: str
+    deadline_ms: float
+    requests: tuple[Request, ...]
+    bytes_sent: dict[str, int] = field(default_factory=dict)
+    """Of IP packets that the robot sent in the window, by interface."""
+    disturbances: tuple[str, ...] = ()
+    """Why the run is void; nothing: it counts."""
+    conditions: dict[str, Any] = field(default_factory=dict)
+    """How late emulator and client were, how busy the machine was."""
+
+    def figures(self) -> Figures:
+        """The figures; the run must have requests."""
+        latencies = [request.latency_s for request in self.requests]
+        count = len(latencies)
+        late = sum(latency * MS > self.deadline_ms for latency in latencies)
+        return Figures(
+            requests=count,
+            miss_ratio=late / count,
+            unanswered_ratio=sum(latency >= UNANSWERED_S for latency in latencies) / count,
+            mean_ms=sum(latencies) / count * MS,
+            p50_ms=(quantile(latencies, 0.5) or 0.0) * MS,
+            p99_ms=(quantile(latencies, 0.99) or 0.0) * MS,
+            bytes_per_request=sum(self.bytes_sent.values()) / count if self.bytes_sent else None,
+        )
+
+    def write(self, folder: Path) -> Path:
+        """Write it to FOLDER/SCENARIO/CONTENDER.json; returns the file."""
+        file = folder / self.scenario / f"{self.contender}.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps({**asdict(self), "figures": asdict(self.figures())}) + "\n", encoding="utf-8")
+        return file
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """The inverse of `write`."""
+        fields: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        del fields["figures"]
+        fields["requests"] = tuple(Request(**request) for request in fields["requests"])
+        fields["disturbances"] = tuple(fields["disturbances"])
+        return cls(**fields)

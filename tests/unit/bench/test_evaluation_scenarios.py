@@ -1,0 +1,118 @@
+"""Scenario files, the rule by which windows are chosen, the ideal, and what an outcome says."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bench.evaluation.ideal import compute
+from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request
+from bench.evaluation.scenario import read_scenarios
+from bench.evaluation.windows import choose, cut
+from bench.netlab import LinkProfile, Trace, TraceStep
+from bench.netlab.trace_folder import TraceEntry
+from protos.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+TEXT = """
+name: some
+case: A
+about: a test
+duration_s: 30
+traffic: {request_bytes: 120000, answer_bytes: 1000, rate_hz: 5, deadline_ms: 1000, compute_ms: 20}
+network: {generator: drive, seeds: [1, 2]}
+"""
+
+
+def entry(folder: Path, name: str, duration_s: float = 200.0, kind: str = "rate") -> TraceEntry:
+    return TraceEntry(name, kind, ("one", "two"), duration_s, folder / name)
+
+
+def flat(rate_kbps: float, seconds: int = 30) -> tuple[TraceStep, ...]:
+    profile = LinkProfile(delay_ms=10.0, rate_kbps=rate_kbps)
+    return tuple(TraceStep(float(at), profile, profile) for at in range(seconds))
+
+
+def test_every_scenario_of_the_project_is_readable_and_every_case_has_one(tmp_path: Path) -> None:
+    drives = [entry(tmp_path, f"drive-{pair}-{number:02}") for pair in ("p-q", "q-r", "r-s") for number in range(7)]
+    scenarios = read_scenarios(drives)
+    assert {scenario.case for scenario in scenarios} == set("ABCDEFG")
+    assert len({scenario.name for scenario in scenarios}) == len(scenarios)
+    assert sum(scenario.window is not None for scenario in scenarios) >= 10
+    assert all(scenario.trace().duration_s == pytest.approx(scenario.duration_s) for scenario in read_scenarios([]))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ("case: A", "case: Z", "some.yaml: case"),
+        ("rate_hz: 5", "rate_hz: 0", "some.yaml: traffic.rate_hz"),
+        ("generator: drive", "generator: dive", "some.yaml: network.generator: .*blind_spot"),
+        ("generator: drive", 'generator: drive, traces: "*"', "either generator or traces"),
+        ("duration_s", "duration", "some.yaml: duration"),
+    ],
+)
+def test_a_bad_scenario_file_is_refused_in_one_line(tmp_path: Path, before: str, after: str, told: str) -> None:
+    (tmp_path / "some.yaml").write_text(TEXT.replace(before, after))
+    with pytest.raises(ConfigError) as refused:
+        read_scenarios([], tmp_path)
+    assert "\n" not in str(refused.value)
+    assert re.search(told, str(refused.value))
+
+
+def test_windows_are_chosen_by_name_and_length_alone(tmp_path: Path) -> None:
+    names = [f"drive-x-{number:02}" for number in range(1, 8)]
+    entries = [entry(tmp_path, name) for name in reversed(names)]
+    entries += [entry(tmp_path, "drive-y-01", 60.0), entry(tmp_path, "drive-y-02", 121.0)]
+    entries += [entry(tmp_path, "drive-z-01", kind="rtt"), entry(tmp_path, "walk-01")]
+    assert [window.name for window in choose(entries, "drive-*", 3, 120.0)] == [
+        "drive-x-01-at-40",
+        "drive-x-03-at-40",
+        "drive-x-05-at-40",
+        "drive-y-02-at-0",
+    ]
+
+
+def test_a_cut_keeps_both_paths_on_one_clock() -> None:
+    steps = tuple(TraceStep(float(at), LinkProfile(rate_kbps=at), LinkProfile(rate_kbps=at)) for at in range(10))
+    part = cut(Trace("t", {"a": steps, "b": steps}), 2.5, 3.0)
+    for path in "ab":
+        assert [(step.at_s, step.up.rate_kbps) for step in part.path(path)] == [(0, 2), (0.5, 3), (1.5, 4), (2.5, 5)]
+
+
+def test_the_ideal_takes_the_faster_path_of_each_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some.yaml").write_text(TEXT)
+    scenario = read_scenarios([], tmp_path)[0]
+    # 120 kB take 0.96 s at 1 Mbit/s: a path for every fifth request.
+    trace = Trace("t", {"a": flat(20_000.0), "b": flat(0.0)})
+    monkeypatch.setattr(type(scenario), "trace", lambda _: trace)
+    both, a, b = (compute(scenario, name) for name in ("ideal", "ideal-a", "ideal-b"))
+    assert both.requests == a.requests
+    assert both.figures().p99_ms == pytest.approx(120_000 * 8 / 20_000 + 20 + 1000 * 8 / 20_000 + 20)
+    assert b.figures().unanswered_ratio == b.figures().miss_ratio == 1.0
+    assert scenario.shortened(10.0).count == 50
+
+
+def test_whoever_has_no_answer_counts_as_ten_seconds_and_the_sender_s_delay_counts() -> None:
+    requests = (
+        Request(0.0, 0.0, 0.1),
+        Request(1.0, 1.5, 2.1),
+        Request(2.0, 2.0, None),
+        Request(3.0, 3.0, 3.0 + 2 * UNANSWERED_S),
+    )
+    figures = Outcome("s", "A", "c", 1000.0, requests, bytes_sent={"wlan0": 300, "wwan0": 100}).figures()
+    assert (figures.miss_ratio, figures.unanswered_ratio) == (0.75, 0.5)
+    assert figures.mean_ms == pytest.approx((0.1 + 1.1 + 20.0) / 4 * 1e3)
+    assert figures.p99_ms == UNANSWERED_S * 1e3
+    assert figures.bytes_per_request == 100.0
+
+
+def test_an_outcome_is_written_and_read(tmp_path: Path) -> None:
+    outcome = Outcome("s", "A", "c", 1000.0, (Request(0.0, 0.0, None),), {"wlan0": 1}, ("late",), {"p99_s": 0.1})
+    assert Outcome.read(outcome.write(tmp_path)) == outcome
+    assert replace(outcome, contender="d").write(tmp_path) == tmp_path / "s" / "d.json"
