@@ -28,9 +28,7 @@ def main() -> int:
     dataplane.add_arguments(commands.add_parser("dataplane", help="the data plane against its targets"))
     churn.add_arguments(commands.add_parser("churn", help="minutes of trouble: requests lost or doubled, memory grown"))
     matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
-    scenarios.add_arguments(
-        commands.add_parser("scenarios", help="what is replayed; the generator beside traces")
-    )
+    scenarios.add_arguments(commands.add_parser("scenarios", help="what is replayed; the generator beside traces"))
     options = parser.parse_args(sys.argv[1:] or ["dataplane"])
     runs = {"churn": churn.run, "dataplane": dataplane.run, "matcher": matcher.run, "scenarios": scenarios.run}
     return runs[options.command](options)
