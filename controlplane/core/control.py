@@ -31,6 +31,7 @@ from controlplane.core.picture import Picture
 from controlplane.core.plan import Plan
 from controlplane.core.problem import BlockKey, Problem
 from controlplane.core.publisher import Publisher
+from controlplane.core.reconcile import changed_robots
 from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.stability import Stability
@@ -53,7 +54,7 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from controlplane.core.policy import Policy
     from controlplane.core.registry import Sidecar
@@ -309,9 +310,13 @@ class ControlCore:
         self.counters.unproven += plan.unproven
         if settled.relaxed and settled.relaxed != self.plan.relaxed:
             self.counters.relaxations += 1
+        robots = changed_robots(self.plan, settled, self._picture, picture)
         self.plan = settled
         self._picture = picture
-        self._publish(now)
+        if self._publish_at is None:
+            self._send(self._publisher.publish_plan(robots, self.permits, settled, picture), now)
+        else:
+            self._publish(now)
 
     def solving_failed(self, now: float) -> None:
         """The solver raised: the plan in force stays, and it is tried again with the next routine solving."""
@@ -320,7 +325,10 @@ class ControlCore:
 
     def _publish(self, now: float) -> None:
         self._publish_at = None
-        for send in self._publisher.publish(self.permits, self.plan, self._picture):
+        self._send(self._publisher.publish(self.permits, self.plan, self._picture), now)
+
+    def _send(self, news: Iterable[Send], now: float) -> None:
+        for send in news:
             if isinstance(send.message, MappingSet):
                 self.history.note(self._streams[send.stream], send.message, now)
             self._events.append(send)

@@ -30,6 +30,9 @@ class BlockPlan:
     """By how many interfaces the block's own capacity is exceeded."""
     why: str = ""
     """What made it change last; empty if it never did."""
+    block: Block | None = field(default=None, compare=False, repr=False)
+    choice: Choice = field(default=(), compare=False, repr=False)
+    """What it was made from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +86,21 @@ def price(problem: Problem, choices: Mapping[BlockKey, Choice]) -> Price:
 
 
 def make_plan(
-    problem: Problem, choices: Mapping[BlockKey, Choice], *, bound: float = -math.inf, unproven: int = 0
+    problem: Problem,
+    choices: Mapping[BlockKey, Choice],
+    *,
+    bound: float = -math.inf,
+    unproven: int = 0,
+    before: Mapping[BlockKey, BlockPlan] | None = None,
 ) -> Plan:
-    """Write choices down as a plan."""
+    """Write choices down as a plan; those that are as `before`, for the same blocks, are the same objects."""
     plans: dict[BlockKey, BlockPlan] = {}
     for block in problem.blocks:
         choice = choices[block.key]
+        known = before.get(block.key) if before is not None else None
+        if known is not None and known.block is block and known.choice == choice:
+            plans[block.key] = known
+            continue
         pairs = [(i, j) for i, j in enumerate(choice) if j is not None]
         plans[block.key] = BlockPlan(
             key=block.key,
@@ -96,6 +108,8 @@ def make_plan(
             cost=block_cost(problem.objective, block, choice),
             predicted_miss=joint_miss(block, choice),
             excess=block_excess(block, choice),
+            block=block,
+            choice=choice,
         )
     return Plan(plans, fleet_excess(problem, choices), bound, unproven)
 
@@ -104,6 +118,8 @@ def choice_of(block: Block, plan: BlockPlan | None) -> Choice | None:
     """The plan's choice in the block's present numbering; None if it is not valid there any more."""
     if plan is None:
         return None
+    if plan.block is block:
+        return plan.choice
     server_of = dict(plan.assignments)
     index = {server: number for number, server in enumerate(block.servers)}
     choice: list[int | None] = []

@@ -15,6 +15,7 @@ Beyond the paper:
 from __future__ import annotations
 
 import enum
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -112,14 +113,16 @@ def block_excess(block: Block, choice: Choice) -> int:
     return sum(max(0, load - block.capacity) for load in loads(choice, len(block.servers)))
 
 
+def limits_used(problem: Problem, block: Block, choice: Choice) -> list[FleetKey]:
+    """For each interface the limit over all robots that it falls under, where it does."""
+    keys = [FleetKey(block.servers[server], block.key.service) for server in choice if server is not None]
+    return [key for key in keys if key in problem.fleet_capacity]
+
+
 def fleet_excess(problem: Problem, choices: Mapping[BlockKey, Choice]) -> dict[FleetKey, int]:
     """By how many interfaces the choices exceed each limit over all robots; only those exceeded."""
-    load: dict[FleetKey, int] = {}
-    for block in problem.blocks:
-        for server, count in zip(block.servers, loads(choices[block.key], len(block.servers)), strict=True):
-            key = FleetKey(server, block.key.service)
-            load[key] = load.get(key, 0) + count
-    return {key: load[key] - limit for key, limit in problem.fleet_capacity.items() if load.get(key, 0) > limit}
+    load = Counter(key for block in problem.blocks for key in limits_used(problem, block, choices[block.key]))
+    return {key: load[key] - limit for key, limit in problem.fleet_capacity.items() if load[key] > limit}
 
 
 def is_valid(block: Block, choice: Choice) -> bool:

@@ -102,6 +102,16 @@ class Publisher:
             if sidecar.role is Role.ROBOT:
                 yield from self._mapping(sidecar, sidecar.stream, views, plan, picture)
 
+    def publish_plan(
+        self, robots: Iterable[NodeName], permits: Permits, plan: Plan, picture: Picture
+    ) -> Iterator[Send]:
+        """The mappings of these robots, where they are news; who is there did not change since `publish`."""
+        views = Views(self._registry, permits)
+        for name in robots:
+            robot = self._registry.get(name)
+            if robot is not None and robot.stream is not None and not self._is_held_back(robot, permits):
+                yield from self._mapping(robot, robot.stream, views, plan, picture)
+
     def _is_held_back(self, sidecar: Sidecar, permits: Permits) -> bool:
         if permits.restricted and sidecar.role is Role.CLOUD and not sidecar.ready:
             # What robots may call on it depends on what it offers.

@@ -67,6 +67,23 @@ def mapping_of(
     return tuple(mappings)
 
 
+def changed_robots(plan: Plan, new_plan: Plan, picture: Picture, new_picture: Picture) -> set[NodeName]:
+    """The robots whose mappings another plan and picture may make different, as long as the members are the same."""
+    everything = plan.fleet_excess != new_plan.fleet_excess
+    keys = new_picture.notes.keys() | picture.notes.keys()
+    return {
+        key.robot
+        for key in keys
+        if everything
+        or new_plan.blocks.get(key) is not plan.blocks.get(key)
+        or not _is_same(picture.notes.get(key), new_picture.notes.get(key))
+    }
+
+
+def _is_same(one: BlockNotes | None, other: BlockNotes | None) -> bool:
+    return one is other or one == other
+
+
 def _standby(
     planned: tuple[Assignment, ...], notes: BlockNotes, before: ServiceMapping | None, *, single: bool
 ) -> list[Assignment]:

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, NamedTuple
 from controlplane.core.certainty import probability_better
 from controlplane.core.objectives import block_cost, joint_miss
 from controlplane.core.plan import choice_of, make_plan
-from controlplane.core.problem import FleetKey, Objective, block_excess, loads
+from controlplane.core.problem import Objective, block_excess, limits_used
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from controlplane.core.plan import Plan
-    from controlplane.core.problem import Block, BlockKey, Choice, Problem
+    from controlplane.core.plan import BlockPlan, Plan
+    from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
 
 IMPROVEMENT_SHARE = 0.1
 IMPROVEMENT_MIN = 0.002
@@ -68,13 +68,15 @@ class Stability:
         """
         old = {block.key: choice_of(block, running.blocks.get(block.key)) for block in problem.blocks}
         choices = {key: choice for key, choice in old.items() if choice is not None}
-        why = {key: block.why for key, block in running.blocks.items()}
+        why: dict[BlockKey, str] = {}
         self._changed = {key: times for key, times in self._changed.items() if key in old}
+        differences = _differences(problem, new, old)
         load: Counter[FleetKey] = Counter()
-        for block in problem.blocks:
-            if block.key in choices:
-                load.update(_limited(problem, block, choices[block.key]))
-        for together in _linked(problem, _differences(problem, new, old), load):
+        if differences:
+            for block in problem.blocks:
+                if block.key in choices:
+                    load.update(limits_used(problem, block, choices[block.key]))
+        for together in _linked(problem, differences, load):
             if not self._is_made(problem, together, load, now):
                 continue
             for difference in together:
@@ -83,8 +85,8 @@ class Stability:
                 if key in running.blocks:
                     why[key] = _reason(difference)
                     self._changed.setdefault(key, deque(maxlen=MAX_CHANGES)).append(now)
-        plan = make_plan(problem, choices, bound=new.bound, unproven=new.unproven)
-        return replace(plan, blocks={key: replace(block, why=why.get(key, "")) for key, block in plan.blocks.items()})
+        plan = make_plan(problem, choices, bound=new.bound, unproven=new.unproven, before=running.blocks)
+        return replace(plan, blocks={key: _said(block, running, why) for key, block in plan.blocks.items()})
 
     def _is_made(
         self, problem: Problem, together: Sequence[_Difference], load: Mapping[FleetKey, int], now: float
@@ -110,18 +112,18 @@ def _differences(problem: Problem, new: Plan, old: Mapping[BlockKey, Choice | No
             raise ValueError("the plan does not fit the problem")
         before = old[block.key]
         if choice != before:
-            gained = _limited(problem, block, choice)
-            lost = _limited(problem, block, before) if before is not None else {}
-            change = {key: gained.get(key, 0) - lost.get(key, 0) for key in gained | lost}
+            change = Counter(limits_used(problem, block, choice))
+            change.subtract(limits_used(problem, block, before) if before is not None else [])
             found.append(_Difference(block, choice, before, {key: count for key, count in change.items() if count}))
     return found
 
 
-def _limited(problem: Problem, block: Block, choice: Choice) -> dict[FleetKey, int]:
-    """Interfaces that the choice gives each limit over all robots."""
-    counts = zip(block.servers, loads(choice, len(block.servers)), strict=True)
-    found = {FleetKey(server, block.key.service): count for server, count in counts if count}
-    return {key: count for key, count in found.items() if key in problem.fleet_capacity}
+def _said(block: BlockPlan, running: Plan, why: Mapping[BlockKey, str]) -> BlockPlan:
+    """With the reason of its last change."""
+    before = running.blocks.get(block.key)
+    if block is before:
+        return block
+    return replace(block, why=why.get(block.key, before.why if before is not None else ""))
 
 
 def _linked(
