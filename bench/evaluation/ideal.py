@@ -1,8 +1,8 @@
 """What the networks would have allowed, computed from the trace: nothing is run.
 
-Each path is first in, first out in both directions (`bench.netlab.fifo`) and carries every request; the ideal takes,
-for each request, the faster of the two. Nobody calls losers off here, so a system that does can be better than this
-where a queue builds up.
+Each path is first in, first out in both directions (`controlplane.planning.fifo`) and carries every request; the ideal
+takes, for each request, the faster of the two. Nobody calls losers off here, so a system that does can be better than
+this where a queue builds up.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import zlib
 from typing import TYPE_CHECKING
 
 from bench.evaluation.outcome import Outcome, Request
-from bench.netlab.fifo import FifoPath
+from controlplane.planning.fifo import FifoPath
 
 if TYPE_CHECKING:
     from bench.evaluation.scenario import Scenario

@@ -7,7 +7,7 @@ import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from bench.netlab.fifo import FifoPath
+from controlplane.planning.fifo import FifoPath
 
 if TYPE_CHECKING:
     from bench.netlab.traces import Trace

@@ -8,12 +8,10 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from bench.netlab.errors import LabConfigError
+from controlplane.planning.traces import DEFAULT_QUEUE_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-# What a cellular base station or a Wi-Fi driver commonly holds back for one station, bytes.
-DEFAULT_QUEUE_BYTES = 1_200_000
 
 
 class DropReason(StrEnum):

@@ -1,32 +1,17 @@
-"""Two-path traces: a step-wise record of rate, round-trip time and loss of paths `a` and `b`, one clock.
-
-A trace file is CSV, gzip-compressed if its name ends in .gz, with a header and one row per step:
-
-    t_s, a_up_kbps, a_down_kbps, a_rtt_ms, a_loss, b_up_kbps, b_down_kbps, b_rtt_ms, b_loss
-
-A row holds from its `t_s` to the next. Rate 0 is an outage. Each direction gets half the round-trip time.
-"""
+"""Recorded paths as the lab's links; the format of the files is `controlplane.planning.traces`'."""
 
 from __future__ import annotations
 
-import csv
-import gzip
-import io
-import math
-import zlib
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bench.netlab.errors import LabConfigError
-from bench.netlab.profile import DEFAULT_QUEUE_BYTES, LinkProfile
+from bench.netlab.profile import LinkProfile
+from controlplane.planning import traces
 
-_COLUMNS = (
-    "t_s",
-    *("a_up_kbps", "a_down_kbps", "a_rtt_ms", "a_loss"),
-    *("b_up_kbps", "b_down_kbps", "b_rtt_ms", "b_loss"),
-)
+if TYPE_CHECKING:
+    from controlplane.planning.traces import Direction, RecordedPaths
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,58 +65,42 @@ class Trace:
             raise LabConfigError(f"trace {self.name}: no path {name!r}, only {sorted(self.paths)}") from None
 
 
-def load_trace(file: str | Path, *, queue_bytes: int = DEFAULT_QUEUE_BYTES) -> Trace:
+def load_trace(file: str | Path, *, queue_bytes: int = traces.DEFAULT_QUEUE_BYTES) -> Trace:
     """Read a trace file; both paths get a bottleneck queue of `queue_bytes`.
 
     Raises:
-        LabConfigError: unreadable, or not in the format above; names file and line.
+        LabConfigError: unreadable, or not in the format; names file and line.
     """
-    file = Path(file)
     try:
-        raw = file.read_bytes()
-        if file.suffix == ".gz":
-            raw = gzip.decompress(raw)
-        text = raw.decode("ascii")
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        raise LabConfigError(f"trace {file}: {error}") from None
-    return parse_trace(text, name=file.name.removesuffix(".gz").removesuffix(".csv"), queue_bytes=queue_bytes)
+        return _as_links(traces.read_trace(Path(file), queue_bytes=queue_bytes))
+    except traces.TraceError as error:
+        raise LabConfigError(str(error)) from None
 
 
-def parse_trace(text: str, *, name: str = "trace", queue_bytes: int = DEFAULT_QUEUE_BYTES) -> Trace:
+def parse_trace(text: str, *, name: str = "trace", queue_bytes: int = traces.DEFAULT_QUEUE_BYTES) -> Trace:
     """Parse the text of a trace file.
 
     Raises:
-        LabConfigError: not in the format above; names the line.
+        LabConfigError: not in the format; names the line.
     """
-    steps: dict[str, list[TraceStep]] = {"a": [], "b": []}
     try:
-        reader = csv.DictReader(io.StringIO(text), strict=True, skipinitialspace=True)
-        if reader.fieldnames is None or set(reader.fieldnames) != set(_COLUMNS):
-            raise LabConfigError(f"trace {name}: expected the columns {', '.join(_COLUMNS)}")
-        for row in reader:
-            try:
-                if None in row or not math.isfinite(float(row["t_s"])):
-                    raise ValueError("expected finite numbers, one a column")
-                values = {column: float(row[column]) for column in _COLUMNS}
-                for path, path_steps in steps.items():
-                    path_steps.append(_step(values, path, queue_bytes))
-            except (TypeError, ValueError) as error:
-                raise LabConfigError(f"trace {name}, line {reader.line_num}: {error}") from None
-    except csv.Error as error:
-        raise LabConfigError(f"trace {name}: {error}") from None
-    times = [step.at_s for step in steps["a"]]
-    if not times or times[0] != 0.0 or any(later <= earlier for earlier, later in pairwise(times)):
-        raise LabConfigError(f"trace {name}: t_s must start at 0 and grow")
-    return Trace(name, {path: tuple(path_steps) for path, path_steps in steps.items()})
+        return _as_links(traces.parse_trace(text, name=name, queue_bytes=queue_bytes))
+    except traces.TraceError as error:
+        raise LabConfigError(str(error)) from None
 
 
-def _step(values: dict[str, float], path: str, queue_bytes: int) -> TraceStep:
-    def profile(direction: str) -> LinkProfile:
-        return LinkProfile(
-            delay_ms=values[f"{path}_rtt_ms"] / 2,
-            loss=values[f"{path}_loss"],
-            rate_kbps=values[f"{path}_{direction}_kbps"],
-            queue_bytes=queue_bytes,
-        )
+def _as_links(recorded: RecordedPaths) -> Trace:
+    paths = {
+        path: tuple(TraceStep(step.at_s, _profile(step.up), _profile(step.down)) for step in steps)
+        for path, steps in recorded.paths.items()
+    }
+    return Trace(recorded.name, paths)
 
-    return TraceStep(values["t_s"], profile("up"), profile("down"))
+
+def _profile(direction: Direction) -> LinkProfile:
+    return LinkProfile(
+        delay_ms=direction.delay_ms,
+        loss=direction.loss,
+        rate_kbps=direction.rate_kbps,
+        queue_bytes=direction.queue_bytes,
+    )

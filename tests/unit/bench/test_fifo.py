@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bench.netlab.errors import LabConfigError
-from bench.netlab.fifo import FifoLink, FifoPath
 from bench.netlab.profile import LinkProfile
 from bench.netlab.trace_folder import read_folder
 from bench.netlab.traces import TraceStep
+from controlplane.planning.fifo import FifoLink, FifoPath
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -52,7 +52,7 @@ def test_step_survives_json() -> None:
         (HEADER + "1,1,1,1,0,1,1,1,0\n", "start at 0"),
         (HEADER + "0,1,1,1,0,1,1,1,0\n0,1,1,1,0,1,1,1,0\n", "start at 0"),
         (HEADER + "nan,1,1,1,0,1,1,1,0\n", "line 2"),
-        (HEADER + "0,1,1,1,2,1,1,1,0\n", "line 2: loss"),
+        (HEADER + "0,1,1,1,2,1,1,1,0\n", "line 2: a_loss"),
         (HEADER + "0,1,1,x,0,1,1,1,0\n", "line 2"),
         (HEADER + "0,1,1,1\n", "line 2"),
         (HEADER + "0,1,1,1,0,1,1,1,0,9\n", "line 2"),

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     import random
-
-    from bench.netlab.traces import TraceStep
+    from collections.abc import Sequence
 
 PACKET_BYTES = 1400
 """What one packet carries of a message."""
@@ -18,10 +17,46 @@ PACKET_BYTES = 1400
 _BYTES_PER_KBIT = 125.0
 
 
+class Direction(Protocol):
+    """What one direction of a path does in one step: `controlplane.planning.traces.Direction`, or a link of the lab."""
+
+    @property
+    def rate_kbps(self) -> float | None:
+        """Kilobit/s; 0 is an outage, as is None: a recorded path has a rate."""
+
+    @property
+    def delay_ms(self) -> float:
+        """Propagation, one way."""
+
+    @property
+    def loss(self) -> float:
+        """Probability that a packet is lost."""
+
+    @property
+    def queue_bytes(self) -> int:
+        """Room in front of the bottleneck."""
+
+
+class Step(Protocol):
+    """From `at_s` seconds on, both directions are like this."""
+
+    @property
+    def at_s(self) -> float:
+        """Seconds from the start."""
+
+    @property
+    def up(self) -> Direction:
+        """From the robot."""
+
+    @property
+    def down(self) -> Direction:
+        """To the robot."""
+
+
 class FifoLink:
     """One direction. Messages are offered in order of time; times are seconds of the trace's clock."""
 
-    def __init__(self, steps: tuple[TraceStep, ...], *, up: bool) -> None:
+    def __init__(self, steps: Sequence[Step], *, up: bool) -> None:
         profiles = [step.up if up else step.down for step in steps]
         self._starts = [step.at_s for step in steps]
         self._rates = [(profile.rate_kbps or 0.0) * _BYTES_PER_KBIT for profile in profiles]
@@ -84,16 +119,16 @@ class FifoLink:
 class FifoPath:
     """Both directions of one path to a server."""
 
-    def __init__(self, steps: tuple[TraceStep, ...]) -> None:
-        self._up = FifoLink(steps, up=True)
-        self._down = FifoLink(steps, up=False)
+    def __init__(self, steps: Sequence[Step]) -> None:
+        self.up = FifoLink(steps, up=True)
+        self.down = FifoLink(steps, up=False)
 
     def request(self, at: float, size: int, answer_size: int, processing_s: float, rng: random.Random) -> float:
         """Seconds from `at` to the answer; inf when request or answer is lost.
 
         Answers queue in the order of their requests, though a server may overtake itself by its processing time.
         """
-        arrived = self._up.send(at, size, rng)
+        arrived = self.up.send(at, size, rng)
         if math.isinf(arrived):
             return math.inf
-        return self._down.send(arrived + processing_s, answer_size, rng) - at
+        return self.down.send(arrived + processing_s, answer_size, rng) - at
