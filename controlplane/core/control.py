@@ -35,6 +35,7 @@ from controlplane.core.reconcile import changed_robots
 from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.stability import Stability
+from controlplane.core.status import statuses
 from protos.errors import DecodeError
 from protos.model import (
     Ack,
@@ -49,7 +50,6 @@ from protos.model import (
     ResourceKind,
     Role,
     ServiceSet,
-    SidecarStatus,
     Welcome,
 )
 
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from controlplane.core.policy import Policy
     from controlplane.core.registry import Sidecar
     from protos.explanation import Explanation
-    from protos.model import NodeName, ServiceName, SidecarMessage, SyncState
+    from protos.model import NodeName, ServiceName, SidecarMessage, SidecarStatus, SyncState
 
 PUBLISH_DELAY_S = 0.02
 """From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two
@@ -341,24 +341,7 @@ class ControlCore:
 
     def status(self, now: float) -> list[SidecarStatus]:
         """Every registered sidecar, by name."""
-        found: list[SidecarStatus] = []
-        for sidecar in sorted(self.registry, key=lambda sidecar: sidecar.name):
-            snapshots = self._publisher[sidecar.name]
-            found.append(
-                SidecarStatus(
-                    peer=sidecar.as_peer(),
-                    connected=sidecar.stream is not None,
-                    lease_left_s=max(0.0, sidecar.lease_end - now),
-                    software_version=sidecar.registration.software_version,
-                    uses=sidecar.uses,
-                    peers=snapshots.peers.status,
-                    mapping=snapshots.mapping.status,
-                    services=snapshots.mapping.sent or (),
-                    paths=tuple(self.estimator.paths(sidecar.name)),
-                    refused_offers=self.permits.refused_offers(sidecar),
-                )
-            )
-        return found
+        return list(statuses(self.registry, self._publisher, self.estimator, self.permits, now))
 
     def explain(self, robot: NodeName, service: ServiceName, now: float) -> Explanation:
         """Why requests go where they go. Raises UnknownNameError if the robot, or its service, is not known."""
