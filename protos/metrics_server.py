@@ -64,7 +64,8 @@ class MetricsServer:
     def __init__(self, host: str, port: int, registry: CollectorRegistry) -> None:
         self._server = _Server(host, port)
         self._server.set_app(make_wsgi_app(registry))
-        self._thread = threading.Thread(target=self._server.serve_forever, name="plr-metrics", daemon=True)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="plr-metrics", daemon=True)
         self._thread.start()
 
     @property
@@ -72,8 +73,15 @@ class MetricsServer:
         """The port listened on, also where 0 was asked for."""
         return self._server.server_port
 
+    def _serve(self) -> None:
+        # Not serve_forever: that looks twice a second whether it should end, and keeps whoever ends it waiting.
+        while not self._closing.is_set():
+            self._server.handle_request()
+
     def close(self) -> None:
         """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
+        self._closing.set()
+        # Wakes the thread: on Linux, a socket that listens no more is readable.
+        self._server.socket.shutdown(socket.SHUT_RDWR)
         self._thread.join(_STOP_TIMEOUT_S)
+        self._server.server_close()
