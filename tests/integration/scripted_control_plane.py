@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import queue
-import socket
 import threading
 from typing import TYPE_CHECKING, TypeVar
 
@@ -120,11 +119,3 @@ class ScriptedControlPlane(control_pb2_grpc.ControlPlaneServicer):
                 elif self.welcome is not None:
                     outgoing.put_nowait(control_message_to_proto(self.welcome))
         outgoing.put_nowait(None)
-
-
-def free_port() -> int:
-    """Return a TCP port of the loopback interface that nobody listens on right now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

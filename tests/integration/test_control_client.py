@@ -48,7 +48,8 @@ from protos.plr.v1 import control_pb2
 from sidecar.control_client import ControlClient
 from sidecar.core import control_session
 from sidecar.core.control_session import ControlSession
-from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedControlPlane, free_port
+from tests.free_ports import free_port
+from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedControlPlane
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -41,7 +41,8 @@ from protos.model import (
 from sidecar.control_client import ControlClient
 from sidecar.core import control_session
 from sidecar.core.control_session import ControlSession
-from tests.integration.scripted_control_plane import WAIT_S, free_port
+from tests.free_ports import free_port
+from tests.integration.scripted_control_plane import WAIT_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -33,7 +33,8 @@ from protos.model import (
     Welcome,
 )
 from sidecar.state_store import StateStore
-from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane, free_port
+from tests.free_ports import free_port
+from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane
 from tests.sessions import with_credential
 
 if TYPE_CHECKING:

@@ -19,6 +19,7 @@ from controlplane.stun_server import StunServer, start_stun_server
 from protos.stun import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun_client import StunClient
 from sidecar.core.stun_events import Mapped, StunEvent
+from tests.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -35,21 +36,6 @@ def udp_socket(family: int, host: str) -> socket.socket:
     sock.bind((host, 0))
     sock.setblocking(False)
     return sock
-
-
-def free_port() -> int:
-    """A UDP and TCP port that is free on both loopback addresses at the time of asking."""
-    for _ in range(50):
-        with contextlib.ExitStack() as stack:
-            first = stack.enter_context(udp_socket(4, HOSTS[4]))
-            port: int = first.getsockname()[1]
-            try:
-                second = stack.enter_context(socket.socket(socket.AF_INET6, socket.SOCK_DGRAM))
-                second.bind((HOSTS[6], port))
-            except OSError:
-                continue
-            return port
-    raise AssertionError("no free port")
 
 
 def learn(server: Address, family: int, local_host: str) -> tuple[StunEvent, Address]:
@@ -81,7 +67,7 @@ def coturn_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """A coturn that serves STUN only, on loopback, with nothing of it outside the test's own folder."""
     assert shutil.which("turnserver"), "Debian's package coturn is needed"
     folder: Path = tmp_path_factory.mktemp("coturn")
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     config = folder / "turnserver.conf"
     config.write_text(
         "\n".join(
