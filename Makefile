@@ -12,7 +12,7 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test fuzz lint format protos interfaces lock bench bench-dataplane bench-churn bench-matcher clean distclean
+.PHONY: help setup demo test fuzz lint format protos interfaces lock bench bench-quick bench-dataplane bench-churn bench-matcher clean distclean
 
 help: ## this list
 	@echo 'usage: make TARGET'
@@ -53,6 +53,9 @@ lock: setup ## lock dependencies anew from pyproject.toml (LOCK_ARGS=--upgrade f
 
 bench: setup ## every measurement, reports into bench/results
 	@$(PY) -m bench $(BENCH_ARGS)
+
+bench-quick: setup ## 20 s of a drive with every contender: direct ROS 2, MPTCP, zenoh, ours (5 minutes at most, as root)
+	@$(PY) -m bench evaluate --quick $(BENCH_ARGS)
 
 bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP, QUIC and zenoh (15 minutes, as root)
 	@$(PY) -m bench dataplane $(BENCH_ARGS)

@@ -4,6 +4,8 @@ examples:
   make bench-dataplane                                     the data plane against its targets, with a page of plots
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
   make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
+  make bench-quick                                         20 s of a drive with every contender
+  python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
   python -m bench scenarios --traces ~/traces              what the evaluation replays
   make bench-matcher BENCH_ARGS='--traces ~/traces'        are the matcher's predictions true?
 """
@@ -15,6 +17,7 @@ import sys
 
 from bench.churn import command as churn
 from bench.dataplane import command as dataplane
+from bench.evaluation import command as evaluate
 from bench.evaluation import scenarios_command as scenarios
 from bench.matcher import command as matcher
 
@@ -29,8 +32,15 @@ def main() -> int:
     churn.add_arguments(commands.add_parser("churn", help="minutes of trouble: requests lost or doubled, memory grown"))
     matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
     scenarios.add_arguments(commands.add_parser("scenarios", help="what is replayed; the generator beside traces"))
+    evaluate.add_arguments(commands.add_parser("evaluate", help="the system beside others on replayed networks"))
     options = parser.parse_args(sys.argv[1:] or ["dataplane"])
-    runs = {"churn": churn.run, "dataplane": dataplane.run, "matcher": matcher.run, "scenarios": scenarios.run}
+    runs = {
+        "churn": churn.run,
+        "dataplane": dataplane.run,
+        "evaluate": evaluate.run,
+        "matcher": matcher.run,
+        "scenarios": scenarios.run,
+    }
     return runs[options.command](options)
 
 

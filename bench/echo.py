@@ -24,8 +24,10 @@ SERVICE = "/echo"
 
 
 def answer(request: Any, response: Any) -> dict[str, Any]:
-    """Answer with a checksum of the payload, after as many milliseconds as `format` says."""
-    time.sleep(float(request.image.format or 0) / 1e3)
+    """Answer with a checksum of the payload, after as many milliseconds, and with as many bytes, as `format` says."""
+    delay_ms, _, size = request.image.format.partition(" ")
+    time.sleep(float(delay_ms or 0) / 1e3)
+    response.message = "." * int(size or 0)
     data = bytes(request.image.data)
     response.header = request.image.header
     response.success = True

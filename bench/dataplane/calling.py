@@ -36,6 +36,8 @@ class Plan:
     """No request leaves later than this after the first, however many are left."""
     grace_s: float = 5.0
     """How long the last answers are waited for."""
+    start_s: float | None = None
+    """Of CLOCK_MONOTONIC: when the first request leaves; None: at once."""
 
 
 @dataclass(slots=True)
@@ -91,7 +93,8 @@ class Caller:
         """Send the requests; returns what `Calls.of` reads when all are answered or the grace is over."""
         filler = os.urandom(max(0, plan.size - HEADER.size))
         log = self._log = CallLog(first=self._next)
-        start = time.monotonic()
+        start = time.monotonic() if plan.start_s is None else plan.start_s
+        time.sleep(max(0.0, start - time.monotonic()))
         for position in range(plan.count):
             if plan.rate_hz is not None:
                 time.sleep(max(0.0, start + position / plan.rate_hz - time.monotonic()))

@@ -17,6 +17,7 @@ import traceback
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
     from types import TracebackType
 
@@ -48,17 +49,35 @@ class Remote:
         self._read = b""
 
     @classmethod
-    def start(cls, module: str, folder: Path, *, host: Host | None = None, name: str | None = None) -> Remote:
-        """Run `python -m bench.dataplane.programs.MODULE` on this host or on one of the lab; logs go to `folder`."""
+    def start(
+        cls,
+        module: str,
+        folder: Path,
+        *,
+        host: Host | None = None,
+        name: str | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> Remote:
+        """Run `python -m bench.dataplane.programs.MODULE` on this host or on one of the lab; logs go to `folder`.
+
+        `environment` comes on top of what the program would have.
+        """
         name = name or module
         argv = [sys.executable, "-m", f"bench.dataplane.programs.{module}"]
         log = folder / f"{name}.log"
         pipe = subprocess.PIPE
         with log.open("ab") as errors:
             if host is None:
-                process = subprocess.Popen(argv, stdin=pipe, stdout=pipe, stderr=errors, start_new_session=True)
+                process = subprocess.Popen(
+                    argv,
+                    stdin=pipe,
+                    stdout=pipe,
+                    stderr=errors,
+                    start_new_session=True,
+                    env={**os.environ, **(environment or {})},
+                )
             else:
-                process = host.popen(argv, stdin=pipe, stdout=pipe, stderr=errors)
+                process = host.popen(argv, stdin=pipe, stdout=pipe, stderr=errors, env=environment)
         return cls(name, process, log)
 
     def ask(self, question: str, *, timeout_s: float = ANSWER_TIMEOUT_S, **fields: Any) -> Any:
@@ -74,6 +93,11 @@ class Remote:
             self._process.stdin.flush()
         except OSError as error:
             raise RemoteError(f"{self.name}: {error}\n{self._last_words()}") from error
+
+    def ready(self, timeout_s: float) -> bool:
+        """Whether the answer to what was begun comes, or the program ends, within this time."""
+        assert self._process.stdout is not None
+        return b"\n" in self._read or bool(select.select([self._process.stdout], [], [], max(0.0, timeout_s))[0])
 
     def finish(self, timeout_s: float = ANSWER_TIMEOUT_S) -> Any:
         """Return the answer to what was begun. Raises RemoteError."""

@@ -54,6 +54,15 @@ def _lab(interfaces: tuple[InterfaceSpec, ...]) -> LabConfig:
     )
 
 
+def allow_multipath(robot: Host, cloud: Host) -> None:
+    """Let the kernel's multipath TCP use the robot's second carrier too. Raises CalledProcessError: it has none."""
+    for host in (robot, cloud):
+        host.run(["ip", "mptcp", "limits", "set", "subflow", "2", "add_addr_accepted", "2"], check=True)
+    robot.run(["ip", "mptcp", "endpoint", "flush"], check=True)
+    second = robot.address(CARRIERS[1])
+    robot.run(["ip", "mptcp", "endpoint", "add", second, "dev", CARRIERS[1], "subflow"], check=True)
+
+
 class SilentCut:
     """Takes away cables in the middle: everything is lost both ways, while the carriers stay up and nobody is told."""
 

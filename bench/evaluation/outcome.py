@@ -24,7 +24,8 @@ class Request:
     """One request; seconds from the window's begin."""
 
     due_s: float
-    sent_s: float
+    sent_s: float | None
+    """None: never, its sender was blocked."""
     answered_s: float | None
     """None: never."""
 

@@ -31,10 +31,12 @@ class TcpProgram:
         self._connection: socket.socket | None = None
         self._caller = Caller(self._send)
         self._answer_bytes = HEADER.size
+        self._compute_s = 0.0
 
-    def listen(self, *, multipath: bool, answer_bytes: int = HEADER.size) -> int:
-        """Serve on a free port of all addresses; returns it."""
+    def listen(self, *, multipath: bool, answer_bytes: int = HEADER.size, compute_s: float = 0.0) -> int:
+        """Serve on a free port of all addresses, each request for `compute_s`; returns the port."""
         self._answer_bytes = answer_bytes
+        self._compute_s = compute_s
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, _IPPROTO_MPTCP if multipath else 0)
         listener.bind(("0.0.0.0", 0))
         listener.listen()
@@ -73,6 +75,8 @@ class TcpProgram:
             self._start(sock, self._on_request)
 
     def _on_request(self, sock: socket.socket, message: bytes, _now: float) -> None:
+        if self._compute_s:
+            time.sleep(self._compute_s)
         answer = message[: self._answer_bytes]
         sock.sendall(_LENGTH.pack(len(answer)) + answer)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import queue
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -25,12 +26,22 @@ class ZenohProgram:
 
     def __init__(self) -> None:
         self._sessions: list[zenoh.Session] = []
+        self._outboxes: list[queue.SimpleQueue[bytes]] = []
         self._caller = Caller(self._send)
         self._answer_bytes = HEADER.size
+        self._compute_s = 0.0
 
-    def listen(self, ports: list[int], max_links: int, lease_ms: int, answer_bytes: int = HEADER.size) -> None:
-        """Serve on these TCP ports of all addresses, a session for each."""
+    def listen(
+        self,
+        ports: list[int],
+        max_links: int,
+        lease_ms: int,
+        answer_bytes: int = HEADER.size,
+        compute_s: float = 0.0,
+    ) -> None:
+        """Serve on these TCP ports of all addresses, a session for each, each request for `compute_s`."""
         self._answer_bytes = answer_bytes
+        self._compute_s = compute_s
         for port in ports:
             session = _open(max_links, lease_ms, listen=[f"tcp/0.0.0.0:{port}"])
             session.declare_queryable(KEY, self._on_query, complete=True)
@@ -47,6 +58,10 @@ class ZenohProgram:
             if time.monotonic() > end:
                 raise TimeoutError("not all links came up")
             time.sleep(0.05)
+        for session in self._sessions:
+            outbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            self._outboxes.append(outbox)
+            threading.Thread(target=self._query, args=(session, outbox), daemon=True).start()
 
     def call(self, **plan: Any) -> dict[str, Any]:
         """Send a plan's requests."""
@@ -63,14 +78,21 @@ class ZenohProgram:
 
     def _on_query(self, query: zenoh.Query) -> None:
         assert query.payload is not None
+        if self._compute_s:
+            time.sleep(self._compute_s)
         query.reply(KEY, query.payload.to_bytes()[: self._answer_bytes])
 
     def _send(self, _number: int, data: bytes) -> None:
-        for session in self._sessions:
+        for outbox in self._outboxes:
+            outbox.put(data)
+
+    def _query(self, session: zenoh.Session, outbox: queue.SimpleQueue[bytes]) -> None:
+        """Send one session's queries; a session that blocks, its link being full, holds up no other."""
+        while True:
             session.get(
                 KEY,
                 self._on_reply,
-                payload=data,
+                payload=outbox.get(),
                 timeout=QUERY_TIMEOUT_S,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,

@@ -16,7 +16,7 @@ from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import Calls, Row, median, ratio, worst
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, SilentCut, cables
+from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, SilentCut, allow_multipath, cables
 from bench.netlab import Lab
 
 if TYPE_CHECKING:
@@ -167,11 +167,7 @@ def _tcp(world: World) -> contextlib.AbstractContextManager[Remote]:
 
 @contextlib.contextmanager
 def _mptcp(world: World) -> Iterator[Remote]:
-    for host in (world.robot, world.cloud):
-        host.run(["ip", "mptcp", "limits", "set", "subflow", "2", "add_addr_accepted", "2"], check=True)
-    world.robot.run(["ip", "mptcp", "endpoint", "flush"], check=True)
-    second = world.robot.address(CARRIERS[1])
-    world.robot.run(["ip", "mptcp", "endpoint", "add", second, "dev", CARRIERS[1], "subflow"], check=True)
+    allow_multipath(world.robot, world.cloud)
     with _stream(world, multipath=True) as client:
         client.ask("call", size=SIZE, count=5, rate_hz=RATE_HZ)
         if client.ask("subflows") != 1:

@@ -1,0 +1,131 @@
+"""`python -m bench evaluate`: scenarios x contenders, a record of every request, and a table; misses first."""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+import sys
+import tempfile
+import traceback
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from bench.dataplane.command import rich_table
+from bench.dataplane.report import machine
+from bench.dataplane.section import Figure, Table
+from bench.evaluation.contenders import CONTENDERS
+from bench.evaluation.ideal import IDEALS, compute
+from bench.evaluation.runner import run as run_in_lab
+from bench.evaluation.scenario import Scenario, read_scenarios
+from bench.netlab import LabConfigError
+from bench.netlab.trace_folder import read_folder
+from protos.errors import ConfigError
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Sequence
+
+    from bench.evaluation.outcome import Outcome
+
+QUICK_SCENARIO = "drive-1"
+QUICK_SECONDS = 20.0
+_COLUMNS = ("", "missed", "never answered", "mean ms", "P50 ms", "P99 ms", "kB/request", "void")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m bench evaluate`."""
+    names = (*CONTENDERS, *IDEALS)
+    parser.add_argument("--scenario", action="append", metavar="GLOB", help="these only; `python -m bench scenarios`")
+    parser.add_argument("--contender", action="append", choices=names, help="this one only; may be repeated")
+    parser.add_argument("--traces", type=Path, help="folder of recorded traces; default: made-up scenarios alone")
+    parser.add_argument("--seconds", type=float, help="shorten every window to so much")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK_SECONDS:g} s of {QUICK_SCENARIO}: does it work?")
+    parser.add_argument(
+        "--out", type=Path, default=Path("bench/results"), help="folder for the reports (default %(default)s)"
+    )
+    parser.add_argument("--keep-logs", type=Path, metavar="DIR", help="keep configurations and logs here")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Measure; returns the exit code: 1 when a run failed or was disturbed, 2 when something is not readable."""
+    try:
+        scenarios = _chosen(options)
+    except (LabConfigError, ConfigError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    console = Console(highlight=False, soft_wrap=True)
+    outcomes: list[Outcome] = []
+    failed: list[str] = []
+    for scenario in scenarios:
+        console.print(f"{scenario.name} (case {scenario.case}): {scenario.about}, {scenario.duration_s:g} s")
+        for contender in options.contender or (*IDEALS, *CONTENDERS):
+            with console.status(f"{scenario.name}: {contender}"):
+                try:
+                    outcomes.append(_run(scenario, contender, options.keep_logs))
+                except LabConfigError as error:
+                    print(error, file=sys.stderr)
+                    return 2
+                except Exception as error:  # the other runs are worth having
+                    traceback.print_exc()
+                    failed.append(f"{scenario.name}, {contender}: {error}".splitlines()[0])
+                    continue
+            outcomes[-1].write(options.out / "evaluation")
+            for why in outcomes[-1].disturbances:
+                console.print(f"{contender}: void, {why}")
+        console.print(rich_table(_table(scenario, outcomes)))
+        _write(options, outcomes, failed)
+    for text in failed:
+        console.print(f"failed: {text}")
+    void = any(outcome.disturbances for outcome in outcomes)
+    return 1 if failed or (void and not options.quick) else 0
+
+
+def _chosen(options: argparse.Namespace) -> list[Scenario]:
+    scenarios = read_scenarios(read_folder(options.traces) if options.traces else [])
+    globs = options.scenario or ([QUICK_SCENARIO] if options.quick else ["*"])
+    chosen = [one for one in scenarios if any(fnmatch.fnmatch(one.name, glob) for glob in globs)]
+    if not chosen:
+        raise LabConfigError(f"no scenario {' or '.join(globs)}; `python -m bench scenarios` lists them")
+    seconds = options.seconds or (QUICK_SECONDS if options.quick else None)
+    return [one.shortened(seconds) for one in chosen] if seconds else chosen
+
+
+def _run(scenario: Scenario, contender: str, keep_logs: Path | None) -> Outcome:
+    if contender in IDEALS:
+        return compute(scenario, contender)
+    with tempfile.TemporaryDirectory(prefix="plr-evaluation-") as name:
+        folder = Path(name)
+        if keep_logs is not None:
+            folder = keep_logs / scenario.name / contender
+            folder.mkdir(parents=True, exist_ok=True)
+        return run_in_lab(scenario, CONTENDERS[contender], folder)
+
+
+def _table(scenario: Scenario, outcomes: Sequence[Outcome]) -> Table:
+    rows: list[tuple[str | Figure, ...]] = []
+    for outcome in outcomes:
+        if outcome.scenario == scenario.name:
+            figures = outcome.figures()
+            kilobytes = None if figures.bytes_per_request is None else figures.bytes_per_request / 1e3
+            shares = (f"{figures.miss_ratio:.1%}", f"{figures.unanswered_ratio:.1%}")
+            latencies = (figures.mean_ms, figures.p50_ms, figures.p99_ms)
+            void = "void" if outcome.disturbances else ""
+            rows.append((outcome.contender, *shares, *latencies, kilobytes, void))
+    title = f"{scenario.name}: {scenario.count} requests, deadline {scenario.traffic.deadline_ms:g} ms"
+    return Table(title, _COLUMNS, tuple(rows))
+
+
+def _write(options: argparse.Namespace, outcomes: Sequence[Outcome], failed: Sequence[str]) -> None:
+    runs: dict[str, dict[str, Any]] = {}
+    for outcome in outcomes:
+        runs.setdefault(outcome.scenario, {})[outcome.contender] = {
+            **asdict(outcome.figures()),
+            "case": outcome.case,
+            "deadline_ms": outcome.deadline_ms,
+            "void": list(outcome.disturbances),
+        }
+    report = {"runs": runs, "failed": list(failed), "machine": machine(), "quick": options.quick}
+    (options.out / "evaluation.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,157 @@
+"""Ways to get answers from a cloud over two carriers: each gives a client that is connected and ready to call.
+
+All of them run in the same lab: a robot with a carrier `a` and a carrier `b`, two servers that take the same time for a
+request, one request at a time. Nobody stands behind a NAT, as DDS does not pass one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from bench.dataplane.remote import Remote
+from bench.dataplane.topology import CARRIERS, CLOUDS, ROBOT, allow_multipath
+from bench.netlab import HostSpec, InterfaceSpec, LabConfig, LinkProfile, server
+from bench.system import System
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from bench.evaluation.scenario import Traffic
+    from bench.netlab import Host, Lab
+
+PATHS = dict(zip(CARRIERS, ("a", "b"), strict=True))
+"""The robot's interface -> the path of the trace behind it."""
+WARM = LinkProfile(delay_ms=20.0, rate_kbps=50_000.0)
+"""Both links while everybody starts and finds the others: the same good network for all."""
+ZENOH_PORT = 7447
+ZENOH_LEASE_MS = 10_000
+"""Its default: TCP below survives what is shorter."""
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """What a contender is started in."""
+
+    lab: Lab
+    folder: Path
+    """For configurations and logs."""
+    traffic: Traffic
+
+    @property
+    def robot(self) -> Host:
+        """Where the client runs."""
+        return self.lab.host(ROBOT)
+
+    @property
+    def clouds(self) -> tuple[Host, ...]:
+        """Where servers run."""
+        return tuple(self.lab.host(name) for name in CLOUDS)
+
+    @property
+    def service(self) -> dict[str, float]:
+        """How a server answers, as the programs are told."""
+        return {"answer_bytes": self.traffic.answer_bytes, "compute_s": self.traffic.compute_ms / 1e3}
+
+    def remote(self, program: str, host: Host, **environment: str) -> Remote:
+        """Start a measurement program."""
+        return Remote.start(program, self.folder, host=host, name=f"{program}.{host.name}", environment=environment)
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """One way."""
+
+    name: str
+    about: str
+    start: Callable[[World], AbstractContextManager[Remote]]
+    carriers: tuple[str, ...] = CARRIERS
+    """Interfaces that the robot has."""
+
+    def lab(self) -> LabConfig:
+        """The lab that it needs."""
+        interfaces = tuple(InterfaceSpec(name, nat=None, up=WARM, down=WARM) for name in self.carriers)
+        return LabConfig(
+            robots=(HostSpec(ROBOT, interfaces),), clouds=tuple(server(name) for name in CLOUDS), source_routing=True
+        )
+
+
+def _direct(world: World, *, carrier: str) -> Iterator[Remote]:
+    cloud = world.clouds[0]
+    # Multicast does not cross routers: each is told where the other is.
+    there = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": cloud.address()}
+    here = {**there, "ROS_STATIC_PEERS": world.robot.address(carrier)}
+    argv = [sys.executable, "-m", "bench.echo", "serve"]
+    cloud.popen(argv, env=here, log_path=world.folder / "direct.server.log")
+    with world.remote("ros", world.robot, **there) as client:
+        client.ask("connect", **world.service)
+        yield client
+
+
+def _mptcp(world: World) -> Iterator[Remote]:
+    cloud = world.clouds[0]
+    allow_multipath(world.robot, cloud)
+    with world.remote("tcp", cloud) as listener, world.remote("tcp", world.robot) as client:
+        port = listener.ask("listen", multipath=True, **world.service)
+        client.ask("connect", host=cloud.address(), port=port, multipath=True)
+        client.ask("call", size=1000, count=5, rate_hz=20.0)
+        if client.ask("subflows") != 1:
+            raise RuntimeError("the second subflow did not come up")
+        yield client
+
+
+def _zenoh(world: World) -> Iterator[Remote]:
+    common = {"max_links": 1, "lease_ms": ZENOH_LEASE_MS}
+    with contextlib.ExitStack() as stack:
+        for cloud in world.clouds:
+            listener = stack.enter_context(world.remote("zenoh", cloud))
+            listener.ask("listen", ports=[ZENOH_PORT], **common, **world.service)
+        client = stack.enter_context(world.remote("zenoh", world.robot))
+        sessions = [
+            [f"tcp/{cloud.address()}:{ZENOH_PORT}#iface={carrier}"]
+            for cloud, carrier in zip(world.clouds, CARRIERS, strict=True)
+        ]
+        client.ask("connect", sessions=sessions, **common)
+        yield client
+
+
+def _plr(world: World) -> Iterator[Remote]:
+    service = {"name": "/echo", "deadline_ms": world.traffic.deadline_ms, "idempotent": True}
+    system = System(world.lab, world.folder)
+    try:
+        system.start_control_plane()
+        for cloud in CLOUDS:
+            system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
+            system.start_cloud(cloud, [{"name": "/echo"}])
+        system.wait_for_offer(system.start_robot([service]))
+        with world.remote("ros", world.robot) as client:
+            client.ask("connect", **world.service)
+            yield client
+    finally:
+        system.close()
+
+
+_ALL = (
+    Contender(
+        "direct-a",
+        "ROS 2 straight over carrier a",
+        contextlib.contextmanager(partial(_direct, carrier=CARRIERS[0])),
+        CARRIERS[:1],
+    ),
+    Contender(
+        "direct-b",
+        "ROS 2 straight over carrier b",
+        contextlib.contextmanager(partial(_direct, carrier=CARRIERS[1])),
+        CARRIERS[1:],
+    ),
+    Contender("mptcp", "one connection of the kernel's multipath TCP", contextlib.contextmanager(_mptcp)),
+    Contender("zenoh", "a zenoh session over each carrier, first reply", contextlib.contextmanager(_zenoh)),
+    Contender("plr-replicate", "every request over both carriers, first answer", contextlib.contextmanager(_plr)),
+)
+CONTENDERS = {contender.name: contender for contender in _ALL}
+"""By name; the ideals (`bench.evaluation.ideal`) stand beside them."""

@@ -1,0 +1,119 @@
+"""One scenario with one contender in the lab: start all on a good network, replay the window, keep the records."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from bench.dataplane.statistics import MS, Calls, quantile
+from bench.evaluation.contenders import PATHS, WARM, World
+from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request
+from bench.netlab import Lab
+from bench.pressure import BUSY_SHARE, CpuPressure
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from bench.dataplane.remote import Remote
+    from bench.evaluation.contenders import Contender
+    from bench.evaluation.scenario import Scenario
+    from bench.netlab import LinkStats
+
+WARM_UP_S = 3.0
+"""Of the scenario's requests, on the good network, before the window."""
+LEAD_S = 1.0
+"""From the order to replay to the window's begin: by then links and client have it."""
+DRAIN_S = 30.0
+"""By then a client that was blocked has ended its run, once the links are good again."""
+MOST_LATE_S = 0.005
+"""P99 of the emulator's packets behind their time; more disturbs a run."""
+MOST_LATE_STEP_S = 0.1
+"""The worst step of the trace behind its time."""
+
+
+def run(scenario: Scenario, contender: Contender, folder: Path, *, seed: int = 1) -> Outcome:
+    """Run it. Logs go to `folder`.
+
+    Raises:
+        LabError, LabConfigError: the lab or the trace.
+        SystemFailureError, RemoteError, RuntimeError: the contender did not start, or ended.
+    """
+    traffic = scenario.traffic
+    trace = scenario.trace()
+    plan = {"size": traffic.request_bytes, "rate_hz": traffic.rate_hz}
+    with Lab(contender.lab(), seed=seed) as lab, contender.start(World(lab, folder, traffic)) as client:
+        client.ask("call", **plan, count=max(1, round(WARM_UP_S * traffic.rate_hz)))
+        before = {name: lab.link(name).stats(reset=True) for name in contender.carriers}
+        pressure = CpuPressure()
+        start = time.monotonic() + LEAD_S
+        lab.replay(trace, {name: PATHS[name] for name in contender.carriers}, start=start)
+        seconds = scenario.duration_s + UNANSWERED_S
+        client.begin("call", **plan, count=scenario.count, start_s=start, seconds=seconds, grace_s=UNANSWERED_S)
+        client.ready(start + seconds - time.monotonic())
+        busy = pressure.share()
+        after = {name: lab.link(name).stats() for name in contender.carriers}
+        calls = _finish(client, lab, contender.carriers)
+    sent = {name: after[name].up.sent_bytes - before[name].up.sent_bytes for name in after}
+    late_s = [at - start - number / traffic.rate_hz for number, at in enumerate(calls.sent_s)]
+    return Outcome(
+        scenario=scenario.name,
+        case=scenario.case,
+        contender=contender.name,
+        deadline_ms=traffic.deadline_ms,
+        requests=_requests(calls, start, scenario),
+        bytes_sent=sent,
+        disturbances=disturbances(after, busy),
+        conditions={
+            "cpu_pressure": busy,
+            "client_late_p99_ms": (quantile(late_s, 0.99) or 0.0) * MS,
+            "links": {name: _conditions(stats) for name, stats in after.items()},
+        },
+    )
+
+
+def disturbances(links: Mapping[str, LinkStats], busy: float | None) -> tuple[str, ...]:
+    """Why a run says more about the machine than about the contender; nothing: it counts."""
+    found = []
+    for name, stats in links.items():
+        if stats.lateness.p99_s > MOST_LATE_S:
+            found.append(f"{name}: packets {stats.lateness.p99_s * MS:.1f} ms late (P99)")
+        if stats.step_lateness.max_s > MOST_LATE_STEP_S:
+            found.append(f"{name}: a step of the trace {stats.step_lateness.max_s * MS:.0f} ms late")
+        lost = stats.up.kernel_drops + stats.down.kernel_drops
+        if lost:
+            found.append(f"{name}: {lost} packets lost before the emulator saw them")
+    if busy is not None and busy > BUSY_SHARE:
+        found.append(f"some program waited for a processor for {busy:.0%} of the run")
+    return tuple(found)
+
+
+def _finish(client: Remote, lab: Lab, carriers: Sequence[str]) -> Calls:
+    """The client's log. What it is still blocked with may leave now; no answer counts any more."""
+    for name in carriers:
+        lab.link(name).set(WARM)
+    return Calls.of(client.finish(DRAIN_S))
+
+
+def _requests(calls: Calls, start: float, scenario: Scenario) -> tuple[Request, ...]:
+    requests = []
+    for number in range(scenario.count):
+        due_s = number / scenario.traffic.rate_hz
+        sent_s = calls.sent_s[number] - start if number < len(calls.sent_s) else None
+        latency_s = calls.latency_s[number] if sent_s is not None else None
+        answered_s = sent_s + latency_s if sent_s is not None and latency_s is not None else None
+        requests.append(Request(due_s, sent_s, answered_s))
+    return tuple(requests)
+
+
+def _conditions(stats: LinkStats) -> dict[str, Any]:
+    return {
+        "late_p99_ms": stats.lateness.p99_s * MS,
+        "late_max_ms": stats.lateness.max_s * MS,
+        "step_late_max_ms": stats.step_lateness.max_s * MS,
+        "realtime": stats.realtime,
+        "queue_drops": {
+            direction: {reason.value: count for reason, count in side.drops.items() if count}
+            for direction, side in (("up", stats.up), ("down", stats.down))
+        },
+    }
