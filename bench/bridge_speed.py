@@ -35,6 +35,7 @@ from rclpy.type_support import check_for_type_support
 from std_srvs.srv import Empty
 
 from protos.model import NodeName, Role, ServiceName, SessionId
+from sidecar import interpreter
 from sidecar.core.events import ExecuteRequest, ExecutionId, OfferService, RequestFailed, ResponseArrived
 from sidecar.core.priority import Priority
 from sidecar.core.rules import ServiceRule
@@ -197,7 +198,7 @@ def run_bridges(services: int) -> None:
     """Proxy ROS_DOMAIN_ID's services into the next domain."""
     from sidecar.ros.bridge import RosBridge
 
-    sys.setswitchinterval(0.0005)
+    interpreter.share()
     rules = (ServiceRule("/s*", deadline_s=1.0, lifetime_s=CALL_TIMEOUT_S),)
     domain = int(os.environ["ROS_DOMAIN_ID"])
     joined = Shortcut()

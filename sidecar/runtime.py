@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import logging
 import random
-import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -15,6 +13,7 @@ from protos.config_fields import split_host_port
 from protos.errors import ConfigError
 from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, Version
 from protos.tls_files import TlsWatch, load_tls_files
+from sidecar import interpreter
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.core.engine import EngineConfig
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SWITCH_INTERVAL_S = 0.0005
-"""A computing thread gives the interpreter up after this (CPython's default is 5 ms): what another interface waits."""
 DRAIN_S = 5.0
 """On SIGTERM, requests in flight get this long."""
 DRAIN_POLL_S = 0.02
@@ -99,7 +96,7 @@ class Sidecar:
             ConfigError: the configuration does not fit this machine.
             OSError: a socket or the metrics' port is refused.
         """
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        interpreter.share()
         self._open_metrics()
         self._data_plane.start()
         last = self._store.last_good
@@ -130,9 +127,7 @@ class Sidecar:
         self._store.close()
         if self._metrics is not None:
             self._metrics.close()
-        # gRPC waits at exit, for 2 s, until its channels are gone, and only a collection takes their cycles apart.
-        gc.unfreeze()
-        gc.collect()
+        interpreter.clear()
 
     def _open_metrics(self) -> None:
         listen = self._config.metrics_listen
@@ -247,10 +242,7 @@ def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
     sidecar = Sidecar(config, version)
     notifier = sdnotify.SystemdNotifier()
     sidecar.start()
-    # What start-up made stays: a full collection over it would hold the interpreter, and all interfaces, for 20 to
-    # 35 ms; with it set aside, a collection looks at the requests in flight only.
-    gc.collect()
-    gc.freeze()
+    interpreter.settle()
     notifier.notify("READY=1")
     log.info("stopping %s: no new requests, finishing those in flight", stopping.wait())
     notifier.notify("STOPPING=1")

@@ -7,7 +7,6 @@ beginning. What the control plane would push (peers, mapping) comes from the con
 from __future__ import annotations
 
 import base64
-import gc
 import logging
 import queue
 import random
@@ -37,12 +36,12 @@ from protos.model import (
     SessionId,
     Version,
 )
+from sidecar import interpreter
 from sidecar.config import SidecarConfig
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, RequestId, ResponseArrived
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
-from sidecar.runtime import SWITCH_INTERVAL_S
 from sidecar.start_session import start_session
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ class EngineProgram:
         )
         self._role, self._answer_bytes = parsed.role, answer_bytes
         logging.basicConfig(level=parsed.log_level.name, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
-        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        interpreter.share()
         self._name = parsed.name
         self._own = start_session(parsed.node_name, parsed.role, 1, None)
         self._token = random.randbytes(16)
@@ -96,8 +95,7 @@ class EngineProgram:
             threading.Thread(target=self._answer, daemon=True, name="application").start()
         if not self._have_candidates.wait(READY_TIMEOUT_S):
             raise TimeoutError("no interface came into use")
-        gc.collect()
-        gc.freeze()
+        interpreter.settle()
         return self._as_peer(parsed.name)
 
     def meet(self, peers: list[dict[str, Any]], mapping: list[tuple[str, str]] | None = None) -> None:
