@@ -30,6 +30,6 @@ def settle() -> None:
 
 
 def clear() -> None:
-    """Take everything apart before the end: gRPC waits at exit, for 2 s, until its channels and their cycles are gone."""
+    """Take everything apart before the end: gRPC waits at exit, for 2 s, until its channels' cycles are gone."""
     gc.unfreeze()
     gc.collect()
