@@ -1,16 +1,18 @@
-"""plr: ask a running control plane, certify the fleet's nodes, try out a policy, look up configuration keys.
+"""plr: ask a running control plane, plan ahead, certify nodes, try out a policy, look up configuration keys.
 
 examples:
   plr status --tls-dir ~/.plr/alice --address control.example.org:50051
   plr status --insecure --json
   plr explain --tls-dir ~/.plr/alice robot-7 /plan
+  plr plan --traces drive.csv.gz --request-bytes 120000 --deadline-ms 250 --target 0.01
   plr ca init
   plr ca issue robot-1 --role robot
   plr config schema controlplane
   plr config schema sidecar
   plr policy check --config /etc/plr/controlplane.yaml --robot arm-1 --service /plan --cloud cloud-a
 
-exit codes: 0 ok, 1 the control plane cannot be reached or is not in order, or the policy denies it, 2 bad usage
+exit codes: 0 ok, 1 the control plane cannot be reached or is not in order, or the policy
+denies it, or the plan misses its target, 2 bad usage
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from typing import TYPE_CHECKING
 
 from google.protobuf import json_format
 
-from controlplane import explain_command, policy_command, status_table, version
+from controlplane import explain_command, plan_command, policy_command, status_table, version
 from controlplane.admin_client import AskError, add_options, ask
 from controlplane.ca import commands as ca_commands
 from controlplane.config import ControlPlaneConfig
@@ -59,6 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     status.set_defaults(run=_status)
 
     explain_command.add_to(commands)
+    plan_command.add_to(commands)
     ca_commands.add_to(commands)
 
     config = commands.add_parser("config", help="about configuration files")

@@ -28,6 +28,7 @@ give; the last changes. How each is computed: docs/theory.md.
 examples:
   plr explain --tls-dir ~/.plr/alice robot-7 /plan
   plr explain --insecure --json robot-7 /plan > robot-7.json
+  plr plan --recorded robot-7.json --target 0.001
 """
 
 

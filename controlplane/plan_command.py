@@ -1,0 +1,182 @@
+"""`plr plan`: how many interfaces and servers it takes to meet a target, from what was recorded, without a network."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from controlplane.planning import plan_text
+from controlplane.planning.plot import PlotError, draw
+from controlplane.planning.prospects import least_set
+from controlplane.planning.recorded import RecordedService, RecordingError, read_recording
+from controlplane.planning.replay import Compute, ReplayedTraces, Workload
+from controlplane.planning.traces import TraceError, read_trace
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from controlplane.arguments import Commands
+    from controlplane.planning.prospects import Source
+    from controlplane.planning.traces import RecordedPaths
+
+EXIT_MET = 0
+EXIT_NOT_MET = 1
+EXIT_USAGE = 2
+
+MAX_REQUESTS = 5_000_000
+"""Requests sent through traces in one run: some minutes."""
+
+DEFAULT = Workload(request_bytes=10_000, answer_bytes=1000, rate_hz=10.0, compute=Compute(0.02, 0.04))
+"""What is sent through traces unless said otherwise; what was recorded live has its own."""
+
+_EPILOG = """\
+The LSC theorem says that one server behind one path can not be latency-reliable on commodity infrastructure: it misses
+with some epsilon > 0. Copies over k independent paths all miss with epsilon^k, so some k meets any target. This command
+says which: PRODUCT is what independent paths would give, JOINT what was recorded. Each interface goes to one server.
+
+examples:
+  plr explain --tls-dir ~/.plr/alice --json robot-7 /plan > robot-7.json
+  plr plan --recorded robot-7.json --target 0.001
+  plr plan --traces drive-*.csv.gz --request-bytes 120000 --rate-hz 5 --deadline-ms 250 --target 0.01 --plot plan.svg
+
+exit codes: 0 done (with --target: some set meets it), 1 no set meets the target, 2 bad usage
+"""
+
+
+class _UsageError(Exception):
+    """One line for the user."""
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command to `plr`."""
+    plan = commands.add_parser(
+        "plan",
+        help="how many interfaces and servers meet a target, from recordings",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    source = plan.add_mutually_exclusive_group(required=True)
+    source.add_argument("--recorded", type=Path, metavar="FILE", help="what plr explain --json printed")
+    source.add_argument(
+        "--traces",
+        type=Path,
+        nargs="+",
+        metavar="FILE|DIR",
+        help="traces of two paths, .csv or .csv.gz, or folders",
+    )
+    plan.add_argument("--deadline-ms", type=_number(0.0), metavar="MS", help="with --recorded: the service's own")
+    plan.add_argument("--target", type=_number(0.0, 1.0), metavar="PROBABILITY", help="to miss at most so often")
+    plan.add_argument("--plot", type=Path, metavar="FILE", help="draw it over the deadline: .svg or .html")
+    plan.add_argument("--json", action="store_true", help="print the table as JSON")
+    workload = plan.add_argument_group("what is sent through traces")
+    workload.add_argument("--request-bytes", type=_whole, metavar="N", help=f"the default is {DEFAULT.request_bytes}")
+    workload.add_argument("--answer-bytes", type=_whole, metavar="N", help=f"the default is {DEFAULT.answer_bytes}")
+    workload.add_argument(
+        "--rate-hz", type=_number(0.0), metavar="N", help=f"requests a second; the default is {DEFAULT.rate_hz:g}"
+    )
+    workload.add_argument(
+        "--compute-ms",
+        type=_compute,
+        dest="compute",
+        metavar="MEDIAN:P99",
+        help="how long servers take, log-normal; the default is 20:40",
+    )
+    plan.set_defaults(run=_plan)
+
+
+def _number(above: float, below: float = float("inf")) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = above
+        if not above < value < below:
+            limit = f" and below {below:g}" if below < float("inf") else ""
+            raise argparse.ArgumentTypeError(f"expected a number above {above:g}{limit}, got {text}")
+        return value
+
+    return parse
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal() or not 0 < int(text) <= 1 << 24:
+        raise argparse.ArgumentTypeError(f"expected 1 to {1 << 24} bytes, got {text}")
+    return int(text)
+
+
+def _compute(text: str) -> Compute:
+    median, _, p99 = text.partition(":")
+    try:
+        found = Compute(float(median) / 1e3, float(p99) / 1e3)
+    except ValueError:
+        found = Compute(0.0, 0.0)
+    if not 0.0 < found.median_s <= found.p99_s < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected MEDIAN:P99 in milliseconds, such as 20:40, got {text}")
+    return found
+
+
+def _given(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What was said of the workload."""
+    keys = (field.name for field in fields(Workload))
+    return {key: getattr(arguments, key) for key in keys if getattr(arguments, key) is not None}
+
+
+def _plan(arguments: argparse.Namespace) -> int:
+    try:
+        source, deadline_s = _recorded(arguments) if arguments.recorded is not None else _replayed(arguments)
+        prospects = source.prospects(deadline_s)
+        if not prospects:
+            raise _UsageError(f"{arguments.recorded}: no pair in it carried a request or a probe")
+        if arguments.plot is not None:
+            draw(arguments.plot, source, deadline_s, arguments.target)
+    except (_UsageError, RecordingError, TraceError, PlotError) as error:
+        sys.stderr.write(f"plr: {error}\n")
+        return EXIT_USAGE
+    least = least_set(prospects, arguments.target) if arguments.target is not None else None
+    if arguments.json:
+        told = {
+            "recorded": source.title,
+            "deadline_ms": deadline_s * 1e3,
+            "target": arguments.target,
+            "sets": [asdict(found) for found in prospects],
+            "least": asdict(least) if least is not None else None,
+        }
+        sys.stdout.write(json.dumps(told, indent=2) + "\n")
+    else:
+        sys.stdout.write(plan_text.render(source, prospects, deadline_s, arguments.target) + "\n")
+    return EXIT_NOT_MET if arguments.target is not None and least is None else EXIT_MET
+
+
+def _recorded(arguments: argparse.Namespace) -> tuple[Source, float]:
+    if _given(arguments):
+        raise _UsageError("sizes, rate and computing times go with --traces: what was recorded is as it was")
+    source = RecordedService(read_recording(arguments.recorded))
+    deadline_ms = arguments.deadline_ms
+    return source, source.deadline_s if deadline_ms is None else deadline_ms / 1e3
+
+
+def _replayed(arguments: argparse.Namespace) -> tuple[Source, float]:
+    if arguments.deadline_ms is None:
+        raise _UsageError("--traces needs --deadline-ms")
+    workload = replace(DEFAULT, **_given(arguments))
+    traces = _read(arguments.traces)
+    requests = sum(trace.duration_s for trace in traces) * workload.rate_hz
+    if requests > MAX_REQUESTS:
+        raise _UsageError(f"{requests:.0f} requests, {MAX_REQUESTS} at most: give fewer traces or a lower --rate-hz")
+    if requests < 1.0:
+        raise _UsageError("the traces are too short for a single request")
+    return ReplayedTraces(traces, workload), arguments.deadline_ms / 1e3
+
+
+def _read(paths: Sequence[Path]) -> list[RecordedPaths]:
+    files: list[Path] = []
+    for path in paths:
+        inside = sorted((*path.glob("*.csv"), *path.glob("*.csv.gz"))) if path.is_dir() else [path]
+        if not inside:
+            raise _UsageError(f"{path}: no .csv or .csv.gz in this folder")
+        files += inside
+    return [read_trace(file) for file in files]

@@ -1,0 +1,64 @@
+"""The predictions as a table for a terminal, and what they say of the target."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from controlplane.planning.prospects import least_set, paths_needed
+from controlplane.text_table import columns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from controlplane.planning.prospects import Prospect, Source
+
+HEADER = ("INTERFACES", "SERVERS", "PRODUCT", "JOINT", "JOINT/PRODUCT", "BEST SET")
+
+
+def render(source: Source, prospects: Sequence[Prospect], deadline_s: float, target: float | None) -> str:
+    """What was recorded, a row for each set, and the verdict."""
+    rows = [
+        (
+            str(found.interfaces),
+            str(found.servers),
+            f"{found.product:.2g}",
+            f"{found.joint:.2g}",
+            f"{found.joint / found.product:.2g}",
+            found.paths,
+        )
+        for found in prospects
+    ]
+    lines = [source.title, f"predicted probability to miss {deadline_s * 1e3:g} ms:", "", *columns([HEADER, *rows])]
+    if target is not None:
+        lines += ["", *verdict(source, prospects, target)]
+    return "\n".join(lines)
+
+
+def verdict(source: Source, prospects: Sequence[Prospect], target: float) -> Iterator[str]:
+    """The least set that meets the target; without one, by how much the best fails and what would do."""
+    least = least_set(prospects, target)
+    if least is not None:
+        yield (
+            f"least set for {target:g}: {_count(least.interfaces, 'interface')} and"
+            f" {_count(least.servers, 'server')} ({least.paths}), predicted {least.joint:.2g}"
+        )
+        return
+    if not prospects:
+        yield "nothing was recorded to plan with"
+        return
+    best = min(prospects, key=lambda found: found.joint)
+    yield (
+        f"no set meets {target:g}: the best, {_count(best.interfaces, 'interface')} and"
+        f" {_count(best.servers, 'server')} ({best.paths}), misses {best.joint:.2g},"
+        f" {best.joint / target:.2g} times as often"
+    )
+    if target * source.requests < 1.0:
+        yield f"{source.requests:.0f} requests can not show a probability of {target:g}: record more"
+    single = min(prospects, key=lambda found: (found.interfaces, found.servers, found.joint))
+    needed = paths_needed(single.joint, target)
+    if needed is not None:
+        yield f"{needed} paths as good as {single.paths} ({single.joint:.2g}) would do if they failed independently"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number != 1 else ''}"

@@ -1,0 +1,169 @@
+"""What a running control plane had measured of one robot's service: the answer of `plr explain --json`."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from google.protobuf import json_format
+
+from controlplane.core.fading import FadedHistogram, sum_exceeds
+from controlplane.core.objectives import choice_costs, joint_miss
+from controlplane.core.posterior import IGNORANCE
+from controlplane.core.problem import Block, BlockKey, Objective
+from controlplane.planning.prospects import Prospect
+from protos.convert import explanation_from_proto
+from protos.errors import DecodeError
+from protos.explanation import SAMPLE
+from protos.plr.v1 import admin_pb2
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from controlplane.core.problem import Choice
+    from protos.explanation import Explanation, PairExplanation
+    from protos.histogram import Histogram
+    from protos.model import Assignment
+
+MAX_CHOICES = 20_000
+"""Sets looked at: beyond, only the servers with the least epsilon of each interface are."""
+
+MAX_PROBES = 100.0
+"""Probes beyond which more of them do not bring a probability any nearer to 0 or 1: they are small."""
+
+MIN_REQUESTS = 20.0
+"""Requests a pair must have carried before it tells how much slower requests are than probes."""
+
+
+class RecordingError(ValueError):
+    """Not a recording; the text names the file."""
+
+
+def read_recording(file: Path) -> Explanation:
+    """Read what `plr explain --json` printed. Raises RecordingError."""
+    try:
+        answer = json_format.Parse(file.read_text(encoding="utf-8"), admin_pb2.ExplainResponse())
+        return explanation_from_proto(answer)
+    except (OSError, UnicodeDecodeError, json_format.ParseError, DecodeError) as error:
+        raise RecordingError(f"{file}: not an answer of plr explain --json: {' '.join(str(error).split())}") from None
+
+
+class RecordedService:
+    """One robot's service, at any deadline: latencies are those of the requests as they were."""
+
+    def __init__(self, explanation: Explanation) -> None:
+        self._explanation = explanation
+        self._pairs = {pair.path: pair for pair in explanation.pairs if pair.latency.total or pair.rtt.answered}
+        self._overhead_s = _overhead(self._pairs.values())
+        self.requests = max((pair.requests for pair in self._pairs.values()), default=0.0)
+        self.title = (
+            f"{explanation.robot} {explanation.service}: {len(self._pairs)} pairs with evidence,"
+            f" at most {self.requests:.0f} requests each"
+        )
+
+    @property
+    def deadline_s(self) -> float:
+        """The deadline that the service had."""
+        return self._explanation.deadline_s
+
+    def prospects(self, deadline_s: float) -> list[Prospect]:
+        """For each number of interfaces and servers the best set of those recorded."""
+        if not self._pairs:
+            return []
+        block = self._block(deadline_s)
+        choices = _choices(block)
+        costs = choice_costs(Objective.JOINT, block, choices)
+        best: dict[tuple[int, int], int] = {}
+        for row in np.argsort(costs, kind="stable").tolist():
+            used = [server for server in choices[row].tolist() if server >= 0]
+            if used and (block.idempotent or len(set(used)) == 1):
+                best.setdefault((len(used), len(set(used))), row)
+        return [
+            self._prospect(block, tuple(None if server < 0 else server for server in choices[best[key]].tolist()))
+            for key in sorted(best)
+        ]
+
+    def _prospect(self, block: Block, choice: Choice) -> Prospect:
+        used = [(i, j) for i, j in enumerate(choice) if j is not None]
+        return Prospect(
+            interfaces=len(used),
+            servers=len({j for _, j in used}),
+            paths=", ".join(f"{block.interfaces[i]} -> {block.servers[j]}" for i, j in used),
+            product=math.prod(block.epsilon[i][j] or 1.0 for i, j in used),
+            joint=joint_miss(block, choice),
+        )
+
+    def _block(self, deadline_s: float) -> Block:
+        found = self._explanation
+        interfaces = tuple(dict.fromkeys(path.interface for path in self._pairs))
+        servers = tuple(dict.fromkeys(path.server for path in self._pairs))
+        index = {path: (interfaces.index(path.interface), servers.index(path.server)) for path in self._pairs}
+        epsilon: list[list[float | None]] = [[None] * len(servers) for _ in interfaces]
+        for path, (i, j) in index.items():
+            epsilon[i][j] = self._epsilon(path, deadline_s)
+        lifts = {}
+        for joint in found.joints:
+            if joint.first in index and joint.second in index and joint.first.interface != joint.second.interface:
+                one, other = index[joint.first], index[joint.second]
+                lifts[min(one, other), max(one, other)] = joint.lift
+        return Block(
+            key=BlockKey(found.robot, found.service),
+            interfaces=interfaces,
+            servers=servers,
+            epsilon=tuple(map(tuple, epsilon)),
+            capacity=0,
+            idempotent=found.idempotent,
+            lifts=lifts,
+        )
+
+    def _epsilon(self, path: Assignment, deadline_s: float) -> float:
+        pair = self._pairs[path]
+        if deadline_s == self.deadline_s and pair.miss is not None:
+            return pair.miss.mean
+        if pair.latency.total:
+            over, samples = pair.latency.fraction_over(deadline_s), pair.latency.total / SAMPLE
+        else:
+            over, samples = self._from_probes(pair, deadline_s), min(pair.probes, MAX_PROBES)
+        return (over * samples + IGNORANCE.misses) / (samples + IGNORANCE.weight)
+
+    def _from_probes(self, pair: PairExplanation, deadline_s: float) -> float:
+        """Of a pair that carried no request: by round trips and computing times."""
+        lost = pair.rtt.lost / pair.rtt.total
+        return lost + (1.0 - lost) * sum_exceeds(_faded(pair.rtt), _faded(pair.compute), deadline_s - self._overhead_s)
+
+
+def _overhead(pairs: Collection[PairExplanation]) -> float:
+    """How much slower, in seconds, requests are than probes and computing together, in the median."""
+    found = [
+        (pair.latency.total, _median(pair.latency) - _median(pair.rtt) - _median(pair.compute))
+        for pair in pairs
+        if pair.latency.total >= MIN_REQUESTS * SAMPLE and pair.latency.answered and pair.rtt.answered
+    ]
+    total = sum(weight for weight, _ in found)
+    return sum(weight * max(0.0, excess) for weight, excess in found) / total if total else 0.0
+
+
+def _median(histogram: Histogram) -> float:
+    """Of the answered samples; 0 without any."""
+    return _faded(histogram).median() if histogram.answered else 0.0
+
+
+def _faded(histogram: Histogram) -> FadedHistogram:
+    faded = FadedHistogram(1.0, 0.0)
+    faded.add(histogram, 0.0)
+    return faded
+
+
+def _choices(block: Block) -> NDArray[np.intp]:
+    """Every way to give each interface a server or none, a row each with -1 for none."""
+    share = max(1, int(MAX_CHOICES ** (1.0 / len(block.interfaces))) - 1)
+    options = []
+    for row in block.epsilon:
+        known = [(epsilon, server) for server, epsilon in enumerate(row) if epsilon is not None]
+        options.append([-1, *(server for _, server in sorted(known)[:share])])
+    return np.array(list(itertools.product(*options)), dtype=np.intp)

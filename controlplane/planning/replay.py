@@ -1,0 +1,133 @@
+"""Requests sent through recorded paths: what one interface, or both, and one server, or two, would have given."""
+
+from __future__ import annotations
+
+import math
+import random
+import zlib
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from controlplane.core.posterior import IGNORANCE
+from controlplane.planning.fifo import FifoPath
+from controlplane.planning.prospects import Prospect
+from controlplane.planning.traces import PATHS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from controlplane.planning.traces import RecordedPaths
+
+    Latencies = NDArray[np.float64]
+
+_P99 = NormalDist().inv_cdf(0.99)
+
+
+@dataclass(frozen=True, slots=True)
+class Compute:
+    """How long a server works on a request: log-normal, by its median and its 99th percentile, in seconds."""
+
+    median_s: float
+    p99_s: float
+
+    def draw(self, rng: random.Random) -> float:
+        """One request's time."""
+        return self.median_s * rng.lognormvariate(0.0, math.log(self.p99_s / self.median_s) / _P99)
+
+
+@dataclass(frozen=True, slots=True)
+class Workload:
+    """Requests of one size at a steady rate."""
+
+    request_bytes: int
+    answer_bytes: int
+    rate_hz: float
+    compute: Compute
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """Seconds until the first answer of each request, inf if none came."""
+
+    alone: tuple[Latencies, Latencies]
+    """Over each path by itself."""
+    one_server: Latencies
+    """Over both, to one server, which runs each request once."""
+    two_servers: Latencies
+    """Over both, each to a server of its own."""
+
+
+def replay(trace: RecordedPaths, workload: Workload) -> Replayed:
+    """Send the workload from the trace's start to its end; the same every time.
+
+    Nothing is called off when the first answer is there, so queues are no shorter than they would be.
+    """
+    rng = random.Random(zlib.crc32(trace.name.encode()))  # noqa: S311 - no secret depends on it
+    paths = [FifoPath(trace.paths[name]) for name in PATHS]
+    # What one server answers goes down in another order.
+    shared = [FifoPath(trace.paths[name]).down for name in PATHS]
+    alone: tuple[list[float], list[float]] = ([], [])
+    one_server: list[float] = []
+    interval = 1.0 / workload.rate_hz
+    for number in range(int(trace.duration_s * workload.rate_hz)):
+        # Not in step with the trace, whose rows change at whole seconds.
+        at = (number + rng.random()) * interval
+        computes = [workload.compute.draw(rng) for _ in PATHS]
+        arrivals = [path.up.send(at, workload.request_bytes, rng) for path in paths]
+        for found, path, arrived, compute in zip(alone, paths, arrivals, computes, strict=True):
+            answered = path.down.send(arrived + compute, workload.answer_bytes, rng) if arrived < math.inf else math.inf
+            found.append(answered - at)
+        done = min(arrivals) + computes[0]
+        one_server.append(
+            min(
+                (
+                    down.send(max(done, arrived), workload.answer_bytes, rng)
+                    for down, arrived in zip(shared, arrivals, strict=True)
+                    if arrived < math.inf
+                ),
+                default=math.inf,
+            )
+            - at
+        )
+    first, second = (np.array(found) for found in alone)
+    return Replayed((first, second), np.array(one_server), np.minimum(first, second))
+
+
+class ReplayedTraces:
+    """Several traces, pooled: as if the robot had gone through one after the other."""
+
+    def __init__(self, traces: Sequence[RecordedPaths], workload: Workload) -> None:
+        replayed = [replay(trace, workload) for trace in traces]
+        self._alone = [np.concatenate([found.alone[path] for found in replayed]) for path in range(len(PATHS))]
+        self._one_server = np.concatenate([found.one_server for found in replayed])
+        self._two_servers = np.concatenate([found.two_servers for found in replayed])
+        self.requests = float(len(self._two_servers))
+        compute = workload.compute
+        self.title = (
+            f"{len(traces)} trace{'s' if len(traces) > 1 else ''}, {len(self._two_servers)} requests of"
+            f" {workload.request_bytes} bytes, {workload.rate_hz:g} a second, answers of {workload.answer_bytes} bytes,"
+            f" servers take {compute.median_s * 1e3:g} ms (P99 {compute.p99_s * 1e3:g} ms)"
+        )
+
+    def prospects(self, deadline_s: float) -> list[Prospect]:
+        """One interface, both to one server, both to two."""
+        singles = [_share_over(latencies, deadline_s) for latencies in self._alone]
+        best = min(singles)
+        product = math.prod(singles)
+        both = " and ".join(PATHS)
+        return [
+            Prospect(1, 1, PATHS[singles.index(best)], best, best),
+            Prospect(2, 1, both, product, _share_over(self._one_server, deadline_s)),
+            Prospect(2, 2, both, product, _share_over(self._two_servers, deadline_s)),
+        ]
+
+
+def _share_over(latencies: Latencies, deadline_s: float) -> float:
+    """The expected share of requests that miss; none seen does not make it 0."""
+    missed = float(np.count_nonzero(latencies > deadline_s))
+    return (missed + IGNORANCE.misses) / (len(latencies) + IGNORANCE.weight)
