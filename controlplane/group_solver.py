@@ -71,7 +71,7 @@ class GroupSolver:
         relaxed = decomposition.run(
             self._hinted(hint), good_gap=self._good_gap, out_of_time=lambda: time.monotonic() > self._end
         )
-        proven = self._is_good(relaxed.standing.cost, relaxed.bound) and relaxed.excess_proven
+        proven = self._is_good(relaxed.standing.cost, relaxed) and relaxed.excess_proven
         choices, bound = relaxed.standing.choices(), relaxed.bound
         if not proven and len(self._limits):
             choices, bound, proven = self._search(relaxed)
@@ -89,8 +89,10 @@ class GroupSolver:
             found[block.key] = choice
         return found
 
-    def _is_good(self, cost: float, bound: float) -> bool:
-        return cost - bound <= RESOLUTION * len(self._group.blocks) or relative_gap(cost, bound) <= self._good_gap
+    def _is_good(self, cost: float, relaxed: Relaxed) -> bool:
+        if cost - relaxed.bound <= RESOLUTION * len(self._group.blocks):
+            return True
+        return relative_gap(cost, relaxed.bound, relaxed.standing.size) <= self._good_gap
 
     def _search(self, relaxed: Relaxed) -> tuple[dict[BlockKey, Choice], float, bool]:
         """Let CP-SAT choose among the choices that the bound leaves a chance."""
@@ -134,4 +136,4 @@ class GroupSolver:
             cost += options[number].cost
         if proven and complete:
             return choices, cost, True
-        return choices, relaxed.bound, relaxed.excess_proven and self._is_good(cost, relaxed.bound)
+        return choices, relaxed.bound, relaxed.excess_proven and self._is_good(cost, relaxed)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.decomposition import Decomposition
 from controlplane.core.grouping import independent_groups
 from controlplane.core.limits import Limits
-from controlplane.core.plan import Plan, make_plan, relative_gap
+from controlplane.core.plan import Plan, make_plan
 from controlplane.core.problem import FleetKey, reachable
 from controlplane.group_solver import SMALL_BLOCKS, GroupSolver
 
@@ -124,7 +124,7 @@ class Matcher:
             bound=sum(worth.values()) - paid,
             unproven=kept.plan.unproven,
         )
-        if relative_gap(plan.cost, plan.bound) > INCREMENTAL_GAP:
+        if plan.gap > INCREMENTAL_GAP:
             return None
         self._kept = _Kept(problem, blocks, plan, load, kept.prices, worth)
         return plan

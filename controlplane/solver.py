@@ -20,7 +20,9 @@ RESOLUTION = 1e-7
 """CP-SAT counts in integers: two costs closer than this are the same to it. No posterior mean over less than a
 million requests is finer."""
 
-_SCALE = round(1 / RESOLUTION)
+_LARGEST = 2.0**61
+"""What the objective of CP-SAT may come to: half of its integers. Costs that range further are counted in larger
+steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +49,10 @@ def pick_columns(
     excess: list[Any] = []
     users: list[list[tuple[int, Any]]] = [[] for _ in capacity]
     costs_most = 0
+    scale = _scale(blocks)
     for columns, hinted in zip(blocks, hint, strict=True):
         least = min(column.cost for column in columns)
-        costs = [round((column.cost - least) * _SCALE) for column in columns]
+        costs = [round((column.cost - least) * scale) for column in columns]
         costs_most += max(costs)
         variables = [model.new_bool_var("") for _ in columns]
         model.add_exactly_one(variables)
@@ -79,3 +82,10 @@ def pick_columns(
         for variables in chosen
     ]
     return found, status == cp_model.OPTIMAL
+
+
+def _scale(blocks: Sequence[Sequence[Column]]) -> float:
+    costs = [[column.cost for column in columns] for columns in blocks]
+    costs_most = sum(max(of_block) - min(of_block) for of_block in costs)
+    excess_most = sum(max(column.excess + len(column.limits) for column in columns) for columns in blocks)
+    return min(1 / RESOLUTION, _LARGEST / (1 + costs_most) / (2 + excess_most))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NewType
+from typing import TYPE_CHECKING, NamedTuple, NewType
 
 if TYPE_CHECKING:
     from protos.histogram import Histogram
@@ -48,6 +48,9 @@ NO_POLICY = 1
 MAX_CREDENTIAL_BYTES = 2048
 """Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
 
+DEFAULT_CHARGE = 1.0
+"""What a request over an interface costs unless said otherwise: so that a service that is to be cheap sends few copies
+where nobody told what they cost."""
 
 MAX_JOINTS = 1024
 """Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers."""
@@ -95,12 +98,40 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
+class InterfaceLabel:
+    """What a robot says of one of its interfaces, for the choice of paths."""
+
+    interface: InterfaceName
+    carrier: str = ""
+    """Whose network it uses; interfaces with the same one fail together. Empty: not known."""
+    charge: float = DEFAULT_CHARGE
+    """What a request over it costs, in any one currency."""
+
+
+@dataclass(frozen=True, slots=True)
 class ServiceOffer:
     """A service that a cloud sidecar can run; `capacity` 0 means no limit."""
 
     name: ServiceName
     type: str
     capacity: int = 0
+    charge: float = 0.0
+    """What a request costs that it runs, in the currency of the interfaces' charges."""
+
+
+class Copies(NamedTuple):
+    """How many copies of a request are sent, each over another interface; 0: as many as there are interfaces."""
+
+    least: int = 0
+    most: int = 0
+
+    def over(self, interfaces: int) -> Copies:
+        """The numbers for so many interfaces."""
+        return Copies(*(min(count or interfaces, interfaces) for count in self))
+
+
+EVERY_INTERFACE = Copies()
+AT_MOST_EVERY_INTERFACE = Copies(least=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +142,9 @@ class ServiceUse:
     type: str
     deadline_s: float
     idempotent: bool
+    copies: Copies = EVERY_INTERFACE
+    target_miss: float = 0.0
+    """Above 0: the cheapest mapping that misses the deadline no more often; 0: the most reliable one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,13 +244,16 @@ class Registration:
     peers_version: Version = Version(0)
     mapping_version: Version = Version(0)
     credential: bytes = field(default=b"", repr=False)
+    region: str = ""
+    """Of a cloud: where it stands; clouds with the same one fail together. Empty: not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class CandidateSet:
-    """All candidates of a sidecar, replacing those it sent before."""
+    """All candidates of a sidecar, with what it says of their interfaces, replacing those it sent before."""
 
     candidates: tuple[Candidate, ...] = ()
+    labels: tuple[InterfaceLabel, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

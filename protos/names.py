@@ -12,6 +12,8 @@ MAX_STRING_BYTES = 255
 
 # At most 63 characters: such a name fits a certificate's common name (X.520) and a DNS label (RFC 1035).
 _NODE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
+# A region or a carrier: stands in reasons and log lines.
+_DOMAIN_LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.&+-]{0,62}")
 # What Linux allows in an interface's name, less what is not printable ASCII.
 _INTERFACE_NAME = re.compile(r"[!-.0-~]+")
 # ROS 2: tokens of letters, digits and underscores that do not start with a digit.
@@ -49,6 +51,11 @@ def node_name(value: str, field: str) -> NodeName:
 def interface_name(value: str, field: str) -> InterfaceName:
     """Check the name of a network interface."""
     return InterfaceName(_name(value, field, _INTERFACE_NAME, "the name of an interface"))
+
+
+def domain_label(value: str, field: str) -> str:
+    """Check the name of a region or a carrier; an empty one means that it is not known."""
+    return value and _name(value, field, _DOMAIN_LABEL, "a name of 1 to 63 letters, digits, '_', '.', '-', '&' and '+'")
 
 
 def service_name(value: str, field: str) -> ServiceName:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -18,17 +19,35 @@ from protos.config_fields import (
     refuse_duplicates,
 )
 from protos.config_file import key_path, parse_yaml, read_text, validate
+from protos.convert.fields import MAX_CHARGE
 from protos.errors import ConfigError
 from protos.identity import IdentityRole
-from protos.model import NodeName, Role, ServiceName
-from sidecar.config_fields import InterfacePattern, RepairShare, ServicePattern, SidecarName, is_glob
+from protos.model import (
+    AT_MOST_EVERY_INTERFACE,
+    DEFAULT_CHARGE,
+    EVERY_INTERFACE,
+    InterfaceLabel,
+    NodeName,
+    Role,
+    ServiceName,
+)
+from sidecar.config_fields import (
+    CopiesWanted,
+    DomainLabel,
+    InterfacePattern,
+    RepairShare,
+    ServicePattern,
+    SidecarName,
+    is_glob,
+)
 from sidecar.core.priority import Priority
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from protos.identity import Identity
+    from protos.model import InterfaceName
     from sidecar.core.redundancy import Redundancy
 
 DEFAULT_CLOUD_UDP_PORT = 24700
@@ -77,6 +96,13 @@ class _Section(BaseModel):
     )
 
 
+class ModeWord(enum.Enum):
+    """What a service's mapping is chosen for."""
+
+    MOST_RELIABLE = "most_reliable"
+    CHEAPEST = "cheapest"
+
+
 class StunConfig(_Section):
     """How the sidecar learns its addresses as seen from outside."""
 
@@ -101,6 +127,17 @@ class AdvertisedAddress(_Section):
     """The interface behind it; none: the first usable one."""
 
 
+class NetworkConfig(_Section):
+    """What lies behind interfaces; the first entry that matches an interface's name decides."""
+
+    interface: InterfacePattern
+    """Name or glob."""
+    carrier: DomainLabel | None = None
+    """Whose network it is: interfaces with the same carrier are taken to fail together."""
+    cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] = DEFAULT_CHARGE
+    """What a copy of a request over it costs, in any one currency; for services with mode cheapest."""
+
+
 class ServiceConfig(_Section):
     """One service, or all whose name matches a glob; the first entry that matches a name decides."""
 
@@ -122,8 +159,17 @@ class ServiceConfig(_Section):
     fec: RepairShare | None = None
     """Repair symbols for each symbol of what is sent from here (robot: requests, cloud: answers), 0 to 1, or off, or
     auto: as many as the loss measured on the path asks for. Default auto."""
+    copies: CopiesWanted | None = None
+    """Robot: over how many interfaces copies of a request are sent: each, at_most (each, but rather none than one too
+    many for a server or into a failure domain already used), or a number. Default each; with mode cheapest at_most."""
+    mode: Annotated[ModeWord | None, _converted] = None
+    """Robot: most_reliable or cheapest, as long as target_miss is kept. Default most_reliable."""
+    target_miss: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Robot, with mode cheapest: the largest predicted probability that a request misses its deadline."""
     capacity_interfaces: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Cloud: how many robot interfaces may be mapped to this server for the service; none: no limit."""
+    cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] | None = None
+    """Cloud: what a request costs that runs here, in the currency of the robots' networks. Default 0."""
 
 
 class SidecarConfig(_Section):
@@ -149,6 +195,10 @@ class SidecarConfig(_Section):
         | None
     ) = None
     """Names or globs; none: all usable ones, which leaves out loopback, containers, bridges and tunnels."""
+    networks: Annotated[tuple[NetworkConfig, ...], _converted] = ()
+    """Robot: carriers and costs of its interfaces."""
+    region: DomainLabel | None = None
+    """Cloud: where it stands: clouds in the same region are taken to fail together."""
     udp_port: Annotated[int, Field(ge=0, le=65535)] = Field(
         default_factory=lambda fields: DEFAULT_CLOUD_UDP_PORT if fields.get("role") is Role.CLOUD else 0
     )
@@ -179,6 +229,15 @@ class SidecarConfig(_Section):
     def service_rules(self) -> tuple[ServiceRule, ...]:
         """The services as the cores want them, in order."""
         return tuple(_rule(self.role, service) for service in self.services)
+
+    def labels(self, interfaces: Iterable[InterfaceName]) -> tuple[InterfaceLabel, ...]:
+        """What is known of these interfaces; those that no entry of `networks` matches are left out."""
+        found = []
+        for name in dict.fromkeys(interfaces):
+            network = next((entry for entry in self.networks if fnmatch.fnmatchcase(name, entry.interface)), None)
+            if network is not None:
+                found.append(InterfaceLabel(name, network.carrier or "", network.cost_per_request))
+        return tuple(found)
 
 
 def load_config(path: Path, identify: Callable[[Path], Identity] | None = None) -> SidecarConfig:
@@ -257,6 +316,9 @@ def _rule(role: Role, service: ServiceConfig) -> ServiceRule:
         priority=Priority[(service.priority or PriorityWord.NORMAL).name],
         fec=_redundancy(service.fec),
         capacity=service.capacity_interfaces or _UNLIMITED,
+        copies=service.copies or (AT_MOST_EVERY_INTERFACE if service.target_miss else EVERY_INTERFACE),
+        target_miss=service.target_miss or 0.0,
+        charge=service.cost_per_request or 0.0,
     )
 
 
@@ -275,6 +337,13 @@ def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
         yield ("advertise",), "expected on a cloud only: a robot's addresses come from STUN"
     if config.advertise and config.udp_port == 0:
         yield ("udp_port",), "expected a fixed port beside advertise, got 0"
+    if config.networks and config.role is Role.CLOUD:
+        yield ("networks",), "expected on a robot only: it is the robots' interfaces that are chosen between"
+    if config.region is not None and config.role is Role.ROBOT:
+        yield ("region",), "expected on a cloud only: a robot's copies should go to different regions"
+    for index, network in enumerate(config.networks):
+        if any(network.interface == before.interface for before in config.networks[:index]):
+            yield ("networks", index, "interface"), f"expected each interface once, got '{network.interface}' again"
     for index, advertised in enumerate(config.advertise):
         if advertised.interface is not None and is_glob(advertised.interface):
             yield ("advertise", index, "interface"), f"expected a name, got the glob '{advertised.interface}'"
@@ -284,12 +353,18 @@ def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
 
 def _check_service(role: Role, service: ServiceConfig) -> Iterator[tuple[str, str]]:
     if role is Role.CLOUD:
-        for key in ("deadline_ms", "idempotent", "drop_late", "priority"):
+        for key in ("deadline_ms", "idempotent", "drop_late", "priority", "copies", "mode", "target_miss"):
             if getattr(service, key) is not None:
                 yield key, "expected on a robot only: it is the robot's sidecar that decides this"
         return
     if service.capacity_interfaces is not None:
         yield "capacity_interfaces", "expected on a cloud only: it limits what that server takes"
+    if service.cost_per_request is not None:
+        yield "cost_per_request", "expected on a cloud only: a robot's costs are its networks'"
+    if service.mode is ModeWord.CHEAPEST and service.target_miss is None:
+        yield "target_miss", "expected a probability beside mode: cheapest, but missing"
+    if service.mode is not ModeWord.CHEAPEST and service.target_miss is not None:
+        yield "target_miss", "expected only beside mode: cheapest"
     if service.deadline_ms is None:
         yield "deadline_ms", "expected milliseconds, but missing"
     elif service.lifetime_ms is not None and service.lifetime_ms <= service.deadline_ms:

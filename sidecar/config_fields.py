@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from typing import Annotated
 
-from pydantic import AfterValidator, PlainValidator, WithJsonSchema
+from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema
 
+from protos.convert.fields import MAX_COPIES
 from protos.errors import DecodeError
-from protos.names import node_name
+from protos.model import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
+from protos.names import domain_label, node_name
 
 _INTERFACE = re.compile(r"[^\s/]{1,15}")
 _INTERFACE_GLOB = re.compile(r"[^\s/]{1,64}")
@@ -16,6 +18,7 @@ _SERVICE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _SERVICE_GLOB = re.compile(r"[/*?\[][A-Za-z0-9_/*?\[\]!-]*")
 _GLOB_CHARACTERS = frozenset("*?[")
 _MAX_SERVICE_CHARACTERS = 255
+_COPIES_WORDS = {"each": EVERY_INTERFACE, "at_most": AT_MOST_EVERY_INTERFACE}
 
 
 def is_glob(pattern: str) -> bool:
@@ -54,6 +57,24 @@ def _check_repair_share(value: object) -> float | str:
     raise ValueError(f"expected off, auto or a number from 0 to 1, got {value!r}")
 
 
+def _check_domain_label(text: str) -> str:
+    try:
+        return domain_label(text, "label")
+    except DecodeError:
+        problem = f"expected 1 to 63 letters, digits, '-', '_', '.', '&' or '+', a letter or digit first, got {text!r}"
+        raise ValueError(problem) from None
+
+
+def _check_copies(value: object) -> Copies:
+    if isinstance(value, Copies):
+        return value
+    if isinstance(value, str) and value in _COPIES_WORDS:
+        return _COPIES_WORDS[value]
+    if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_COPIES:
+        return Copies(value, value)
+    raise ValueError(f"expected each, at_most or a number from 1 to {MAX_COPIES}, got {value!r}")
+
+
 SidecarName = Annotated[str, AfterValidator(_check_node_name)]
 InterfacePattern = Annotated[str, AfterValidator(_check_interface)]
 ServicePattern = Annotated[str, AfterValidator(_check_service)]
@@ -61,4 +82,13 @@ RepairShare = Annotated[
     float | str,
     PlainValidator(_check_repair_share),
     WithJsonSchema({"anyOf": [{"enum": ["off", "auto"]}, {"type": "number", "minimum": 0, "maximum": 1}]}),
+]
+DomainLabel = Annotated[str, Field(min_length=1), AfterValidator(_check_domain_label)]
+"""Name of a region or a carrier."""
+CopiesWanted = Annotated[
+    Copies,
+    PlainValidator(_check_copies),
+    WithJsonSchema(
+        {"anyOf": [{"enum": [*_COPIES_WORDS]}, {"type": "integer", "minimum": 1, "maximum": MAX_COPIES}]},
+    ),
 ]

@@ -31,7 +31,7 @@ from sidecar.outage_log import OutageLog
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Candidate, ServiceOffer, ServiceUse
+    from protos.model import Candidate, InterfaceLabel, ServiceOffer, ServiceUse
     from protos.plr.v1 import control_pb2
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
@@ -130,9 +130,9 @@ class ControlClient:
         self._thread.start()
         self._running.wait()
 
-    def set_candidates(self, candidates: tuple[Candidate, ...]) -> None:
-        """Tell the control plane under which addresses we are reached now."""
-        self._post(lambda: self._session.set_candidates(CandidateSet(candidates)))
+    def set_candidates(self, candidates: tuple[Candidate, ...], labels: tuple[InterfaceLabel, ...] = ()) -> None:
+        """Tell the control plane under which addresses we are reached now, and what is known of our interfaces."""
+        self._post(lambda: self._session.set_candidates(CandidateSet(candidates, labels)))
 
     def set_services(self, offers: tuple[ServiceOffer, ...], uses: tuple[ServiceUse, ...]) -> None:
         """Tell the control plane what we offer and carry now."""

@@ -26,7 +26,7 @@ from sidecar.state_store import StateDirError, StateStore
 
 if TYPE_CHECKING:
     from protos.metrics_server import MetricsServer
-    from protos.model import Assignment, InterfaceName, MappingSet, PeerSet, Report, ServiceName, Welcome
+    from protos.model import Assignment, Candidate, InterfaceName, MappingSet, PeerSet, Report, ServiceName, Welcome
     from protos.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
     from sidecar.core.stun_events import StunEvent
@@ -74,6 +74,7 @@ class Sidecar:
                 peers_version=last.peers.version if last.peers else Version(0),
                 mapping_version=last.mapping.version if last.mapping else Version(0),
                 credential=own.credential.encode(),
+                region=config.region or "",
             ),
             random.SystemRandom(),
         )
@@ -83,7 +84,7 @@ class Sidecar:
             own,
             identity.token,
             self._data_plane,
-            self._control.set_candidates,
+            self._tell_candidates,
         )
         self._metrics: MetricsServer | None = None
         self._logged_mappings: dict[ServiceName, tuple[Assignment, ...]] = {}
@@ -172,6 +173,10 @@ class Sidecar:
 
     def _on_stun(self, interface: InterfaceName, event: StunEvent) -> None:
         self._interfaces.on_stun_event(interface, event)
+
+    def _tell_candidates(self, candidates: tuple[Candidate, ...]) -> None:
+        labels = self._config.labels(candidate.interface for candidate in candidates)
+        self._control.set_candidates(candidates, labels)
 
     def _on_services_changed(self) -> None:
         self._control.set_services(*self._data_plane.services())

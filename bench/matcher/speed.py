@@ -59,7 +59,8 @@ def _cold(
     began, began_cpu = time.perf_counter(), time.process_time()
     plan = Matcher().solve(problem, time_limit_s=TIME_LIMIT_S)
     took, cpu = time.perf_counter() - began, time.process_time() - began_cpu
-    beyond = None if lifts else relative_gap(plan.cost, flow_optimum(problem))
+    optimum = None if lifts else flow_optimum(problem)
+    beyond = None if optimum is None else relative_gap(plan.cost, optimum, abs(optimum))
     findings.figures |= {
         f"solve_{name}_s": took,
         f"solve_{name}_cpu_s": cpu,

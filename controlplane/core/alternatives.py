@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.choices import MAX_LISTED, list_choices, own_excess
-from controlplane.core.objectives import block_cost, choice_costs, joint_miss
+from controlplane.core.costs import block_cost, choice_costs
+from controlplane.core.objectives import joint_miss
 from controlplane.core.plan import choice_of
 from controlplane.core.problem import FleetKey, block_excess, loads, reachable
 from protos.explanation import Alternative, AlternativeKind
@@ -40,9 +41,9 @@ class _Alternatives:
         self._block = block
         self._running = running
         self._taken = _taken_by_others(problem, plan, block)
-        choices = list_choices(block, MAX_LISTED)
+        choices = list_choices(block, MAX_LISTED).choices
         costs = choice_costs(problem.objective, block, choices)
-        self._choices = choices[np.lexsort((costs, _excess(block, choices)))]
+        self._choices = choices[np.lexsort((costs, own_excess(block, choices)))]
 
     def all(self) -> tuple[Alternative, ...]:
         return (*self._others(), *self._alone(), *self._without())
@@ -109,12 +110,6 @@ def _taken_by_others(problem: Problem, plan: Plan, block: Block) -> Counter[Node
         if key.service == block.key.service and key.robot != block.key.robot
         for _, server in other.assignments
     )
-
-
-def _excess(block: Block, choices: NDArray[np.intp]) -> NDArray[np.intp]:
-    if not block.capacity or not block.idempotent:
-        return np.zeros(len(choices), dtype=np.intp)
-    return own_excess(choices, np.array(block.capacity))
 
 
 def _choice(row: Sequence[int] | NDArray[np.intp]) -> Choice:

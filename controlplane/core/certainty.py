@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.objectives import PROBABILITY_FLOOR, block_cost
+from controlplane.core.costs import TARGET_TOLERANCE, block_cost
+from controlplane.core.objectives import PROBABILITY_FLOOR, joint_miss
 from controlplane.core.problem import Objective
 
 if TYPE_CHECKING:
@@ -40,6 +42,17 @@ def probability_better(objective: Objective, changes: Iterable[tuple[Block, Choi
         for path in sorted(ours - theirs):
             saved -= _off_mean(objective, block, path, rng)
     return float(np.mean((saved > 0.0) + 0.5 * (saved == 0.0)))
+
+
+def probability_met(block: Block, choice: Choice) -> float:
+    """The probability that a choice keeps the target of its block, with the epsilons of its paths drawn likewise."""
+    if block.target is None:
+        return 1.0
+    rng = np.random.default_rng(_SEED)
+    log_miss = np.full(DRAWS, math.log(joint_miss(block, choice)))
+    for path in sorted(_paths(choice)):
+        log_miss += _off_mean(Objective.JOINT, block, path, rng)
+    return float(np.mean(log_miss <= math.log(block.target.miss) + TARGET_TOLERANCE))
 
 
 def _paths(choice: Choice) -> set[Path]:

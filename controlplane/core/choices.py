@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from controlplane.core.domains import repeats
 from controlplane.core.objectives import PROBABILITY_FLOOR, epsilon_matrix
-from controlplane.core.problem import reachable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,6 +26,9 @@ OWN_EXCESS_PRICE = 1e6
 
 MAX_LISTED = 4096
 """Choices looked at of one block: 2 interfaces with 64 servers, 3 with 16, 4 with 8."""
+
+CHOICES_A_WAY = 4
+"""Choices there should be room for, at least, for each set of interfaces that carries copies."""
 
 
 class Near(NamedTuple):
@@ -44,37 +47,91 @@ def combinations(interfaces: int, options: int) -> Indices:
     return np.indices((options,) * interfaces, dtype=np.intp).reshape(interfaces, -1).T.copy()
 
 
-def own_excess(picks: Indices, capacity: Indices) -> Indices:
-    """By how many interfaces each choice exceeds the block's own capacity; interfaces are the last dimension."""
-    excess = np.zeros(picks.shape[:-1], dtype=np.intp)
-    for interface in range(1, picks.shape[-1]):
-        before = (picks[..., :interface] == picks[..., interface, None]).sum(axis=-1)
-        excess += before >= capacity
-    return excess
+def own_excess(block: Block, choices: Indices) -> Indices:
+    """`problem.block_excess` of many choices, a row each."""
+    if not block.capacity or not block.idempotent or block.target is not None:
+        return np.zeros(len(choices), dtype=np.intp)
+    return repeats(choices, np.array(block.capacity))
 
 
-def count_choices(block: Block) -> int:
-    """How many choices a block has, whatever they exceed."""
-    if not block.idempotent:
-        return len({server for row in block.epsilon for server in reachable(row)})
-    return math.prod(len(reachable(row)) for row in block.epsilon)
+class Listed(NamedTuple):
+    """Choices of one block."""
+
+    choices: Indices
+    complete: bool
+    """Whether there are no others."""
 
 
-def list_choices(block: Block, at_most: int) -> Indices:
-    """The block's choices, -1 where an interface gets no server.
+def list_choices(block: Block, at_most: int) -> Listed:
+    """The block's choices, -1 where an interface carries no copy.
 
-    Of more than `at_most`, those among the servers with the least epsilon for each interface.
+    Of more than `at_most`, those among the most promising servers of each interface; where even the ways to leave
+    interfaces out are too many, those that leave out the worst.
     """
     epsilon = epsilon_matrix(block)
     there = ~np.isnan(epsilon)
     if not block.idempotent:
-        used = np.flatnonzero(there.any(axis=0))
-        return np.where(there[:, used], used, -1).T
-    options = [np.flatnonzero(row) for row in there]
-    if count_choices(block) > at_most:
-        share = max(1, int(at_most ** (1 / len(options)) + 1e-9))
-        options = [row[np.argsort(epsilon[i, row], kind="stable")[:share]] for i, row in enumerate(options)]
-    return np.array(list(itertools.product(*options)), dtype=np.intp)
+        return _list_single(block, epsilon, at_most)
+    ways, complete = _ways(block, epsilon, np.arange(len(epsilon)), at_most)
+    share = epsilon.shape[1]
+    counts = there.sum(axis=1)
+    while share > 1 and sum(math.prod(int(min(counts[i], share)) for i in way) for way in ways) > at_most:
+        share -= 1
+    options = [_promising(block, i, np.flatnonzero(row), share) for i, row in enumerate(there)]
+    complete = complete and share >= counts.max()
+    return Listed(np.concatenate([_all_of(way, options) for way in ways]), complete)
+
+
+def _list_single(block: Block, epsilon: Floats, at_most: int) -> Listed:
+    """One server, over as many of the interfaces that reach it as are wanted."""
+    lists = []
+    complete = True
+    servers = np.flatnonzero(~np.isnan(epsilon).all(axis=0))
+    for server in servers:
+        ways, all_ways = _ways(block, epsilon, np.flatnonzero(~np.isnan(epsilon[:, server])), at_most // len(servers))
+        complete = complete and all_ways
+        choices = np.full((len(ways), len(epsilon)), -1, dtype=np.intp)
+        for row, way in enumerate(ways):
+            choices[row, way] = server
+        lists.append(choices)
+    return Listed(np.concatenate(lists), complete)
+
+
+def _ways(block: Block, epsilon: Floats, usable: Indices, at_most: int) -> tuple[list[list[int]], bool]:
+    """The sets of interfaces that may carry copies, of those usable; all, or if these are too many, the best of each
+    size."""
+    least, most = block.copies_wanted
+    sizes = range(min(least, len(usable)), min(most, len(usable)) + 1)
+    if sum(math.comb(len(usable), size) for size in sizes) <= max(1, at_most // CHOICES_A_WAY):
+        return [list(way) for size in sizes for way in itertools.combinations(usable.tolist(), size)], True
+    best_first = usable[np.argsort(np.nanmin(epsilon[usable], axis=1), kind="stable")].tolist()
+    return [sorted(best_first[:size]) for size in sizes], len(sizes) == 1 and sizes[0] == len(usable)
+
+
+def _promising(block: Block, interface: int, servers: Indices, share: int) -> Indices:
+    """So many of an interface's servers: in turn the one with the least epsilon, the one with the least in another
+    region, and, where charges count, the cheapest."""
+    if len(servers) <= share:
+        return servers
+    best_first = sorted(servers.tolist(), key=lambda server: block.epsilon[interface][server] or 0.0)
+    rankings = [best_first]
+    if block.regions:
+        of_region = {block.regions[server] or server: server for server in reversed(best_first)}
+        rankings.append(sorted(of_region.values(), key=best_first.index))
+    if block.target is not None:
+        charges = block.target.charges[interface]
+        rankings.append(sorted(best_first, key=lambda server: charges[server]))
+    turns = itertools.chain.from_iterable(itertools.zip_longest(*rankings))
+    return np.array(list(dict.fromkeys(server for server in turns if server is not None))[:share], dtype=np.intp)
+
+
+def _all_of(way: list[int], options: list[Indices]) -> Indices:
+    """Every way to give the interfaces named one of their options, and the others none."""
+    grids = np.meshgrid(*(options[i] for i in way), indexing="ij")
+    choices = np.full((grids[0].size, len(options)), -1, dtype=np.intp)
+    for i, grid in zip(way, grids, strict=True):
+        choices[:, i] = grid.ravel()
+    return choices
 
 
 def lift_floor(block: Block) -> float:

@@ -124,8 +124,8 @@ class ControlCore:
         match message:
             case Registration():
                 raise DecodeError("a second registration on one stream")
-            case CandidateSet(candidates=candidates):
-                if self.registry.set_candidates(name, candidates):
+            case CandidateSet():
+                if self.registry.set_candidates(name, message):
                     self._members_changed(now)
             case ServiceSet():
                 if self.registry.set_services(name, message):

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.choices import MAX_LISTED, OWN_EXCESS_PRICE
+from controlplane.core.domains import chooses_interfaces, has_shared_regions
 from controlplane.core.plan import relative_gap
 from controlplane.core.problem import Objective
 from controlplane.core.stacks import EnumeratedStack, SeparableStack
@@ -53,16 +54,23 @@ def stack_blocks(objective: Objective, blocks: Sequence[Block], limits: Limits) 
     shapes: dict[tuple[bool, bool, int], list[Block]] = {}
     listed = 0
     for block in blocks:
-        fails_together = objective is Objective.JOINT and bool(block.lifts) and block.idempotent
-        listed += fails_together
-        shapes.setdefault((block.idempotent, fails_together, len(block.interfaces)), []).append(block)
+        adds_up = _adds_up(objective, block)
+        listed += block.idempotent and not adds_up
+        shapes.setdefault((block.idempotent, adds_up, len(block.interfaces)), []).append(block)
     at_most = min(MAX_LISTED, max(MIN_LISTED, MAX_LISTED_ALL // max(1, listed)))
     return [
         SeparableStack(objective, members, limits)
-        if idempotent and not fails_together
+        if adds_up
         else EnumeratedStack(objective, members, limits, at_most=at_most)
-        for (idempotent, fails_together, _), members in shapes.items()
+        for (_, adds_up, _), members in shapes.items()
     ]
+
+
+def _adds_up(objective: Objective, block: Block) -> bool:
+    """Whether the block's cost is a sum over its interfaces, which all carry a copy."""
+    if not block.idempotent or block.target is not None or chooses_interfaces(block):
+        return False
+    return not (objective is Objective.JOINT and block.lifts) and not has_shared_regions(block)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +184,7 @@ class Decomposition:
             self._best = standing
 
     def _is_good(self, good_gap: float) -> bool:
-        return self._is_excess_proven() and relative_gap(self._best.cost, self._bound) <= good_gap
+        return self._is_excess_proven() and relative_gap(self._best.cost, self._bound, self._best.size) <= good_gap
 
     def _is_excess_proven(self) -> bool:
         """Whether nothing is exceeded beyond what each block must by itself, or everything is full and more is
@@ -188,5 +196,5 @@ class Decomposition:
             return False
         if any((stack.limit[:, :-1] == len(self.limits)).any() for stack in self.stacks):
             return False
-        wanted = sum(stack.interfaces * len(stack.blocks) for stack in self.stacks)
+        wanted = sum(block.copies_wanted.least for stack in self.stacks for block in stack.blocks)
         return extra <= wanted - int(self.limits.capacity.sum())

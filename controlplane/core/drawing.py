@@ -23,7 +23,16 @@ if TYPE_CHECKING:
     from controlplane.core.permits import Group, Permits
     from controlplane.core.problem import Block, Objective
     from controlplane.core.registry import Sidecar
-    from protos.model import InterfaceName, NodeName, Registration, Report, ServiceName, ServiceOffer, ServiceUse
+    from protos.model import (
+        InterfaceLabel,
+        InterfaceName,
+        NodeName,
+        Registration,
+        Report,
+        ServiceName,
+        ServiceOffer,
+        ServiceUse,
+    )
 
 SLICE_PAIRS = 200
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""
@@ -50,6 +59,7 @@ class _Inputs:
     """What a block is drawn from beside the measurements; equal if that is the same."""
 
     interfaces: tuple[InterfaceName, ...]
+    labels: tuple[InterfaceLabel, ...]
     use: ServiceUse
     offers: tuple[tuple[Registration, ServiceOffer], ...]
     unserved: str
@@ -234,7 +244,7 @@ def _inputs(robot: Sidecar, use: ServiceUse, offering: Sequence[Sidecar], clouds
     else:
         unserved = "" if interfaces else "the robot has told no address yet"
     offers = tuple((cloud.registration, offer) for cloud in clouds for offer in cloud.offers if offer.name == use.name)
-    return _Inputs(interfaces, use, offers, unserved, robot, clouds)
+    return _Inputs(interfaces, robot.labels, use, offers, unserved, robot, clouds)
 
 
 def _epsilon(block: Block, interface: InterfaceName, server: NodeName) -> float:

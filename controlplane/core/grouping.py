@@ -22,7 +22,7 @@ def independent_groups(problem: Problem) -> list[Problem]:
     wanted: dict[FleetKey, int] = {}
     for block in problem.blocks:
         for key in _limits(problem, block):
-            wanted[key] = wanted.get(key, 0) + len(block.interfaces)
+            wanted[key] = wanted.get(key, 0) + block.copies_wanted.most
     binding = {key for key, count in wanted.items() if count > problem.fleet_capacity[key]}
     groups: dict[int, list[Block]] = {}
     leader: dict[FleetKey, int] = {}

@@ -1,8 +1,8 @@
-"""What a block's choice costs under each objective.
+"""What a block's choice costs under each objective; what else counts stands in `costs`.
 
 With S the chosen pairs (i, j) of a block:
 
-- `sum`: the sum of epsilon_ij, and 1 for an interface that gets no server.
+- `sum`: the sum of epsilon_ij, and 1 for an interface without a copy.
 - `product`: the sum of log epsilon_ij.
 - `joint`: the logarithm of `joint_miss`.
 
@@ -34,8 +34,8 @@ LEAST_POSITIVE = sys.float_info.min
 """What a product of very many paths comes to at least, so that it has a logarithm."""
 
 
-def block_cost(objective: Objective, block: Block, choice: Choice) -> float:
-    """The block's share of what is minimised."""
+def objective_cost(objective: Objective, block: Block, choice: Choice) -> float:
+    """What a choice of a block is worth by itself."""
     if objective is Objective.JOINT:
         return math.log(joint_miss(block, choice))
     chosen = [row[server] for row, server in zip(block.epsilon, choice, strict=True) if server is not None]
@@ -75,8 +75,14 @@ def path_costs(objective: Objective, epsilon: NDArray[np.float64]) -> NDArray[np
     return np.where(np.isnan(epsilon), np.inf, costs)
 
 
-def choice_costs(objective: Objective, block: Block, choices: NDArray[np.intp]) -> NDArray[np.float64]:
-    """`block_cost` of many choices, a row each, with -1 where an interface gets no server; infinite over no path."""
+def cost_of_none(objective: Objective) -> float:
+    """What an interface without a copy adds to the cost."""
+    return 1.0 if objective is Objective.SUM else 0.0
+
+
+def objective_costs(objective: Objective, block: Block, choices: NDArray[np.intp]) -> NDArray[np.float64]:
+    """`objective_cost` of many choices, a row each, with -1 where an interface carries no copy; infinite where a path
+    does not exist."""
     epsilon = epsilon_matrix(block)
     if objective is Objective.JOINT:
         return _joint_costs(block, epsilon, choices)
@@ -87,7 +93,7 @@ def choice_costs(objective: Objective, block: Block, choices: NDArray[np.intp]) 
 def _of_paths(objective: Objective, epsilon: NDArray[np.float64], choices: NDArray[np.intp]) -> NDArray[np.float64]:
     costs = path_costs(objective, epsilon)
     rows = np.arange(epsilon.shape[0])
-    return np.where(choices < 0, 1.0 if objective is Objective.SUM else 0.0, costs[rows, choices])
+    return np.where(choices < 0, cost_of_none(objective), costs[rows, choices])
 
 
 def _joint_costs(block: Block, epsilon: NDArray[np.float64], choices: NDArray[np.intp]) -> NDArray[np.float64]:

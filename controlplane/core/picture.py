@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from controlplane.core.block_rules import with_rules
 from controlplane.core.problem import Block, BlockKey, Problem
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def draw_block(
         weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
     dark = tuple(interface for interface in interfaces if interface not in lit)
-    return block, BlockNotes(servers, dark, all_dark)
+    return with_rules(block, robot, use, clouds), BlockNotes(servers, dark, all_dark)
 
 
 def _lifts(

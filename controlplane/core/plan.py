@@ -6,11 +6,18 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.objectives import block_cost, joint_miss
+import numpy as np
+
+from controlplane.core.costs import block_cost, charge, without_rules
+from controlplane.core.domains import shared_domains
+from controlplane.core.objectives import joint_miss
 from controlplane.core.problem import block_excess, fleet_excess, is_valid
+from controlplane.core.shortfall import shortfall
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
 
     from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
     from protos.model import InterfaceName, NodeName
@@ -23,11 +30,19 @@ class BlockPlan:
     key: BlockKey
     assignments: tuple[tuple[InterfaceName, NodeName], ...]
     cost: float
-    """The block's share of what is minimised, see `objectives`."""
+    """The block's share of what is minimised, see `costs`."""
     predicted_miss: float
     """Probability that all copies miss, see `objectives.joint_miss`."""
     excess: int = 0
     """By how many interfaces the block's own capacity is exceeded."""
+    shared: tuple[str, ...] = ()
+    """Regions and carriers that copies share."""
+    target_miss: float = 0.0
+    """What was to be met at the least charge; 0: it was to be as reliable as can be."""
+    charge: float = 0.0
+    """What a request costs with all its copies; 0 without a target."""
+    shortfall: str = ""
+    """By how much the target is missed, and what would meet it."""
     why: str = ""
     """What made it change last; empty if it never did."""
     block: Block | None = field(default=None, compare=False, repr=False)
@@ -54,8 +69,9 @@ class Plan:
 
     @property
     def gap(self) -> float:
-        """By which share of the bound the cost is above it, at most 1."""
-        return relative_gap(self.cost, self.bound) if self.blocks else 0.0
+        """How far the cost is above the bound, see `relative_gap`."""
+        costs = [block.cost for block in self.blocks.values()]
+        return relative_gap(self.cost, self.bound, size(costs)) if costs else 0.0
 
     @property
     def relaxed(self) -> int:
@@ -63,16 +79,21 @@ class Plan:
         return sum(block.excess for block in self.blocks.values()) + sum(self.fleet_excess.values())
 
 
-def relative_gap(cost: float, bound: float) -> float:
-    """By which share of the bound a cost is above it, at most 1; rounding aside, it is never below."""
+def relative_gap(cost: float, bound: float, size: float) -> float:
+    """How far a cost is above a bound, as a share of `size`, at most 1; rounding aside, it is never below."""
     if math.isinf(bound):
         return 1.0
-    return min(1.0, max(0.0, cost - bound) / max(abs(bound), 1e-9))
+    return min(1.0, max(0.0, cost - bound) / max(size, 1e-9))
+
+
+def size(costs: Sequence[float] | NDArray[np.float64]) -> float:
+    """What the costs of blocks come to without signs and rules, which would make a gap look smaller or larger."""
+    return float(np.abs(without_rules(np.asarray(costs, dtype=np.float64))).sum())
 
 
 @dataclass(frozen=True, order=True, slots=True)
 class Price:
-    """What a plan costs; ordered: first keep to the capacities, then miss few deadlines."""
+    """What a plan costs; ordered: first keep to the capacities, then cost little (`costs`)."""
 
     excess: int
     cost: float
@@ -110,6 +131,10 @@ def make_plan(
             excess=block_excess(block, choice),
             block=block,
             choice=choice,
+            shared=shared_domains(block, choice),
+            target_miss=block.target.miss if block.target is not None else 0.0,
+            charge=charge(block.target, choice) if block.target is not None else 0.0,
+            shortfall=shortfall(block, choice),
         )
     return Plan(plans, fleet_excess(problem, choices), bound, unproven)
 

@@ -2,10 +2,14 @@
 
 A block is one robot's use of one service: its interfaces i, the servers j, and epsilon_ij, the probability that a
 request sent over i to j misses the deadline. Binary x_ij; every interface gets exactly one server; at most
-`capacity` interfaces of the block share a server (the paper's is 1). What is minimised stands in `objectives`.
+`capacity` interfaces of the block share a server (the paper's is 1). What is minimised stands in `objectives` and
+`costs`.
 
 Beyond the paper:
 
+- Fewer copies than interfaces: at most one for each, or a number of them (`Copies`).
+- Failure domains: servers have regions and interfaces have carriers, which copies should not share (`domains`).
+- A block may have a target instead of the objective: the least charge that keeps its miss probability below it.
 - A server may limit how many interfaces of all robots it serves (`Problem.fleet_capacity`).
 - A service that is not idempotent goes to one server over all interfaces; capacity within the block does not apply.
 - Where no assignment keeps to the capacities, they are exceeded by the least total number of interfaces, and the
@@ -20,6 +24,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.posterior import Estimate
+from protos.model import EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -57,6 +62,16 @@ Path = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
+class Target:
+    """A service that wants to be cheap, as long as it misses few enough deadlines."""
+
+    miss: float
+    """The largest probability that all copies miss."""
+    charges: tuple[tuple[float, ...], ...]
+    """What a copy of a request costs, by interface, then server; any one currency, not negative."""
+
+
+@dataclass(frozen=True, slots=True)
 class Block:
     """One robot's use of one service. Every interface can reach at least one of the servers."""
 
@@ -72,6 +87,19 @@ class Block:
     """P(both miss) / (epsilon_1 epsilon_2) of two paths, that of the lower interface first; 1 where not named."""
     weights: tuple[tuple[float, ...], ...] = ()
     """By interface, then server: how many independent requests that epsilon is worth; empty if all are exact."""
+
+    copies: Copies = EVERY_INTERFACE
+    regions: tuple[str, ...] = ()
+    """By server: where it stands; empty texts where that is not known, empty if it never is."""
+    carriers: tuple[str, ...] = ()
+    """By interface: whose network it uses; the same."""
+    target: Target | None = None
+    """None: as reliable as can be."""
+
+    @property
+    def copies_wanted(self) -> Copies:
+        """How many copies, for the number of interfaces there are."""
+        return self.copies.over(len(self.interfaces))
 
     def estimate(self, path: Path) -> Estimate | None:
         """What is believed of a path's miss probability; None if there is no path, or its epsilon is exact."""
@@ -93,8 +121,7 @@ class Problem:
 
 
 Choice = tuple[int | None, ...]
-"""For each interface of a block the index of its server; None where the one server of a service that is not
-idempotent cannot be reached over it."""
+"""For each interface of a block the index of its server; None where it carries no copy."""
 
 
 def loads(choice: Choice, servers: int) -> list[int]:
@@ -106,8 +133,8 @@ def loads(choice: Choice, servers: int) -> list[int]:
     return count
 
 
-def block_excess(block: Block, choice: Choice) -> int:
-    """By how many interfaces the choice exceeds the block's own capacity."""
+def crowding(block: Block, choice: Choice) -> int:
+    """How many interfaces share a server beyond the block's own capacity."""
     if not block.capacity or not block.idempotent:
         return 0
     return sum(max(0, load - block.capacity) for load in loads(choice, len(block.servers)))
@@ -119,6 +146,12 @@ def limits_used(problem: Problem, block: Block, choice: Choice) -> list[FleetKey
     return [key for key in keys if key in problem.fleet_capacity]
 
 
+def block_excess(block: Block, choice: Choice) -> int:
+    """By how many interfaces the choice exceeds what no block should; 0 for one with a target, which has its own
+    ranking of what it prefers (`costs`)."""
+    return 0 if block.target is not None else crowding(block, choice)
+
+
 def fleet_excess(problem: Problem, choices: Mapping[BlockKey, Choice]) -> dict[FleetKey, int]:
     """By how many interfaces the choices exceed each limit over all robots; only those exceeded."""
     load = Counter(key for block in problem.blocks for key in limits_used(problem, block, choices[block.key]))
@@ -126,20 +159,20 @@ def fleet_excess(problem: Problem, choices: Mapping[BlockKey, Choice]) -> dict[F
 
 
 def is_valid(block: Block, choice: Choice) -> bool:
-    """Whether the choice uses only paths that exist, leaves out no interface it need not, and, for a service that
-    is not idempotent, names one server."""
+    """Whether the choice uses only paths that exist, as many as the block wants, and, for a service that is not
+    idempotent, one server, over as many of the interfaces as want it and reach it."""
     if len(choice) != len(block.interfaces):
         return False
     for row, server in zip(block.epsilon, choice, strict=True):
         if server is not None and row[server] is None:
             return False
-    used = {server for server in choice if server is not None}
-    if block.idempotent:
-        return None not in choice
-    if len(used) != 1:
+    used = [server for server in choice if server is not None]
+    least, most = block.copies_wanted
+    if not block.idempotent and used:
+        least = min(least, sum(row[used[0]] is not None for row in block.epsilon))
+    if not (max(1, least) <= len(used) <= most):
         return False
-    (only,) = used
-    return all((server is None) == (row[only] is None) for row, server in zip(block.epsilon, choice, strict=True))
+    return block.idempotent or len(set(used)) == 1
 
 
 def reachable(row: Iterable[float | None]) -> list[int]:

@@ -54,16 +54,17 @@ def mapping_of(
             mappings.append(ServiceMapping(use.name, (), 1.0, notes.unserved or "no plan yet"))
             continue
         planned = tuple(Assignment(interface, server) for interface, server in block.assignments)
+        wanted = len(interfaces) if use.target_miss == 0 else 0
         standby = _standby(planned, notes, before.get(use.name), single=not use.idempotent)
+        standby = standby[: max(0, min(use.copies.most or wanted, wanted) - len(planned))]
         kept = tuple(
             assignment
             for assignment in (*planned, *standby)
             if assignment.interface in interfaces and use.name in servers.get(assignment.server, NO_CALLS)
         )
         predicted = block.predicted_miss if set(planned) & set(kept) else 1.0
-        mappings.append(
-            ServiceMapping(use.name, kept, min(1.0, predicted), _reason(block, notes, plan, picture.problem.objective))
-        )
+        reason = _reason(block, notes, plan, picture.problem.objective, standby=bool(standby))
+        mappings.append(ServiceMapping(use.name, kept, min(1.0, predicted), reason))
     return tuple(mappings)
 
 
@@ -110,15 +111,18 @@ def _standby(
     return standby
 
 
-def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objective) -> str:
+def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objective, *, standby: bool) -> str:
     """One short line; without figures that change with every report, as a new reason is a new version."""
-    parts = [LEAST[objective]]
+    parts = [block.shortfall or "least cost that meets the target" if block.target_miss else LEAST[objective]]
     if block.why:
         parts.append(block.why)
     if notes.all_dark:
         parts.append("no path is up, so all known pairs were considered")
     if notes.dark:
-        parts.append(f"no path is up over {', '.join(notes.dark)}: on standby")
+        standing_by = ": on standby" if standby else ""
+        parts.append(f"no path is up over {', '.join(notes.dark)}{standing_by}")
+    if block.shared:
+        parts.append(f"copies share {', '.join(block.shared)}")
     if block.excess:
         parts.append(f"too few servers: capacity exceeded by {block.excess}")
     servers = {server for _, server in block.assignments}

@@ -23,7 +23,16 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Candidate, ServiceName, ServiceOffer, ServiceSet, ServiceUse, SessionId
+    from protos.model import (
+        Candidate,
+        CandidateSet,
+        InterfaceLabel,
+        ServiceName,
+        ServiceOffer,
+        ServiceSet,
+        ServiceUse,
+        SessionId,
+    )
 
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""
@@ -73,6 +82,8 @@ class Sidecar:
     draining: bool = False
     offered: frozenset[ServiceName] = frozenset()
     """Services it has offered since it registered, at most MAX_OFFERED."""
+    labels: tuple[InterfaceLabel, ...] = ()
+    """What a robot says of its interfaces."""
 
     @property
     def name(self) -> NodeName:
@@ -208,11 +219,12 @@ class Registry:
         known = self._sidecars.get(name)
         return known is not None and known.stream == stream
 
-    def set_candidates(self, name: NodeName, candidates: tuple[Candidate, ...]) -> bool:
-        """Replace its addresses; True if they changed."""
+    def set_candidates(self, name: NodeName, told: CandidateSet) -> bool:
+        """Replace its addresses and what it says of its interfaces; True if they changed."""
         known = self._sidecars[name]
-        self._sidecars[name] = replace(known, candidates=candidates)
-        return candidates != known.candidates
+        changed = replace(known, candidates=told.candidates, labels=told.labels)
+        self._sidecars[name] = changed
+        return changed != known
 
     def set_services(self, name: NodeName, services: ServiceSet) -> bool:
         """Replace its services; True if they changed."""

@@ -12,8 +12,10 @@ from collections import Counter, deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.certainty import probability_better
-from controlplane.core.objectives import block_cost, joint_miss
+from controlplane.core.certainty import probability_better, probability_met
+from controlplane.core.costs import block_cost, charge
+from controlplane.core.domains import violations
+from controlplane.core.objectives import joint_miss, objective_cost
 from controlplane.core.plan import choice_of, make_plan
 from controlplane.core.problem import Objective, block_excess, limits_used
 
@@ -170,8 +172,35 @@ def _more_excess(problem: Problem, together: Sequence[_Difference], load: Mappin
 def _is_worth_it(objective: Objective, together: Sequence[_Difference]) -> bool:
     """Whether these changes save enough at today's estimates, and surely enough."""
     pairs = [(difference.block, difference.new, difference.old or ()) for difference in together]
-    then = sum(block_cost(objective, block, old) for block, _, old in pairs)
-    saved = then - sum(block_cost(objective, block, new) for block, new, _ in pairs)
+    bound = [pair for pair in pairs if pair[0].target is not None]
+    free = [pair for pair in pairs if pair[0].target is None]
+    if not all(_keeps_target(*pair) for pair in bound):
+        return False
+    return any(_suits_target(*pair) for pair in bound) or (bool(free) and _saves_misses(objective, free))
+
+
+def _keeps_target(block: Block, new: Choice, old: Choice) -> bool:
+    return probability_met(block, new) >= min(probability_met(block, old), SURE_ENOUGH)
+
+
+def _suits_target(block: Block, new: Choice, old: Choice) -> bool:
+    """Whether the old choice likely misses the target and the new one is better, or the new one is cheaper.
+
+    A target that one choice meets by a hair and the other misses so is no reason to go back and forth.
+    """
+    if block.target is None or block_cost(Objective.JOINT, block, new) >= block_cost(Objective.JOINT, block, old):
+        return False
+    if probability_met(block, old) < 1 - SURE_ENOUGH or violations(block, new) < violations(block, old):
+        return True
+    return charge(block.target, new) <= (1 - IMPROVEMENT_SHARE) * charge(block.target, old)
+
+
+def _saves_misses(objective: Objective, pairs: Sequence[tuple[Block, Choice, Choice]]) -> bool:
+    shared = sum(violations(block, new) - violations(block, old) for block, new, old in pairs)
+    if shared:
+        return shared < 0
+    then = sum(objective_cost(objective, block, old) for block, _, old in pairs)
+    saved = then - sum(objective_cost(objective, block, new) for block, new, _ in pairs)
     if objective is Objective.SUM:
         enough = saved > max(IMPROVEMENT_MIN, IMPROVEMENT_SHARE * then)
     else:
@@ -183,6 +212,11 @@ def _is_worth_it(objective: Objective, together: Sequence[_Difference]) -> bool:
 def _reason(difference: _Difference) -> str:
     if difference.old is None:
         return "moved as a path of it went or came"
+    target = difference.block.target
+    if target is not None:
+        paid, pays = (charge(target, choice) for choice in (difference.old, difference.new))
+        if pays < paid:
+            return f"moved as a request cost {paid:.3g}, now {pays:.3g}"
     then, now = (joint_miss(difference.block, choice) for choice in (difference.old, difference.new))
     if then <= now:
         return "moved to make room for others"

@@ -1,11 +1,11 @@
 """Blocks of one shape stacked into arrays, so that each one's best choice at given prices is found at once.
 
 Prices by block and server come in as an array with one column more than there are servers: the last, which is 0,
-belongs to an interface that gets no server. A price of infinity closes a server.
+belongs to an interface that carries no copy. A price of infinity closes a server.
 
-There are two kinds. A `SeparableStack` holds blocks whose cost is a sum over interfaces. In an optimum an interface
-has one of its I cheapest servers, I being the number of interfaces: otherwise one of those is left by the others, and
-moving there is cheaper and exceeds nothing. An `EnumeratedStack` holds every choice of its blocks.
+There are two kinds. A `SeparableStack` holds blocks whose cost is a sum over interfaces that all carry a copy. In an
+optimum an interface has one of its I cheapest servers, I being the number of interfaces: otherwise one of those is left
+by the others, and moving there is cheaper and exceeds nothing. An `EnumeratedStack` holds every choice of its blocks.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ from controlplane.core.choices import (
     MAX_LISTED,
     OWN_EXCESS_PRICE,
     combinations,
-    count_choices,
     lift_floor,
     list_choices,
     nearest,
     own_excess,
 )
+from controlplane.core.costs import TARGET_FLOOR, choice_costs
+from controlplane.core.domains import repeats
 from controlplane.core.matching import cheapest_matching
-from controlplane.core.objectives import choice_costs, epsilon_matrix, path_costs
+from controlplane.core.objectives import cost_of_none, epsilon_matrix, path_costs
+from controlplane.core.problem import Objective
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.choices import Near
     from controlplane.core.limits import Limits
-    from controlplane.core.problem import Block, Choice, Objective
+    from controlplane.core.problem import Block, Choice
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]
@@ -54,7 +56,7 @@ class Best(NamedTuple):
     excess: Indices
     """By how many interfaces the block's own capacity is exceeded."""
     picks: Indices
-    """By block, then interface: the server's index; the stack's number of servers where an interface gets none."""
+    """By block, then interface: the server's index; the stack's number of servers where an interface has none."""
 
 
 class Stack(abc.ABC):
@@ -107,7 +109,7 @@ class SeparableStack(Stack):
         priced = self._cost[rows] + price[:, None, : self.servers]
         picks = priced.argmin(axis=2)
         value = np.take_along_axis(priced, picks[:, :, None], 2)[:, :, 0].sum(axis=1)
-        excess = own_excess(picks, self._capacity[rows])
+        excess = repeats(picks, self._capacity[rows])
         crowded = np.flatnonzero(excess)
         if crowded.size:
             solve = _try_all if self.interfaces <= MAX_TRIED else _match
@@ -129,7 +131,7 @@ class SeparableStack(Stack):
             options.append(within[:share])
         picks = np.array(list(itertools.product(*options)), dtype=np.intp)
         values = priced[np.arange(self.interfaces), picks].sum(axis=1)
-        return nearest(values, own_excess(picks, self._capacity[row]), picks, margin, at_most, complete=complete)
+        return nearest(values, repeats(picks, self._capacity[row]), picks, margin, at_most, complete=complete)
 
 
 def _try_all(priced: Floats, capacity: Indices, excess_price: float) -> Best:
@@ -139,7 +141,7 @@ def _try_all(priced: Floats, capacity: Indices, excess_price: float) -> Best:
     grid, rows = combinations(interfaces, tried), np.arange(interfaces)
     picks = cheapest[:, rows, grid]
     values = np.take_along_axis(priced, cheapest, 2)[:, rows, grid].sum(axis=2)
-    excess = own_excess(picks, capacity[:, None])
+    excess = repeats(picks, capacity[:, None])
     at = np.arange(len(priced)), (values + excess_price * excess).argmin(axis=1)
     return Best(values[at], excess[at], picks[at])
 
@@ -148,34 +150,33 @@ def _match(priced: Floats, capacity: Indices, excess_price: float) -> Best:
     found = [cheapest_matching(costs, int(slots), excess_price) for costs, slots in zip(priced, capacity, strict=True)]
     picks = np.array(found, dtype=np.intp)
     value = np.take_along_axis(priced, picks[:, :, None], 2)[:, :, 0].sum(axis=1)
-    return Best(value, own_excess(picks, capacity), picks)
+    return Best(value, repeats(picks, capacity), picks)
 
 
 class EnumeratedStack(Stack):
-    """Blocks whose choices are listed: those that go to one server, and those whose paths fail together.
+    """Blocks whose choices are listed: all others.
 
-    Where a block has more than `at_most` choices, only the cheapest servers of each interface are listed. Its bound
-    then rests on the miss probability being no less than the product of its epsilons and of the lifts below 1.
+    Where a block has more than `at_most` choices, only some are. Its bound then rests on each path's own cost, no
+    violation, and the miss probability being no less than the product of its epsilons and of the lifts below 1.
     """
 
     def __init__(self, objective: Objective, blocks: Sequence[Block], limits: Limits, *, at_most: int) -> None:
         super().__init__(blocks, limits)
         lists = [list_choices(block, at_most) for block in blocks]
-        longest = max(len(choices) for choices in lists)
+        longest = max(len(listed.choices) for listed in lists)
         self._choices: Indices = np.full((len(blocks), longest, self.interfaces), self.servers, dtype=np.intp)
         self._cost = np.full((len(blocks), longest), np.inf)
         self._excess = np.zeros((len(blocks), longest), dtype=np.intp)
-        self._count = [len(choices) for choices in lists]
-        self._trimmed: dict[int, tuple[Floats, float]] = {}
-        """By row: what each path costs by itself, and what the lifts add at least."""
-        for row, (block, choices) in enumerate(zip(blocks, lists, strict=True)):
+        self._count = [len(listed.choices) for listed in lists]
+        self._trimmed: dict[int, _PathBound] = {}
+        """By row."""
+        for row, (block, (choices, complete)) in enumerate(zip(blocks, lists, strict=True)):
             count = len(choices)
             self._cost[row, :count] = choice_costs(objective, block, choices)
             self._choices[row, :count] = np.where(choices < 0, self.servers, choices)
-            if block.idempotent and block.capacity:
-                self._excess[row, :count] = own_excess(choices, np.array(block.capacity))
-            if count < count_choices(block):
-                self._trimmed[row] = path_costs(objective, epsilon_matrix(block)), lift_floor(block)
+            self._excess[row, :count] = own_excess(block, choices)
+            if not complete:
+                self._trimmed[row] = _PathBound(objective, block)
 
     def _priced(self, rows: Indices, price: Floats) -> Floats:
         values = self._cost[rows]
@@ -202,6 +203,28 @@ class EnumeratedStack(Stack):
 
     def bound(self, price: Floats, best: Best, more_excess: Floats) -> Floats:
         bound = best.value + more_excess
-        for row, (costs, lifts) in self._trimmed.items():
-            bound[row] = (costs + price[row, : costs.shape[1]]).min(axis=1).sum() + lifts
+        for row, paths in self._trimmed.items():
+            bound[row] = paths.at(price[row])
         return bound
+
+
+class _PathBound:
+    """What no choice of a block is below, path by path."""
+
+    def __init__(self, objective: Objective, block: Block) -> None:
+        least, most = block.copies_wanted
+        self._least, self._most = least if block.idempotent else 1, most
+        if block.target is not None:
+            self._costs = np.where(np.isnan(epsilon_matrix(block)), np.inf, 0.0)
+            self._none, self._rest = 0.0, TARGET_FLOOR
+        else:
+            self._costs = path_costs(objective, epsilon_matrix(block))
+            self._none = cost_of_none(objective)
+            self._rest = lift_floor(block) if objective is Objective.JOINT else 0.0
+
+    def at(self, price: Floats) -> float:
+        """At these prices of the servers."""
+        interfaces, servers = self._costs.shape
+        gains = np.sort((self._costs + price[:servers]).min(axis=1) - self._none)
+        copies = max(self._least, min(self._most, int((gains < 0).sum())))
+        return float(self._none * interfaces + gains[:copies].sum() + self._rest)

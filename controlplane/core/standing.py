@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.objectives import block_cost
+from controlplane.core.costs import block_cost
+from controlplane.core.plan import size
 from controlplane.core.problem import block_excess
 
 if TYPE_CHECKING:
@@ -83,6 +84,11 @@ class Standing:
     def cost(self) -> float:
         """Of all blocks."""
         return float(sum(part.cost.sum() for part in self.parts))
+
+    @property
+    def size(self) -> float:
+        """Of the cost of all blocks, as `plan.size` has it."""
+        return sum(size(part.cost) for part in self.parts)
 
     @property
     def excess(self) -> int:

@@ -25,6 +25,8 @@ from protos.convert.types import (
     candidate_to_proto,
     candidates_from_proto,
     credential_from_proto,
+    label_to_proto,
+    labels_from_proto,
     offer_to_proto,
     offers_from_proto,
     peer_from_proto,
@@ -55,7 +57,7 @@ from protos.model import (
     SidecarMessage,
     Welcome,
 )
-from protos.names import clean_text, node_name, text
+from protos.names import clean_text, domain_label, node_name, text
 from protos.plr.v1 import control_pb2
 
 _RESOURCES = {
@@ -96,7 +98,8 @@ def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMe
         case "register":
             return _registration_from_proto(message.register)
         case "candidates":
-            return CandidateSet(candidates_from_proto(message.candidates.candidates))
+            candidates = candidates_from_proto(message.candidates.candidates)
+            return CandidateSet(candidates, labels_from_proto(message.candidates.labels, candidates))
         case "services":
             uses = each(message.services.uses, MAX_USES, "uses", use_from_proto)
             unique((use.name for use in uses), "uses")
@@ -129,8 +132,10 @@ def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessag
     match value:
         case Registration():
             return control_pb2.SidecarMessage(register=_registration_to_proto(value))
-        case CandidateSet(candidates=candidates):
-            message = control_pb2.Candidates(candidates=map(candidate_to_proto, candidates))
+        case CandidateSet(candidates=candidates, labels=labels):
+            message = control_pb2.Candidates(
+                candidates=map(candidate_to_proto, candidates), labels=map(label_to_proto, labels)
+            )
             return control_pb2.SidecarMessage(candidates=message)
         case ServiceSet(offers=offers, uses=uses):
             services = control_pb2.Services(offers=map(offer_to_proto, offers), uses=map(use_to_proto, uses))
@@ -202,6 +207,7 @@ def _registration_from_proto(message: control_pb2.Register) -> Registration:
         peers_version=version(message.peers_version, "peers_version"),
         mapping_version=version(message.mapping_version, "mapping_version"),
         credential=credential_from_proto(message.credential),
+        region=domain_label(message.region, "region"),
     )
 
 
@@ -217,6 +223,7 @@ def _registration_to_proto(value: Registration) -> control_pb2.Register:
         peers_version=value.peers_version,
         mapping_version=value.mapping_version,
         credential=value.credential,
+        region=value.region,
     )
 
 

@@ -64,6 +64,12 @@ MAX_EVENTS = 1 << 53
 MAX_CAPACITY = 1_000_000
 """Largest capacity of a server; more is written 0, no limit."""
 
+MAX_CHARGE = 1e9
+"""Largest charge of an interface or a server for one request; what is larger is a mistake."""
+
+MAX_COPIES = 256
+"""Copies of one request: as many as a robot can have interfaces."""
+
 US_PER_S = 1_000_000
 
 T = TypeVar("T")
@@ -89,6 +95,13 @@ def probability(value: float, field: str) -> float:
     """Check a probability."""
     if not (math.isfinite(value) and 0.0 <= value <= 1.0):
         raise DecodeError(f"{field} {value} is not a probability")
+    return value
+
+
+def charge(value: float, field: str) -> float:
+    """Check what a request costs."""
+    if not (math.isfinite(value) and 0.0 <= value <= MAX_CHARGE):
+        raise DecodeError(f"{field} {value} is not within 0..{MAX_CHARGE:.0f}")
     return value
 
 

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING
 from protos.convert.fields import (
     MAX_CANDIDATES,
     MAX_CAPACITY,
+    MAX_COPIES,
     MAX_OFFERS,
     at_most,
+    charge,
     duration,
     each,
     known,
     microseconds,
+    probability,
     unique,
 )
 from protos.errors import DecodeError
@@ -26,7 +29,9 @@ from protos.model import (
     CallPermit,
     Candidate,
     CandidateKind,
+    Copies,
     InterfaceId,
+    InterfaceLabel,
     Peer,
     Role,
     ServiceName,
@@ -34,7 +39,7 @@ from protos.model import (
     ServiceUse,
     SessionId,
 )
-from protos.names import interface_name, node_name, service_name, type_name
+from protos.names import domain_label, interface_name, node_name, service_name, type_name
 from protos.plr.v1 import types_pb2
 
 if TYPE_CHECKING:
@@ -111,18 +116,45 @@ def candidates_from_proto(messages: Sequence[types_pb2.Candidate]) -> tuple[Cand
     return candidates
 
 
+def labels_from_proto(
+    messages: Sequence[types_pb2.InterfaceLabel], candidates: Sequence[Candidate]
+) -> tuple[InterfaceLabel, ...]:
+    """Check what a sidecar says of the interfaces that its candidates name."""
+    labels = each(messages, MAX_CANDIDATES, "labels", _label_from_proto)
+    unique((label.interface for label in labels), "labels")
+    known_names = {candidate.interface for candidate in candidates}
+    for label in labels:
+        if label.interface not in known_names:
+            raise DecodeError(f"labels name {label.interface!a}, which no candidate does")
+    return labels
+
+
+def _label_from_proto(message: types_pb2.InterfaceLabel) -> InterfaceLabel:
+    return InterfaceLabel(
+        interface=interface_name(message.interface, "interface"),
+        carrier=domain_label(message.carrier, "carrier"),
+        charge=charge(message.charge, "charge"),
+    )
+
+
+def label_to_proto(label: InterfaceLabel) -> types_pb2.InterfaceLabel:
+    """Encode what a sidecar says of an interface."""
+    return types_pb2.InterfaceLabel(interface=label.interface, carrier=label.carrier, charge=label.charge)
+
+
 def offer_from_proto(message: types_pb2.ServiceOffer) -> ServiceOffer:
     """Check an offer."""
     return ServiceOffer(
         name=service_name(message.name, "service"),
         type=type_name(message.type, "type"),
         capacity=at_most(message.capacity, MAX_CAPACITY, "capacity"),
+        charge=charge(message.charge, "charge"),
     )
 
 
 def offer_to_proto(offer: ServiceOffer) -> types_pb2.ServiceOffer:
     """Encode an offer."""
-    return types_pb2.ServiceOffer(name=offer.name, type=offer.type, capacity=offer.capacity)
+    return types_pb2.ServiceOffer(name=offer.name, type=offer.type, capacity=offer.capacity, charge=offer.charge)
 
 
 def offers_from_proto(messages: Sequence[types_pb2.ServiceOffer]) -> tuple[ServiceOffer, ...]:
@@ -139,13 +171,29 @@ def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
         type=type_name(message.type, "type"),
         deadline_s=duration(message.deadline_us, "deadline_us"),
         idempotent=message.idempotent,
+        copies=_copies_from_proto(message),
+        target_miss=probability(message.target_miss, "target_miss"),
     )
+
+
+def _copies_from_proto(message: types_pb2.ServiceUse) -> Copies:
+    least = at_most(message.least_copies, MAX_COPIES, "least_copies")
+    most = at_most(message.most_copies, MAX_COPIES, "most_copies")
+    if most and not 1 <= least <= most:
+        raise DecodeError(f"least_copies {least} is not within 1..{most}, the most")
+    return Copies(least, most)
 
 
 def use_to_proto(use: ServiceUse) -> types_pb2.ServiceUse:
     """Encode a use."""
     return types_pb2.ServiceUse(
-        name=use.name, type=use.type, deadline_us=microseconds(use.deadline_s), idempotent=use.idempotent
+        name=use.name,
+        type=use.type,
+        deadline_us=microseconds(use.deadline_s),
+        idempotent=use.idempotent,
+        least_copies=use.copies.least,
+        most_copies=use.copies.most,
+        target_miss=use.target_miss,
     )
 
 

@@ -75,7 +75,7 @@ class Offers:
         for name, kind in self._offered.items():
             rule = find_rule(self._rules, name)
             if rule is not None and name in carried:
-                uses.append(ServiceUse(name, kind, rule.deadline_s, rule.idempotent))
+                uses.append(ServiceUse(name, kind, rule.deadline_s, rule.idempotent, rule.copies, rule.target_miss))
         return tuple(uses)
 
     def set_peers(self, peers: list[Peer]) -> None:

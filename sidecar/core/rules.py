@@ -10,6 +10,7 @@ import fnmatch
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from protos.model import EVERY_INTERFACE, Copies
 from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
@@ -57,8 +58,14 @@ class ServiceRule:
     """Whose messages and executions go first where something waits."""
     fec: Redundancy = None
     """Repair symbols for each source symbol of the messages that are sent from here; None: by the measured loss."""
+    copies: Copies = EVERY_INTERFACE
+    """Robot: how many copies of a request the control plane may map."""
+    target_miss: float = 0.0
+    """Robot: above 0, the cheapest mapping is wanted that misses no more often; 0: the most reliable one."""
     capacity: int = 0
     """Cloud: how many robot interfaces may be mapped here; 0 means no limit."""
+    charge: float = 0.0
+    """Cloud: what a request costs that runs here."""
 
 
 def find_rule(rules: Iterable[ServiceRule], name: ServiceName) -> ServiceRule | None:

@@ -266,7 +266,7 @@ class CloudSide:
         self._settling = len(matched) < len(self._runners)
         self._stats.missing_types = dict(self._missing_types)
         offers = tuple(
-            ServiceOffer(name, runner.type.name, rule.capacity)
+            ServiceOffer(name, runner.type.name, rule.capacity, rule.charge)
             for name, runner in sorted(matched.items())
             if (rule := find_rule(self._rules, name)) is not None
         )

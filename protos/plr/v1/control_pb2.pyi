@@ -140,6 +140,7 @@ class Register(_message.Message):
     PEERS_VERSION_FIELD_NUMBER: _builtins.int
     MAPPING_VERSION_FIELD_NUMBER: _builtins.int
     CREDENTIAL_FIELD_NUMBER: _builtins.int
+    REGION_FIELD_NUMBER: _builtins.int
     protocol_version: _builtins.int
     name: _builtins.str
     role: _types_pb2.Role.ValueType
@@ -152,6 +153,8 @@ class Register(_message.Message):
     mapping_version: _builtins.int
     credential: _builtins.bytes
     """What this run says of itself to its peers, signed by itself (protos/credential.py)."""
+    region: _builtins.str
+    """Of a cloud: where it stands; clouds with the same one fail together. Empty: not known."""
     def __init__(
         self,
         *,
@@ -165,10 +168,11 @@ class Register(_message.Message):
         peers_version: _builtins.int = ...,
         mapping_version: _builtins.int = ...,
         credential: _builtins.bytes = ...,
+        region: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["credential", b"credential", "incarnation", b"incarnation", "mapping_version", b"mapping_version", "name", b"name", "peers_version", b"peers_version", "protocol_version", b"protocol_version", "role", b"role", "session", b"session", "software_version", b"software_version", "token", b"token"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["credential", b"credential", "incarnation", b"incarnation", "mapping_version", b"mapping_version", "name", b"name", "peers_version", b"peers_version", "protocol_version", b"protocol_version", "region", b"region", "role", b"role", "session", b"session", "software_version", b"software_version", "token", b"token"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -179,16 +183,22 @@ class Candidates(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     CANDIDATES_FIELD_NUMBER: _builtins.int
+    LABELS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def candidates(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.Candidate]: ...
+    @_builtins.property
+    def labels(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.InterfaceLabel]:
+        """Of interfaces that candidates name; an interface without one has no carrier and costs 1."""
+
     def __init__(
         self,
         *,
         candidates: _abc.Iterable[_types_pb2.Candidate] | None = ...,
+        labels: _abc.Iterable[_types_pb2.InterfaceLabel] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "labels", b"labels"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19protos/plr/v1/types.proto\x12\x06plr.v1\"#\n\x07\x41\x64\x64ress\x12\n\n\x02ip\x18\x01 \x01(\x0c\x12\x0c\n\x04port\x18\x02 \x01(\r\"{\n\tCandidate\x12\x14\n\x0cinterface_id\x18\x01 \x01(\r\x12\x11\n\tinterface\x18\x02 \x01(\t\x12#\n\x04kind\x18\x03 \x01(\x0e\x32\x15.plr.v1.CandidateKind\x12 \n\x07\x61\x64\x64ress\x18\x04 \x01(\x0b\x32\x0f.plr.v1.Address\"<\n\x0cServiceOffer\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0c\n\x04type\x18\x02 \x01(\t\x12\x10\n\x08\x63\x61pacity\x18\x03 \x01(\r\"Q\n\nServiceUse\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0c\n\x04type\x18\x02 \x01(\t\x12\x13\n\x0b\x64\x65\x61\x64line_us\x18\x03 \x01(\x04\x12\x12\n\nidempotent\x18\x04 \x01(\x08\"\x87\x02\n\x04Peer\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x1a\n\x04role\x18\x02 \x01(\x0e\x32\x0c.plr.v1.Role\x12\x0f\n\x07session\x18\x03 \x01(\x06\x12\r\n\x05token\x18\x04 \x01(\x0c\x12\x13\n\x0bincarnation\x18\x05 \x01(\x04\x12%\n\ncandidates\x18\x06 \x03(\x0b\x32\x11.plr.v1.Candidate\x12$\n\x06offers\x18\x07 \x03(\x0b\x32\x14.plr.v1.ServiceOffer\x12\x10\n\x08\x64raining\x18\x08 \x01(\x08\x12\x12\n\ncredential\x18\t \x01(\x0c\x12\x10\n\x08may_call\x18\n \x03(\t\x12\x1b\n\x13may_call_everything\x18\x0b \x01(\x08\"O\n\tHistogram\x12\x0e\n\x06layout\x18\x01 \x01(\r\x12\x11\n\x05index\x18\x02 \x03(\rB\x02\x10\x01\x12\x11\n\x05\x63ount\x18\x03 \x03(\x04\x42\x02\x10\x01\x12\x0c\n\x04lost\x18\x04 \x01(\x04*<\n\x04Role\x12\x14\n\x10ROLE_UNSPECIFIED\x10\x00\x12\x0e\n\nROLE_ROBOT\x10\x01\x12\x0e\n\nROLE_CLOUD\x10\x02*m\n\rCandidateKind\x12\x1e\n\x1a\x43\x41NDIDATE_KIND_UNSPECIFIED\x10\x00\x12\x17\n\x13\x43\x41NDIDATE_KIND_HOST\x10\x01\x12#\n\x1f\x43\x41NDIDATE_KIND_SERVER_REFLEXIVE\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19protos/plr/v1/types.proto\x12\x06plr.v1\"#\n\x07\x41\x64\x64ress\x12\n\n\x02ip\x18\x01 \x01(\x0c\x12\x0c\n\x04port\x18\x02 \x01(\r\"{\n\tCandidate\x12\x14\n\x0cinterface_id\x18\x01 \x01(\r\x12\x11\n\tinterface\x18\x02 \x01(\t\x12#\n\x04kind\x18\x03 \x01(\x0e\x32\x15.plr.v1.CandidateKind\x12 \n\x07\x61\x64\x64ress\x18\x04 \x01(\x0b\x32\x0f.plr.v1.Address\"D\n\x0eInterfaceLabel\x12\x11\n\tinterface\x18\x01 \x01(\t\x12\x0f\n\x07\x63\x61rrier\x18\x02 \x01(\t\x12\x0e\n\x06\x63harge\x18\x03 \x01(\x01\"L\n\x0cServiceOffer\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0c\n\x04type\x18\x02 \x01(\t\x12\x10\n\x08\x63\x61pacity\x18\x03 \x01(\r\x12\x0e\n\x06\x63harge\x18\x04 \x01(\x01\"\x91\x01\n\nServiceUse\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0c\n\x04type\x18\x02 \x01(\t\x12\x13\n\x0b\x64\x65\x61\x64line_us\x18\x03 \x01(\x04\x12\x12\n\nidempotent\x18\x04 \x01(\x08\x12\x14\n\x0cleast_copies\x18\x05 \x01(\r\x12\x13\n\x0bmost_copies\x18\x06 \x01(\r\x12\x13\n\x0btarget_miss\x18\x07 \x01(\x01\"\x87\x02\n\x04Peer\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x1a\n\x04role\x18\x02 \x01(\x0e\x32\x0c.plr.v1.Role\x12\x0f\n\x07session\x18\x03 \x01(\x06\x12\r\n\x05token\x18\x04 \x01(\x0c\x12\x13\n\x0bincarnation\x18\x05 \x01(\x04\x12%\n\ncandidates\x18\x06 \x03(\x0b\x32\x11.plr.v1.Candidate\x12$\n\x06offers\x18\x07 \x03(\x0b\x32\x14.plr.v1.ServiceOffer\x12\x10\n\x08\x64raining\x18\x08 \x01(\x08\x12\x12\n\ncredential\x18\t \x01(\x0c\x12\x10\n\x08may_call\x18\n \x03(\t\x12\x1b\n\x13may_call_everything\x18\x0b \x01(\x08\"O\n\tHistogram\x12\x0e\n\x06layout\x18\x01 \x01(\r\x12\x11\n\x05index\x18\x02 \x03(\rB\x02\x10\x01\x12\x11\n\x05\x63ount\x18\x03 \x03(\x04\x42\x02\x10\x01\x12\x0c\n\x04lost\x18\x04 \x01(\x04*<\n\x04Role\x12\x14\n\x10ROLE_UNSPECIFIED\x10\x00\x12\x0e\n\nROLE_ROBOT\x10\x01\x12\x0e\n\nROLE_CLOUD\x10\x02*m\n\rCandidateKind\x12\x1e\n\x1a\x43\x41NDIDATE_KIND_UNSPECIFIED\x10\x00\x12\x17\n\x13\x43\x41NDIDATE_KIND_HOST\x10\x01\x12#\n\x1f\x43\x41NDIDATE_KIND_SERVER_REFLEXIVE\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -35,20 +35,22 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_HISTOGRAM'].fields_by_name['index']._serialized_options = b'\020\001'
   _globals['_HISTOGRAM'].fields_by_name['count']._loaded_options = None
   _globals['_HISTOGRAM'].fields_by_name['count']._serialized_options = b'\020\001'
-  _globals['_ROLE']._serialized_start=691
-  _globals['_ROLE']._serialized_end=751
-  _globals['_CANDIDATEKIND']._serialized_start=753
-  _globals['_CANDIDATEKIND']._serialized_end=862
+  _globals['_ROLE']._serialized_start=842
+  _globals['_ROLE']._serialized_end=902
+  _globals['_CANDIDATEKIND']._serialized_start=904
+  _globals['_CANDIDATEKIND']._serialized_end=1013
   _globals['_ADDRESS']._serialized_start=37
   _globals['_ADDRESS']._serialized_end=72
   _globals['_CANDIDATE']._serialized_start=74
   _globals['_CANDIDATE']._serialized_end=197
-  _globals['_SERVICEOFFER']._serialized_start=199
-  _globals['_SERVICEOFFER']._serialized_end=259
-  _globals['_SERVICEUSE']._serialized_start=261
-  _globals['_SERVICEUSE']._serialized_end=342
-  _globals['_PEER']._serialized_start=345
-  _globals['_PEER']._serialized_end=608
-  _globals['_HISTOGRAM']._serialized_start=610
-  _globals['_HISTOGRAM']._serialized_end=689
+  _globals['_INTERFACELABEL']._serialized_start=199
+  _globals['_INTERFACELABEL']._serialized_end=267
+  _globals['_SERVICEOFFER']._serialized_start=269
+  _globals['_SERVICEOFFER']._serialized_end=345
+  _globals['_SERVICEUSE']._serialized_start=348
+  _globals['_SERVICEUSE']._serialized_end=493
+  _globals['_PEER']._serialized_start=496
+  _globals['_PEER']._serialized_end=759
+  _globals['_HISTOGRAM']._serialized_start=761
+  _globals['_HISTOGRAM']._serialized_end=840
 # @@protoc_insertion_point(module_scope)

@@ -115,6 +115,35 @@ class Candidate(_message.Message):
 Global___Candidate: _TypeAlias = Candidate  # noqa: Y015
 
 @_typing.final
+class InterfaceLabel(_message.Message):
+    """What a robot says of one of its interfaces, for the choice of paths."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    INTERFACE_FIELD_NUMBER: _builtins.int
+    CARRIER_FIELD_NUMBER: _builtins.int
+    CHARGE_FIELD_NUMBER: _builtins.int
+    interface: _builtins.str
+    carrier: _builtins.str
+    """Whose network it uses; interfaces with the same one fail together. Empty: not known."""
+    charge: _builtins.float
+    """What a request over it costs, in any one currency."""
+    def __init__(
+        self,
+        *,
+        interface: _builtins.str = ...,
+        carrier: _builtins.str = ...,
+        charge: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["carrier", b"carrier", "charge", b"charge", "interface", b"interface"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___InterfaceLabel: _TypeAlias = InterfaceLabel  # noqa: Y015
+
+@_typing.final
 class ServiceOffer(_message.Message):
     """A service that a cloud sidecar can run."""
 
@@ -123,21 +152,25 @@ class ServiceOffer(_message.Message):
     NAME_FIELD_NUMBER: _builtins.int
     TYPE_FIELD_NUMBER: _builtins.int
     CAPACITY_FIELD_NUMBER: _builtins.int
+    CHARGE_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     type: _builtins.str
     """ROS type, such as nav_msgs/srv/GetPlan."""
     capacity: _builtins.int
     """How many robot interfaces may be mapped to this server for this service; 0 means no limit."""
+    charge: _builtins.float
+    """What a request costs that runs here, in the same currency as an interface's."""
     def __init__(
         self,
         *,
         name: _builtins.str = ...,
         type: _builtins.str = ...,
         capacity: _builtins.int = ...,
+        charge: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["capacity", b"capacity", "name", b"name", "type", b"type"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["capacity", b"capacity", "charge", b"charge", "name", b"name", "type", b"type"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -153,11 +186,21 @@ class ServiceUse(_message.Message):
     TYPE_FIELD_NUMBER: _builtins.int
     DEADLINE_US_FIELD_NUMBER: _builtins.int
     IDEMPOTENT_FIELD_NUMBER: _builtins.int
+    LEAST_COPIES_FIELD_NUMBER: _builtins.int
+    MOST_COPIES_FIELD_NUMBER: _builtins.int
+    TARGET_MISS_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     type: _builtins.str
     deadline_us: _builtins.int
     idempotent: _builtins.bool
     """Copies of one request may run on several servers."""
+    least_copies: _builtins.int
+    """How many copies of a request are sent, each over another interface; 0: as many as there are interfaces."""
+    most_copies: _builtins.int
+    target_miss: _builtins.float
+    """Above 0: wanted is the cheapest mapping that misses the deadline with at most this probability. 0: the most
+    reliable one.
+    """
     def __init__(
         self,
         *,
@@ -165,10 +208,13 @@ class ServiceUse(_message.Message):
         type: _builtins.str = ...,
         deadline_us: _builtins.int = ...,
         idempotent: _builtins.bool = ...,
+        least_copies: _builtins.int = ...,
+        most_copies: _builtins.int = ...,
+        target_miss: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["deadline_us", b"deadline_us", "idempotent", b"idempotent", "name", b"name", "type", b"type"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["deadline_us", b"deadline_us", "idempotent", b"idempotent", "least_copies", b"least_copies", "most_copies", b"most_copies", "name", b"name", "target_miss", b"target_miss", "type", b"type"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from controlplane.core.costs import RULE_PRICE, TIE_PRICE
 from controlplane.core.objectives import PROBABILITY_FLOOR
 from controlplane.core.plan import Price
 from controlplane.core.problem import (
@@ -16,11 +18,19 @@ from controlplane.core.problem import (
     Objective,
     Path,
     Problem,
+    Target,
     block_excess,
     fleet_excess,
     is_valid,
 )
-from protos.model import InterfaceName, NodeName, ServiceName
+from protos.model import (
+    AT_MOST_EVERY_INTERFACE,
+    EVERY_INTERFACE,
+    Copies,
+    InterfaceName,
+    NodeName,
+    ServiceName,
+)
 
 if TYPE_CHECKING:
     import random
@@ -37,6 +47,10 @@ def block(
     idempotent: bool = True,
     service: ServiceName = PLAN,
     lifts: dict[tuple[Path, Path], float] | None = None,
+    copies: Copies = EVERY_INTERFACE,
+    regions: tuple[str, ...] = (),
+    carriers: tuple[str, ...] = (),
+    target: Target | None = None,
 ) -> Block:
     return Block(
         key=BlockKey(NodeName(robot), service),
@@ -46,14 +60,23 @@ def block(
         capacity=capacity,
         idempotent=idempotent,
         lifts=lifts or {},
+        copies=copies,
+        regions=regions,
+        carriers=carriers,
+        target=target,
     )
 
 
 def random_problem(
-    rng: random.Random, objective: Objective = Objective.SUM, *, max_choices: int = 30_000, limited: bool = True
+    rng: random.Random,
+    objective: Objective = Objective.SUM,
+    *,
+    max_choices: int = 30_000,
+    limited: bool = True,
+    ruled: bool = False,
 ) -> Problem:
     """A few robots, interfaces and servers: some paths missing, some failing together, and, unless told otherwise,
-    some servers limited over all robots."""
+    some servers limited over all robots. `ruled`: with failure domains, fewer copies and targets too."""
     while True:
         servers = rng.randint(1, 4)
         blocks = []
@@ -70,7 +93,8 @@ def random_problem(
                 epsilon.append(row)
             capacity = rng.choice([0, 1, 1, 1, 2])
             lifts = random_lifts(rng, epsilon, rng.choice([0.0, 0.3, 1.0]))
-            blocks.append(block(epsilon, robot=f"robot-{robot}", capacity=capacity, idempotent=idempotent, lifts=lifts))
+            made = block(epsilon, robot=f"robot-{robot}", capacity=capacity, idempotent=idempotent, lifts=lifts)
+            blocks.append(with_rules(rng, made) if ruled else made)
         limits = {
             FleetKey(NodeName(f"cloud-{j}"), PLAN): rng.randint(1, 3)
             for j in range(servers)
@@ -79,6 +103,21 @@ def random_problem(
         problem = Problem(tuple(blocks), limits, objective)
         if count_choices(problem) <= max_choices:
             return problem
+
+
+def with_rules(rng: random.Random, part: Block) -> Block:
+    """The block with labels, a wish for fewer copies, and a target, each only sometimes."""
+    interfaces, servers = len(part.interfaces), len(part.servers)
+    labels = ["", "north", "south"]
+    charges = tuple(tuple(float(rng.randint(0, 9)) for _ in range(servers)) for _ in range(interfaces))
+    number = rng.randint(1, 3)
+    return replace(
+        part,
+        copies=rng.choice([EVERY_INTERFACE, EVERY_INTERFACE, AT_MOST_EVERY_INTERFACE, Copies(number, number)]),
+        regions=rng.choice([(), tuple(rng.choice(labels) for _ in range(servers))]),
+        carriers=rng.choice([(), tuple(rng.choice(labels) for _ in range(interfaces))]),
+        target=rng.choice([None, Target(rng.choice([0.3, 0.1, 1e-3]), charges)]),
+    )
 
 
 def fleet(rng: random.Random, robots: int, interfaces: int, servers: int, objective: Objective, room: float) -> Problem:
@@ -134,8 +173,46 @@ def all_miss(part: Block, choice: Choice) -> float:
     return min([product, *epsilon.values(), *pairs.values()])
 
 
+def sharing(part: Block, choice: Choice) -> int:
+    """Copies that share a domain, as the page on them defines it, written down once more."""
+    servers = [j for j in choice if j is not None]
+    carriers = [part.carriers[i] for i, j in enumerate(choice) if j is not None and part.carriers]
+    fitting = [j for number, j in enumerate(servers) if not part.capacity or servers[:number].count(j) < part.capacity]
+    regions = [part.regions[j] for j in fitting if part.regions]
+    every = part.copies.least in (0, *range(len(part.interfaces), 9))
+    shared = 0 if every else sum(max(0, carriers.count(label) - 1) for label in set(carriers) - {""})
+    if part.idempotent:
+        shared += sum(max(0, regions.count(label) - 1) for label in set(regions) - {""})
+        if part.target and part.capacity:
+            shared += sum(max(0, servers.count(j) - part.capacity) for j in set(servers))
+    return shared
+
+
+def rank(objective: Objective, part: Block, choice: Choice) -> tuple[float, ...]:
+    """What decides between a block's choices, in order."""
+    if part.target is None:
+        return (sharing(part, choice), plain_objective(objective, part, choice))
+    miss = all_miss(part, choice)
+    if miss <= part.target.miss * (1 + 1e-9):
+        charge = sum(row[j] for row, j in zip(part.target.charges, choice, strict=True) if j is not None)
+        return (0, sharing(part, choice), charge, math.log(miss))
+    return (1, sharing(part, choice) + choice.count(None), math.log(miss / part.target.miss))
+
+
 def plain_cost(objective: Objective, part: Block, choice: Choice) -> float:
     """What a block's choice costs, by the definition."""
+    found = rank(objective, part, choice)
+    if part.target is None:
+        return RULE_PRICE * found[0] + found[1]
+    if found[0]:
+        # Of copies left out only those count that were wanted.
+        unwanted = len(choice) - min(part.copies.most or len(choice), len(choice))
+        return RULE_PRICE * (4 * len(choice) + found[1] - unwanted) + found[2]
+    return RULE_PRICE * found[1] + found[2] / (sum(map(max, part.target.charges)) or 1.0) + TIE_PRICE * found[3]
+
+
+def plain_objective(objective: Objective, part: Block, choice: Choice) -> float:
+    """What the objective says of it, by the definition."""
     chosen = [part.epsilon[i][j] or 0.0 for i, j in enumerate(choice) if j is not None]
     match objective:
         case Objective.SUM:

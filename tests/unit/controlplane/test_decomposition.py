@@ -13,7 +13,7 @@ from controlplane.core.decomposition import Decomposition, stack_blocks
 from controlplane.core.limits import Limits
 from controlplane.core.objectives import path_costs
 from controlplane.core.plan import price
-from controlplane.core.problem import Block, FleetKey, Objective, Problem, is_valid
+from controlplane.core.problem import Block, FleetKey, Objective, Problem, block_excess, is_valid
 from controlplane.core.stacks import EnumeratedStack
 from tests.unit.controlplane.problems import PLAN, best_price, block, fleet, plain_cost, random_problem, valid_choices
 
@@ -24,11 +24,12 @@ def never() -> bool:
     return False
 
 
+@pytest.mark.parametrize("ruled", [False, True])
 @pytest.mark.parametrize("objective", Objective)
-def test_each_block_gets_its_best_choice_at_any_prices(objective: Objective) -> None:
+def test_each_block_gets_its_best_choice_at_any_prices(objective: Objective, ruled: bool) -> None:
     rng = random.Random(41)
     for _ in range(150):
-        problem = random_problem(rng, objective)
+        problem = random_problem(rng, objective, ruled=ruled)
         limits = Limits(problem)
         for stack in stack_blocks(objective, problem.blocks, limits):
             prices = np.array([rng.choice([0.0, rng.random(), 5.0]) for _ in range(stack.servers)] + [0.0])
@@ -39,22 +40,21 @@ def test_each_block_gets_its_best_choice_at_any_prices(objective: Objective) -> 
 
 
 def best_at(objective: Objective, part: Block, prices: list[float]) -> tuple[int, float]:
-    def excess(choice: tuple[int | None, ...]) -> int:
-        if not part.capacity or not part.idempotent:
-            return 0
-        return sum(max(0, choice.count(server) - part.capacity) for server in range(len(part.servers)))
-
     return min(
-        (excess(choice), plain_cost(objective, part, choice) + sum(prices[j] for j in choice if j is not None))
+        (
+            block_excess(part, choice),
+            plain_cost(objective, part, choice) + sum(prices[j] for j in choice if j is not None),
+        )
         for choice in valid_choices(part)
     )
 
 
+@pytest.mark.parametrize("ruled", [False, True])
 @pytest.mark.parametrize("at_most", [1, 2, 8])
-def test_what_is_not_listed_is_not_below_the_bound(at_most: int) -> None:
+def test_what_is_not_listed_is_not_below_the_bound(at_most: int, ruled: bool) -> None:
     rng = random.Random(44)
     for _ in range(150):
-        problem = random_problem(rng, Objective.JOINT)
+        problem = random_problem(rng, Objective.JOINT, ruled=ruled)
         for part in problem.blocks:
             stack = EnumeratedStack(Objective.JOINT, [part], Limits(problem), at_most=at_most)
             prices = np.array([[*(rng.random() for _ in part.servers), 0.0]])
@@ -83,11 +83,12 @@ def test_many_interfaces_equal_a_flow(interfaces: int, capacity: int) -> None:
             assert value == pytest.approx(cost, abs=interfaces * FLOW_UNIT)
 
 
+@pytest.mark.parametrize("ruled", [False, True])
 @pytest.mark.parametrize("objective", Objective)
-def test_plans_are_never_below_the_best_nor_bounds_above_it(objective: Objective) -> None:
+def test_plans_are_never_below_the_best_nor_bounds_above_it(objective: Objective, ruled: bool) -> None:
     rng = random.Random(42)
     for _ in range(100):
-        problem = random_problem(rng, objective, max_choices=2000)
+        problem = random_problem(rng, objective, max_choices=2000, ruled=ruled)
         limits = Limits(problem)
         relaxed = Decomposition(problem, limits, {}).run(None, good_gap=0.0, out_of_time=never)
         best = best_price(problem)

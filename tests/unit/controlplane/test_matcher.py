@@ -19,12 +19,13 @@ from tests.unit.controlplane.problems import PLAN, best_price, block, choices_of
 AMPLE_S = 60.0
 
 
+@pytest.mark.parametrize("ruled", [False, True])
 @pytest.mark.parametrize("objective", Objective)
 @pytest.mark.parametrize("seed", range(10))
-def test_equals_brute_force(seed: int, objective: Objective) -> None:
+def test_equals_brute_force(seed: int, objective: Objective, ruled: bool) -> None:
     rng = random.Random(seed)
     for number in range(40):
-        problem = random_problem(rng, objective, max_choices=3_000, limited=number % 3 > 0)
+        problem = random_problem(rng, objective, max_choices=3_000, limited=number % 3 > 0, ruled=ruled)
         plan = solve(problem, time_limit_s=AMPLE_S)
         assert plan.unproven == 0
         choices = choices_of(problem, {key: made.assignments for key, made in plan.blocks.items()})

@@ -8,9 +8,9 @@ import random
 import numpy as np
 import pytest
 
-from controlplane.core.objectives import block_cost, choice_costs, joint_miss
+from controlplane.core.objectives import joint_miss, objective_cost, objective_costs
 from controlplane.core.problem import Objective
-from tests.unit.controlplane.problems import block, plain_cost, random_problem, valid_choices
+from tests.unit.controlplane.problems import block, plain_objective, random_problem, valid_choices
 
 TOGETHER = ((0, 0), (1, 1))
 
@@ -34,8 +34,8 @@ def test_no_set_misses_more_often_than_one_path_or_pair_of_it() -> None:
 def test_an_interface_without_a_server_adds_nothing_to_a_product() -> None:
     part = block([[0.1, None], [0.2, 0.3]], idempotent=False, lifts={((0, 0), (1, 1)): 7.0})
     assert joint_miss(part, (None, 1)) == pytest.approx(0.3)
-    assert block_cost(Objective.PRODUCT, part, (None, 1)) == pytest.approx(math.log(0.3))
-    assert block_cost(Objective.SUM, part, (None, 1)) == pytest.approx(1.3)
+    assert objective_cost(Objective.PRODUCT, part, (None, 1)) == pytest.approx(math.log(0.3))
+    assert objective_cost(Objective.SUM, part, (None, 1)) == pytest.approx(1.3)
 
 
 @pytest.mark.parametrize("objective", Objective)
@@ -44,7 +44,7 @@ def test_costs_follow_the_definition_one_by_one_and_all_at_once(objective: Objec
     for _ in range(200):
         for part in random_problem(rng, objective).blocks:
             choices = list(valid_choices(part))
-            plain = [plain_cost(objective, part, choice) for choice in choices]
-            assert [block_cost(objective, part, choice) for choice in choices] == pytest.approx(plain)
+            plain = [plain_objective(objective, part, choice) for choice in choices]
+            assert [objective_cost(objective, part, choice) for choice in choices] == pytest.approx(plain)
             table = np.array([[-1 if server is None else server for server in choice] for choice in choices])
-            assert choice_costs(objective, part, table) == pytest.approx(np.array(plain))
+            assert objective_costs(objective, part, table) == pytest.approx(np.array(plain))

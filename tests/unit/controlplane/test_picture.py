@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from controlplane.core.drawing import Drawing
@@ -11,11 +13,13 @@ from controlplane.core.permits import Permits
 from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.posterior import IGNORANCE
-from controlplane.core.problem import BlockKey, FleetKey, Objective
+from controlplane.core.problem import BlockKey, FleetKey, Objective, Target
 from controlplane.core.registry import Sidecar
 from protos.model import (
     Assignment,
     Candidate,
+    Copies,
+    InterfaceLabel,
     InterfaceName,
     JointReport,
     NodeName,
@@ -180,6 +184,19 @@ def test_paths_that_were_seen_to_fail_together_get_a_lift_whatever_the_order_of_
 
 def assignment(interface: str, server: str) -> Assignment:
     return Assignment(InterfaceName(interface), NodeName(server))
+
+
+def test_labels_charges_and_wishes_become_rules_of_the_block() -> None:
+    wish = dataclasses.replace(use(), copies=Copies(1, 2), target_miss=0.01)
+    labels = (InterfaceLabel(InterfaceName("wwan0"), "telekom", 2.0),)
+    here = dataclasses.replace(robot(wish), labels=labels)
+    away = cloud("b", dataclasses.replace(offer(), charge=0.5))
+    far = dataclasses.replace(away, registration=dataclasses.replace(away.registration, region="eu"))
+    (block,) = picture(here, cloud("a"), far).problem.blocks
+    assert (block.carriers, block.regions, block.copies) == (("", "telekom"), ("", "eu"), Copies(1, 2))
+    assert block.target == Target(0.01, ((1.0, 1.5), (2.0, 2.5)))
+    (plain,) = picture(robot(), cloud("a")).problem.blocks
+    assert (plain.carriers, plain.regions, plain.target) == ((), (), None)
 
 
 def test_each_use_has_its_own_deadline() -> None:

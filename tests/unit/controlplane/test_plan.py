@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from controlplane.core.plan import Plan, Price, choice_of, make_plan, price, relative_gap
+from controlplane.core.costs import RULE_PRICE
+from controlplane.core.plan import Plan, Price, choice_of, make_plan, price, relative_gap, size
 from controlplane.core.problem import Objective, Problem
 from tests.unit.controlplane.problems import block
 
@@ -47,10 +48,11 @@ def test_an_old_plan_is_read_in_the_new_numbering_or_given_up() -> None:
     assert choice_of(block([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]), plan) is None
 
 
-def test_the_gap_is_the_share_of_the_bound_that_the_cost_is_above_it() -> None:
-    assert relative_gap(1.1, 1.0) == pytest.approx(0.1)
-    assert relative_gap(-90.0, -100.0) == pytest.approx(0.1)
-    assert relative_gap(0.9999999, 1.0) == 0.0
-    assert relative_gap(5.0, 0.0) == 1.0
-    assert relative_gap(0.0, -math.inf) == 1.0
+def test_the_gap_is_a_share_of_what_the_costs_come_to_without_rules() -> None:
+    assert relative_gap(1.1, 1.0, 1.0) == pytest.approx(0.1)
+    assert relative_gap(-90.0, -100.0, 100.0) == pytest.approx(0.1)
+    assert relative_gap(0.9999999, 1.0, 1.0) == 0.0
+    assert relative_gap(5.0, 0.0, 0.0) == 1.0
+    assert relative_gap(0.0, -math.inf, 1.0) == 1.0
+    assert size([-10.0, 2.0, 3 * RULE_PRICE - 8.0]) == pytest.approx(20.0)
     assert Plan({}).gap == 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from controlplane.core.picture import BlockNotes, Picture
@@ -13,6 +15,7 @@ from protos.model import (
     ALL_CALLS,
     Assignment,
     CallPermit,
+    Copies,
     InterfaceName,
     NodeName,
     ServiceMapping,
@@ -119,3 +122,19 @@ def test_only_a_material_change_is_worth_a_version() -> None:
     assert differs((base,), (ServiceMapping(PLAN, base.assignments, 0.03, "because"),))
     tiny = (ServiceMapping(PLAN, base.assignments, 1e-9, "because"),)
     assert not differs(tiny, (ServiceMapping(PLAN, base.assignments, 1e-6, "because"),))
+
+
+def test_where_not_every_interface_is_to_carry_a_copy_none_stands_by_beyond_that() -> None:
+    dark = picture(servers=(A, B), dark=(WWAN,))
+    one = dataclasses.replace(use(), copies=Copies(1, 1))
+    cheap = dataclasses.replace(use(), target_miss=0.01)
+    for wish in (one, cheap):
+        (mapping,) = mapping_of(robot(wish), servers("a", "b"), plan((WLAN, A)), dark, ())
+        assert pairs(mapping) == [("wlan0", "a")]
+        assert "standby" not in mapping.reason
+
+
+def test_the_reason_names_what_copies_share_and_by_how_much_a_target_is_missed() -> None:
+    made = dataclasses.replace(plan((WLAN, A)).blocks[KEY], shared=("region eu",), target_miss=0.1, shortfall="misses")
+    (mapping,) = mapping_of(robot(), servers("a"), Plan({KEY: made}), picture(servers=(A,)), ())
+    assert mapping.reason == "misses; copies share region eu"

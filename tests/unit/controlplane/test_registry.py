@@ -6,7 +6,7 @@ import pytest
 
 from controlplane.core import registry as registry_module
 from controlplane.core.registry import Admission, Refusal, Registry
-from protos.model import NodeName, RemovalReason, Role, ServiceSet
+from protos.model import CandidateSet, NodeName, RemovalReason, Role, ServiceSet
 from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 
 ROBOT = NodeName("robot")
@@ -40,7 +40,7 @@ def test_every_message_renews_the_lease(registry: Registry) -> None:
 
 def test_losing_the_stream_keeps_the_sidecar_until_its_lease_ends(registry: Registry) -> None:
     registry.register(registration("robot"), stream(1), 0.0)
-    registry.set_candidates(ROBOT, interfaces("wlan0"))
+    registry.set_candidates(ROBOT, CandidateSet(interfaces("wlan0")))
     assert registry.disconnect(ROBOT, stream(1)) is None
     known = registry.get(ROBOT)
     assert known is not None
@@ -62,7 +62,7 @@ def test_who_drained_has_left_when_its_stream_ends(registry: Registry) -> None:
 
 def test_a_newer_incarnation_replaces_the_older_stream(registry: Registry) -> None:
     registry.register(registration("robot", incarnation=1), stream(1), 0.0)
-    registry.set_candidates(ROBOT, interfaces("wlan0"))
+    registry.set_candidates(ROBOT, CandidateSet(interfaces("wlan0")))
     registry.set_draining(ROBOT)
     result = registry.register(registration("robot", incarnation=2), stream(2), 1.0)
     assert result == Admission(replaced=stream(1), new_run=True)
@@ -90,7 +90,7 @@ def test_a_session_number_belongs_to_one_sidecar(registry: Registry) -> None:
 def test_a_sidecar_is_ready_when_it_told_addresses_and_services(registry: Registry) -> None:
     registry.register(registration("robot"), stream(1), 0.0)
     assert [sidecar.ready for sidecar in registry] == [False]
-    assert registry.set_candidates(ROBOT, ())
+    assert registry.set_candidates(ROBOT, CandidateSet(()))
     assert [sidecar.ready for sidecar in registry] == [False]
     assert registry.set_services(ROBOT, ServiceSet())
     assert [sidecar.ready for sidecar in registry] == [True]
@@ -141,8 +141,8 @@ def test_reasons_of_removals_are_bounded(registry: Registry, monkeypatch: pytest
 def test_setters_say_whether_anything_changed(registry: Registry) -> None:
     registry.register(registration("cloud", Role.CLOUD), stream(1), 0.0)
     name = NodeName("cloud")
-    assert registry.set_candidates(name, interfaces("eth0"))
-    assert not registry.set_candidates(name, interfaces("eth0"))
+    assert registry.set_candidates(name, CandidateSet(interfaces("eth0")))
+    assert not registry.set_candidates(name, CandidateSet(interfaces("eth0")))
     assert registry.set_services(name, ServiceSet((offer(),)))
     assert not registry.set_services(name, ServiceSet((offer(),)))
     known = registry.get(name)

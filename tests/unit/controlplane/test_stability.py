@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from controlplane.core.plan import Plan, make_plan, price
-from controlplane.core.problem import FleetKey, Objective, Problem
+from controlplane.core.problem import FleetKey, Objective, Problem, Target
 from controlplane.core.stability import CHANGE_WINDOW_S, MAX_CHANGES, Stability
 from controlplane.matcher import solve
-from protos.model import NodeName
+from protos.model import AT_MOST_EVERY_INTERFACE, NodeName
 from tests.unit.controlplane.problems import PLAN, block, choices_of, random_problem
 
 
@@ -218,3 +218,36 @@ def test_a_change_that_exceeds_more_is_never_made() -> None:
     old = make_plan(problem, {part.key: (0, 1)})
     crowded = make_plan(problem, {part.key: (1, 1)})
     assert settled_of(problem, crowded, old).blocks[part.key].assignments == old.blocks[part.key].assignments
+
+
+@pytest.mark.parametrize(
+    ("misses", "weight", "copies", "changes"),
+    [
+        (0.05, 1000.0, 1, False),
+        (0.2, 1000.0, 1, True),
+        (0.12, 20.0, 1, False),
+        (0.05, 1000.0, 2, True),
+        (0.095, 20.0, 2, False),
+        (0.2, 1000.0, 2, False),
+    ],
+)
+def test_copies_come_and_go_when_the_target_is_surely_missed_or_surely_met(
+    misses: float, weight: float, copies: int, changes: bool
+) -> None:
+    target = Target(0.1, ((1.0, 1.0), (1.0, 1.0)))
+    part = block([[misses, misses], [0.5, 0.5]], copies=AT_MOST_EVERY_INTERFACE, target=target)
+    part = replace(part, weights=((weight,) * 2,) * 2)
+    problem = Problem((part,))
+    old = make_plan(problem, {part.key: (0, None) if copies == 1 else (0, 1)})
+    settled = settled_of(problem, solve(problem, time_limit_s=60), old)
+    assert len(settled.blocks[part.key].assignments) == (3 - copies if changes else copies)
+    if copies == 2 and changes:
+        assert settled.blocks[part.key].why == "moved as a request cost 2, now 1"
+
+
+def test_a_shared_region_is_left_although_that_misses_more() -> None:
+    part = block([[0.01, 0.01, 0.02], [0.01, 0.01, 0.02]], regions=("eu", "eu", "us"))
+    problem = Problem((part,))
+    old = make_plan(problem, {part.key: (0, 1)})
+    settled = settled_of(problem, solve(problem, time_limit_s=60), old)
+    assert settled.blocks[part.key].shared == ()

@@ -9,7 +9,17 @@ from controlplane.core.permits import Permits
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.registry import Registry, Sidecar
 from controlplane.core.views import Views
-from protos.model import ALL_CALLS, CallPermit, NodeName, RemovalReason, RemovedPeer, Role, ServiceName, ServiceSet
+from protos.model import (
+    ALL_CALLS,
+    CallPermit,
+    CandidateSet,
+    NodeName,
+    RemovalReason,
+    RemovedPeer,
+    Role,
+    ServiceName,
+    ServiceSet,
+)
 from tests.unit.controlplane.policies import CLOUDS, ROBOTS, SERVICES, policies
 from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 
@@ -24,7 +34,7 @@ def registry(clouds: dict[str, tuple[str, ...]], robots: tuple[str, ...] = ("rob
     roles = [(name, Role.CLOUD) for name in clouds] + [(name, Role.ROBOT) for name in robots]
     for number, (name, role) in enumerate(roles):
         made.register(registration(name, role), stream(number), 0.0)
-        made.set_candidates(NodeName(name), interfaces("eth0"))
+        made.set_candidates(NodeName(name), CandidateSet(interfaces("eth0")))
         made.set_services(NodeName(name), ServiceSet(tuple(map(offer, clouds.get(name, ())))))
     return made
 

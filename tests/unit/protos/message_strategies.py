@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from hypothesis import strategies as st
 
-from protos.convert.fields import MAX_CAPACITY, MAX_DURATION_S, MAX_EVENTS, MAX_VERSION
+from protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS, MAX_VERSION
 from protos.explanation import (
     Alternative,
     AlternativeKind,
@@ -33,9 +33,11 @@ from protos.model import (
     CandidateKind,
     CandidateSet,
     ControlMessage,
+    Copies,
     Drain,
     Heartbeat,
     InterfaceId,
+    InterfaceLabel,
     InterfaceName,
     JointReport,
     LatencyReport,
@@ -123,8 +125,21 @@ def _tuples(
     return st.lists(elements, max_size=size, unique_by=attribute).map(lambda found: tuple(found))
 
 
-offers = st.builds(ServiceOffer, service_names, type_names, st.integers(0, MAX_CAPACITY))
-uses = st.builds(ServiceUse, service_names, type_names, durations, st.booleans())
+charges = st.floats(0.0, MAX_CHARGE)
+domain_labels = st.just("") | st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.&+-]{0,10}", fullmatch=True)
+copies = st.tuples(st.integers(0, MAX_COPIES), st.just(0)) | st.tuples(
+    st.integers(1, MAX_COPIES), st.integers(1, MAX_COPIES)
+).map(sorted)
+offers = st.builds(ServiceOffer, service_names, type_names, st.integers(0, MAX_CAPACITY), charges)
+uses = st.builds(
+    ServiceUse,
+    service_names,
+    type_names,
+    durations,
+    st.booleans(),
+    copies.map(lambda pair: Copies(*pair)),
+    probabilities,
+)
 permits = st.just(ALL_CALLS) | st.builds(CallPermit, st.frozensets(service_names, max_size=3))
 peers = st.builds(
     Peer,
@@ -151,7 +166,20 @@ registrations = st.builds(
     versions,
     versions,
     credentials,
+    domain_labels,
 )
+
+
+@st.composite
+def candidate_sets(draw: st.DrawFn) -> CandidateSet:
+    candidates = draw(candidate_tuples())
+    names = sorted({candidate.interface for candidate in candidates})
+    labelled = draw(st.lists(st.sampled_from(names), unique=True)) if names else []
+    return CandidateSet(
+        candidates, tuple(InterfaceLabel(name, draw(domain_labels), draw(charges)) for name in labelled)
+    )
+
+
 counts_of = events.flatmap(lambda total: st.tuples(st.just(total), st.integers(0, total)))
 latencies = st.builds(
     lambda interface, server, service, latency, processing, counts: LatencyReport(
@@ -200,7 +228,7 @@ def peer_sets(draw: st.DrawFn) -> PeerSet:
 
 sidecar_messages: st.SearchStrategy[SidecarMessage] = st.one_of(
     registrations,
-    st.builds(CandidateSet, candidate_tuples()),
+    candidate_sets(),
     st.builds(ServiceSet, _tuples(offers, by="name"), _tuples(uses, by="name")),
     reports,
     st.builds(Ack, st.sampled_from(ResourceKind), versions, uint64),

@@ -10,7 +10,15 @@ from pydantic import ValidationError
 
 from protos.errors import ConfigError
 from protos.identity import Identity, IdentityRole
-from protos.model import NodeName, Role
+from protos.model import (
+    AT_MOST_EVERY_INTERFACE,
+    EVERY_INTERFACE,
+    Copies,
+    InterfaceLabel,
+    InterfaceName,
+    NodeName,
+    Role,
+)
 from sidecar.config import (
     DEFAULT_CLOUD_UDP_PORT,
     LogLevel,
@@ -123,6 +131,28 @@ def test_copies_to_several_servers_only_when_asked_for() -> None:
     assert rule.priority is Priority.NORMAL
 
 
+def test_what_is_wanted_of_the_mapping() -> None:
+    (rule,) = parse(ROBOT).service_rules()
+    assert (rule.copies, rule.target_miss) == (EVERY_INTERFACE, 0.0)
+    (rule,) = parse(with_service(ROBOT, copies="at_most")).service_rules()
+    assert rule.copies == AT_MOST_EVERY_INTERFACE
+    (rule,) = parse(with_service(ROBOT, mode="cheapest", target_miss=0.001)).service_rules()
+    assert (rule.copies, rule.target_miss) == (AT_MOST_EVERY_INTERFACE, 0.001)
+    (rule,) = parse(with_service(ROBOT, mode="cheapest", target_miss=0.001, copies=2)).service_rules()
+    assert rule.copies == Copies(2, 2)
+    assert parse(with_service(CLOUD, cost_per_request=2)).service_rules()[0].charge == 2.0
+
+
+def test_the_first_network_that_matches_an_interface_labels_it() -> None:
+    networks = [{"interface": "wwan0", "carrier": "telekom"}, {"interface": "ww*", "cost_per_request": 2}]
+    config = parse(ROBOT, networks=networks)
+    names = [InterfaceName(name) for name in ("wwan0", "wwan1", "wwan0", "wlan0")]
+    assert config.labels(names) == (
+        InterfaceLabel(InterfaceName("wwan0"), "telekom", 1.0),
+        InterfaceLabel(InterfaceName("wwan1"), "", 2.0),
+    )
+
+
 @pytest.mark.parametrize("priority", Priority)
 def test_priorities_are_words(priority: Priority) -> None:
     (rule,) = parse(with_service(ROBOT, priority=priority.name.lower())).service_rules()
@@ -157,6 +187,22 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(ROBOT, lifetime_ms=300_001), "services[0].lifetime_ms", "300000"),
     (with_service(CLOUD, lifetime_ms=300_001), "services[0].lifetime_ms", "300000"),
     (with_service(ROBOT, capacity_interfaces=1), "services[0].capacity_interfaces", "on a cloud only"),
+    (with_service(ROBOT, copies="two"), "services[0].copies", "expected each, at_most or a number from 1 to 256"),
+    (with_service(ROBOT, copies=0), "services[0].copies", "got 0"),
+    (with_service(ROBOT, copies=True), "services[0].copies", "got True"),
+    (with_service(CLOUD, copies=2), "services[0].copies", "on a robot only"),
+    (with_service(ROBOT, mode="cheap"), "services[0].mode", "expected 'most_reliable' or 'cheapest'"),
+    (with_service(ROBOT, mode="cheapest"), "services[0].target_miss", "beside mode: cheapest, but missing"),
+    (with_service(ROBOT, target_miss=0.1), "services[0].target_miss", "only beside mode: cheapest"),
+    (with_service(ROBOT, mode="cheapest", target_miss=0), "services[0].target_miss", "greater than 0"),
+    (with_service(ROBOT, mode="cheapest", target_miss=1.0), "services[0].target_miss", "less than 1"),
+    (with_service(ROBOT, cost_per_request=1), "services[0].cost_per_request", "on a cloud only"),
+    (with_service(CLOUD, cost_per_request=-1), "services[0].cost_per_request", "greater than or equal to 0"),
+    (ROBOT | {"region": "eu"}, "region", "on a cloud only"),
+    (CLOUD | {"region": "eu central"}, "region", "expected 1 to 63 letters"),
+    (CLOUD | {"networks": [{"interface": "eth0"}]}, "networks", "on a robot only"),
+    (ROBOT | {"networks": [{"interface": "wlan0"}] * 2}, "networks[1].interface", "once, got 'wlan0' again"),
+    (ROBOT | {"networks": [{"interface": "wlan0", "carrier": "a b"}]}, "networks[0].carrier", "expected 1 to 63"),
     (ROBOT | {"services": [{"name": "/a"}]}, "services[0].deadline_ms", "expected milliseconds"),
     (with_service(CLOUD, deadline_ms=100), "services[0].deadline_ms", "on a robot only"),
     (with_service(CLOUD, idempotent=False), "services[0].idempotent", "on a robot only"),

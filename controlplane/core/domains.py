@@ -1,0 +1,113 @@
+"""Failure domains: copies of a request should not share a region or a carrier.
+
+A choice is charged with each copy that comes into a region, or behind a carrier, where there is one already. What has
+no label shares nothing. A copy that shares its server beyond the block's capacity counts as that alone, not as sharing
+the region too. Where every interface carries a copy, the carriers do not depend on the choice and are not counted; a
+service that is not idempotent has one server, and so one region.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from controlplane.core.problem import crowding
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from controlplane.core.problem import Block, Choice
+
+    Indices = NDArray[np.intp]
+
+
+def shared_domains(block: Block, choice: Choice) -> tuple[str, ...]:
+    """The regions and carriers that copies share, by name, whether or not the choice could help it."""
+    regions = _labels(block.regions, choice) if block.idempotent else []
+    carriers = _labels(block.carriers, [None if server is None else i for i, server in enumerate(choice)])
+    return tuple(
+        f"{kind} {label}"
+        for kind, labels in (("region", regions), ("carrier", carriers))
+        for label, count in sorted(Counter(labels).items())
+        if count > 1
+    )
+
+
+def violations(block: Block, choice: Choice) -> int:
+    """How many copies share a domain with another before them; with a target, also those that share a server beyond
+    the block's own capacity."""
+    crowd = crowding(block, choice)
+    count = crowd if block.target is not None else 0
+    if block.idempotent and block.regions:
+        fitting = _within(block, choice) if crowd else choice
+        count += _repeats(_labels(block.regions, fitting))
+    if chooses_interfaces(block):
+        count += _repeats(_labels(block.carriers, [None if server is None else i for i, server in enumerate(choice)]))
+    return count
+
+
+def violation_counts(block: Block, choices: Indices) -> Indices:
+    """`violations` of many choices, a row each, with -1 where an interface carries no copy."""
+    count = np.zeros(len(choices), dtype=np.intp)
+    crowd = np.zeros(choices.shape, dtype=np.bool_)
+    if block.idempotent and block.capacity:
+        crowd = beyond(choices, np.array(block.capacity))
+        count += crowd.sum(axis=1) if block.target is not None else 0
+    if block.idempotent and block.regions:
+        count += repeats(np.where((choices < 0) | crowd, -1, _numbered(block.regions)[choices]), np.array(1))
+    if block.carriers and chooses_interfaces(block):
+        count += repeats(np.where(choices < 0, -1, _numbered(block.carriers)), np.array(1))
+    return count
+
+
+def repeats(labels: Indices, free: Indices) -> Indices:
+    """How many labels of each row have stood there `free` times before; interfaces are the last dimension, and what is
+    below 0 is no label."""
+    count: Indices = beyond(labels, free).sum(axis=-1)
+    return count
+
+
+def beyond(labels: Indices, free: Indices) -> NDArray[np.bool_]:
+    """Which labels of each row have stood there `free` times before."""
+    found = np.zeros(labels.shape, dtype=np.bool_)
+    for interface in range(1, labels.shape[-1]):
+        label = labels[..., interface]
+        before = (labels[..., :interface] == label[..., None]).sum(axis=-1)
+        found[..., interface] = (before >= free) & (label >= 0)
+    return found
+
+
+def chooses_interfaces(block: Block) -> bool:
+    """Whether some interface may go without a copy that could carry one."""
+    return block.copies_wanted.least < len(block.interfaces)
+
+
+def has_shared_regions(block: Block) -> bool:
+    """Whether two of its copies may meet in a region that is known."""
+    labels = [region for region in block.regions if region]
+    return block.idempotent and (_repeats(labels) > 0 or (bool(labels) and block.capacity != 1))
+
+
+def _within(block: Block, choice: Choice) -> list[int | None]:
+    """The choice without the copies beyond the block's own capacity."""
+    kept: list[int | None] = []
+    for server in choice:
+        kept.append(None if kept.count(server) >= block.capacity else server)
+    return kept
+
+
+def _labels(labels: Sequence[str], chosen: Iterable[int | None]) -> list[str]:
+    return [labels[number] for number in chosen if number is not None and labels[number]] if labels else []
+
+
+def _repeats(labels: Sequence[str]) -> int:
+    return len(labels) - len(set(labels))
+
+
+def _numbered(labels: Sequence[str]) -> Indices:
+    number = {label: position for position, label in enumerate(dict.fromkeys(labels))}
+    return np.array([number[label] if label else -1 for label in labels], dtype=np.intp)
