@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import grpc
 import yaml
 
-from protos.convert import control_message_from_proto, sidecar_message_to_proto
+from protos.convert import control_message_from_proto, sidecar_message_to_proto, status_from_proto
 from protos.credential import Aead, SessionCredential
 from protos.identity import CONTROL_PLANE_DNS
 from protos.model import (
@@ -34,7 +34,7 @@ from protos.model import (
     SidecarMessage,
     Version,
 )
-from protos.plr.v1 import control_pb2, control_pb2_grpc
+from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2, control_pb2_grpc
 from tests.unit.controlplane.samples import interfaces, offer, registration, use
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
     from controlplane.ca import Issued
+    from protos.model import SidecarStatus, SyncState
 
 Message = TypeVar("Message", bound=ControlMessage)
 
@@ -101,6 +102,22 @@ class ControlPlaneProcess:
             assert time.monotonic() < end, f"{parts} not in {self.lines}"
             time.sleep(0.02)
 
+    def status(self) -> dict[str, SidecarStatus]:
+        """What it tells operators, by sidecar; of one that is not secured."""
+        with grpc.insecure_channel(self.address) as channel:
+            answer = admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest(), timeout=PATIENCE_S)
+        return {found.peer.name: found for found in status_from_proto(answer)}
+
+    def wait_for_state(self, name: str, state: SyncState) -> SidecarStatus:
+        """Wait until a sidecar's peers are in this state; an ack is on its way for a moment."""
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            found = self.status().get(name)
+            if found is not None and found.peers.state is state:
+                return found
+            assert time.monotonic() < end, f"{name} is {found}"
+            time.sleep(0.02)
+
     def reload(self, **changes: Any) -> None:
         """Change the configuration, and tell it."""
         self.settings.update(changes)
@@ -115,6 +132,12 @@ class ControlPlaneProcess:
         assert self._process.stderr is not None
         self._process.stderr.close()
         return code
+
+    def stop_flawless(self) -> None:
+        """Stop it; neither that nor anything before went wrong."""
+        assert self.stop() == 0
+        bad = [number for number, line in enumerate(self.lines) if "Traceback" in line or " ERROR " in line]
+        assert not bad, self.lines[bad[0] :]
 
     def __enter__(self) -> Self:
         return self

@@ -8,11 +8,7 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
-import grpc
-
-from protos.convert import status_from_proto
 from protos.model import MappingSet, PeerSet, Report, Role, SyncState, Welcome
-from protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
@@ -21,7 +17,6 @@ from tests.unit.controlplane.samples import interfaces, path, registration, use
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.model import SidecarStatus
     from protos.tls_files import TlsFiles
 
 
@@ -55,12 +50,6 @@ class Engine:
         """Nothing to do."""
 
 
-def status(plane: ControlPlaneProcess) -> dict[str, SidecarStatus]:
-    with grpc.insecure_channel(plane.address) as channel:
-        answer = admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest(), timeout=PATIENCE_S)
-    return {found.peer.name: found for found in status_from_proto(answer)}
-
-
 def test_a_client_registers_follows_and_outlives_a_restart(tmp_path: Path) -> None:
     engine = Engine()
     session = ControlSession(registration("robot", Role.ROBOT), random.Random(1))
@@ -77,7 +66,7 @@ def test_a_client_registers_follows_and_outlives_a_restart(tmp_path: Path) -> No
                     pass
                 assert {assignment.server for assignment in last} == {"cloud-a", "cloud-b"}
                 end = time.monotonic() + PATIENCE_S
-                while (shown := status(plane)["robot"]).mapping.state is not SyncState.SYNCED:
+                while (shown := plane.status()["robot"]).mapping.state is not SyncState.SYNCED:
                     assert time.monotonic() < end
                     time.sleep(0.05)
                 assert shown.peers.state is SyncState.SYNCED
@@ -92,6 +81,6 @@ def test_a_client_registers_follows_and_outlives_a_restart(tmp_path: Path) -> No
                     pass
                 assert {assignment.server for assignment in mapping.services[0].assignments} == {"cloud-a", "cloud-b"}
                 client.stop()
-                assert "robot" not in status(again)
+                assert "robot" not in again.status()
         finally:
             client.stop()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
 
 import grpc
 import pytest
@@ -13,16 +12,6 @@ from protos.model import Report
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
 from tests.unit.controlplane.samples import histogram, latency, path
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-
-@pytest.fixture(scope="module")
-def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlaneProcess]:
-    with ControlPlaneProcess(tmp_path_factory.mktemp("plane")) as process:
-        yield process
-        assert process.stop() == 0
 
 
 def explain(plane: ControlPlaneProcess, *arguments: str) -> int:

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import grpc
 import pytest
 
-from protos.convert import status_from_proto
 from protos.model import NO_POLICY, NodeName, RemovalReason, RemovedPeer, ServiceName
-from protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from tests.integration.control_plane_process import ControlPlaneProcess, cloud, robot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-    from protos.model import SidecarStatus
 
 
 def policy(*, robots: str = "*", clouds: str = "*", offering: str = "*") -> dict[str, Any]:
@@ -24,12 +19,6 @@ def policy(*, robots: str = "*", clouds: str = "*", offering: str = "*") -> dict
         "calls": [{"robots": robots, "services": "/plan", "clouds": clouds}],
         "offers": [{"clouds": offering, "services": ["/plan"]}],
     }
-
-
-def status(plane: ControlPlaneProcess) -> dict[str, SidecarStatus]:
-    with grpc.insecure_channel(plane.address) as channel:
-        answer = admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest())
-    return {found.peer.name: found for found in status_from_proto(answer)}
 
 
 @pytest.fixture
@@ -65,7 +54,7 @@ def test_a_file_that_is_not_in_order_leaves_the_policy_in_force(plane: ControlPl
         told = r.peers("cloud-a").version
         plane.reload(policy=policy(clouds="no such name"))
         plane.wait_for_line("policy.calls[0].clouds[0]: matches no name", "the policy in force stays")
-        assert status(plane)["robot"].peers.version_sent == told
+        assert plane.status()["robot"].peers.version_sent == told
         plane.reload(policy=policy(clouds="cloud-a"), lease_ms=50_000)
         plane.wait_for_line("lease_ms changed too, which needs a restart")
         plane.wait_for_line("the policy is the same as before")
@@ -82,7 +71,7 @@ def test_refused_offers_are_logged_once_and_shown(plane: ControlPlaneProcess) ->
             'missing under offers: {clouds: ["cloud-b"], services: ["/plan"]}',
         )
         b.peers()
-        shown = {name: found.refused_offers for name, found in status(plane).items()}
+        shown = {name: found.refused_offers for name, found in plane.status().items()}
         assert shown == {"cloud-a": (), "cloud-b": ("/plan",), "robot": ()}
     assert sum("cloud-b offers" in line for line in plane.lines) == 1
 

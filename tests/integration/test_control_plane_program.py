@@ -1,0 +1,120 @@
+"""The control plane as a program: configuration, exit codes, signals, systemd."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import grpc
+import pytest
+import yaml
+
+from protos.model import (
+    Welcome,
+)
+from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_cleanly(tmp_path: Path, number: signal.Signals) -> None:
+    with ControlPlaneProcess(tmp_path) as plane, cloud(plane.address, "cloud-a") as a:
+        a.expect(Welcome)
+        assert plane.stop(number) == 0
+        code, details = a.end()
+        assert code is grpc.StatusCode.UNAVAILABLE
+        assert "stopping" in details
+        assert plane.lines[-1].endswith("stopped")
+        assert not [line for line in plane.lines if "Traceback" in line]
+
+
+def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notified:
+        notified.bind(str(tmp_path / "notify"))
+        notified.settimeout(PATIENCE_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        with ControlPlaneProcess(tmp_path) as plane:
+            assert notified.recv(100) == b"READY=1"
+            assert plane.stop() == 0
+            assert notified.recv(100) == b"STOPPING=1"
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "controlplane", *arguments], capture_output=True, text=True, check=False
+    )
+
+
+def test_a_bad_configuration_ends_with_2_and_one_line(tmp_path: Path) -> None:
+    config = tmp_path / "bad.yaml"
+    config.write_text("lease_sm: 5000\n")
+    done = run("--config", str(config))
+    assert done.returncode == 2
+    assert done.stderr == f"plr-controlplane: {config}: lease_sm: unknown key; did you mean lease_ms?\n"
+    missing = run("--config", str(tmp_path / "none.yaml"))
+    assert missing.returncode == 2
+    assert missing.stderr.count("\n") == 1
+
+
+def test_check_config_and_version(tmp_path: Path) -> None:
+    config = tmp_path / "good.yaml"
+    config.write_text("insecure: true\nlisten: 127.0.0.1:0\n")
+    done = run("--config", str(config), "--check-config")
+    assert (done.returncode, done.stdout) == (0, f"{config}: ok\n")
+    assert re.fullmatch(r"plr-controlplane \S+ \(protocol 2\)\n", run("--version").stdout)
+    assert run().returncode == 2
+
+
+def test_insecure_mode_is_refused_where_others_reach_it_unless_one_knows(tmp_path: Path) -> None:
+    config = tmp_path / "exposed.yaml"
+    config.write_text("insecure: true\n")
+    done = run("--config", str(config), "--check-config")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"plr-controlplane: {config}: listen: expected a loopback address with insecure")
+    assert run("--config", str(config), "--check-config", "--insecure-i-know").returncode == 0
+
+
+def test_without_certificates_and_without_the_word_insecure_it_does_not_start(tmp_path: Path) -> None:
+    config = tmp_path / "neither.yaml"
+    cases = {"": "tls_dir: expected the folder", "insecure: true\ntls_dir: /etc/plr/tls": "one or the other"}
+    for text, told in cases.items():
+        config.write_text(text)
+        done = run("--config", str(config))
+        assert done.returncode == 2
+        assert told in done.stderr
+        assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("key", "kind"),
+    [("listen", socket.SOCK_STREAM), ("stun_listen", socket.SOCK_DGRAM), ("metrics_listen", socket.SOCK_STREAM)],
+)
+def test_an_address_in_use_ends_with_1_and_names_the_key(tmp_path: Path, key: str, kind: socket.SocketKind) -> None:
+    with socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind(("127.0.0.1", 0))
+        if kind is socket.SOCK_STREAM:
+            taken.listen()
+        config = tmp_path / "controlplane.yaml"
+        free = dict.fromkeys(("listen", "stun_listen", "metrics_listen"), "127.0.0.1:0")
+        config.write_text(yaml.safe_dump({"insecure": True} | free | {key: f"127.0.0.1:{taken.getsockname()[1]}"}))
+        done = run("--config", str(config))
+    assert done.returncode == 1
+    assert f"{key}: cannot listen on" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_schema_is_printed() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "controlplane.cli", "config", "schema", "controlplane"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "lease_ms" in json.loads(done.stdout)["properties"]

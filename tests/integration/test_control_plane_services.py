@@ -1,0 +1,105 @@
+"""What a control plane serves beside its streams: health, reflection, STUN, metrics, status."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+
+import grpc
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+
+from protos.model import (
+    Heartbeat,
+    MappingSet,
+    OutcomeReport,
+    PeerSet,
+    Report,
+    SyncState,
+)
+from protos.stun import MessageClass, StunMessage, decode, encode
+from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
+from tests.unit.controlplane.samples import PLAN
+
+
+def test_health_and_reflection(plane: ControlPlaneProcess) -> None:
+    with grpc.insecure_channel(plane.address) as channel:
+        health = health_pb2_grpc.HealthStub(channel)
+        for service in ("", "plr.v1.ControlPlane", "plr.v1.Admin"):
+            answer = health.Check(health_pb2.HealthCheckRequest(service=service), timeout=PATIENCE_S)
+            assert answer.status == health_pb2.HealthCheckResponse.SERVING
+        reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
+        requests = iter([reflection_pb2.ServerReflectionRequest(list_services="")])
+        (listed,) = reflection.ServerReflectionInfo(requests, timeout=PATIENCE_S)
+        names = {service.name for service in listed.list_services_response.service}
+        assert {"plr.v1.ControlPlane", "plr.v1.Admin", "grpc.health.v1.Health"} <= names
+
+
+def test_stun_is_answered(plane: ControlPlaneProcess) -> None:
+    host, port = plane.stun.rsplit(":", 1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        sock.settimeout(PATIENCE_S)
+        sock.sendto(encode(StunMessage(MessageClass.REQUEST, bytes(range(12)))), (host, int(port)))
+        answer = decode(sock.recv(2048))
+        assert answer.message_class is MessageClass.SUCCESS
+        assert answer.xor_mapped_address == sock.getsockname()
+
+
+def metrics_text(plane: ControlPlaneProcess) -> str:
+    with urllib.request.urlopen(f"http://{plane.metrics}/metrics", timeout=PATIENCE_S) as answer:
+        return str(answer.read().decode())
+
+
+def test_metrics_of_the_contract_are_there_and_promtool_finds_nothing(plane: ControlPlaneProcess) -> None:
+    with cloud(plane.address, "cloud-a"), robot(plane.address, "measured") as r:
+        r.peers("cloud-a")
+        nacked = r.expect(MappingSet, lambda message: bool(message.services[0].assignments))
+        r.nack(nacked, "no")
+        r.send(Report(outcomes=(OutcomeReport(PLAN, ok=3, deadline_missed=1),)))
+        patterns = {
+            r'plr_connected_sidecars\{role="robot"\} 1\.0',
+            r'plr_nacks_total\{resource="mapping"\} [1-9]',
+            r'plr_observed_miss_ratio\{robot="measured",service="/plan"\} 0\.25',
+            r'plr_predicted_miss_probability\{robot="measured",service="/plan"\} 0\.',
+            r'plr_resource_sync\{resource="mapping",state="rejected"\} 1\.0',
+            r"plr_plan_excess_interfaces 1\.0",
+            r"plr_solve_duration_seconds_count [1-9]",
+        }
+        end = time.monotonic() + PATIENCE_S
+        missing = patterns
+        while missing and time.monotonic() < end:
+            time.sleep(0.1)
+            r.send(Heartbeat())
+            text = metrics_text(plane)
+            missing = {pattern for pattern in patterns if not re.search(pattern, text)}
+        assert not missing
+    checked = subprocess.run(["promtool", "check", "metrics"], input=text, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    assert checked.stdout + checked.stderr == ""
+    assert "_created" not in text
+
+
+def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
+    with cloud(plane.address, "cloud-a"), robot(plane.address) as r:
+        r.nack(r.expect(PeerSet, lambda message: bool(message.peers)), "not\nthis\tone")
+        plane.wait_for_state("robot", SyncState.REJECTED)
+        table = subprocess.run(
+            [sys.executable, "-m", "controlplane.cli", "status", "--insecure", "--address", plane.address],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        as_json = subprocess.run(
+            [sys.executable, "-m", "controlplane.cli", "status", "--insecure", "--address", plane.address, "--json"],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+    assert re.search(r"^robot +robot +open .* rejected ", table, re.MULTILINE)
+    assert "not this one" in table
+    assert '"SYNC_STATE_REJECTED"' in as_json
