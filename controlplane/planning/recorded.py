@@ -10,7 +10,7 @@ import numpy as np
 from google.protobuf import json_format
 
 from controlplane.core.fading import FadedHistogram, sum_exceeds
-from controlplane.core.objectives import choice_costs, joint_miss
+from controlplane.core.objectives import joint_miss, objective_costs
 from controlplane.core.posterior import IGNORANCE
 from controlplane.core.problem import Block, BlockKey, Objective
 from controlplane.planning.prospects import Prospect
@@ -77,7 +77,7 @@ class RecordedService:
             return []
         block = self._block(deadline_s)
         choices = _choices(block)
-        costs = choice_costs(Objective.JOINT, block, choices)
+        costs = objective_costs(Objective.JOINT, block, choices)
         best: dict[tuple[int, int], int] = {}
         for row in np.argsort(costs, kind="stable").tolist():
             used = [server for server in choices[row].tolist() if server >= 0]
