@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, NewType
+from typing import TYPE_CHECKING, NewType
+
+from protos.preferences import EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
     from protos.histogram import Histogram
+    from protos.preferences import InterfaceLabel
 
 PROTOCOL_VERSION = 2
 """Version of the control stream and of the datagram layout; peers of another version are refused."""
@@ -47,10 +50,6 @@ NO_POLICY = 1
 
 MAX_CREDENTIAL_BYTES = 2048
 """Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
-
-DEFAULT_CHARGE = 1.0
-"""What a request over an interface costs unless said otherwise: so that a service that is to be cheap sends few copies
-where nobody told what they cost."""
 
 MAX_JOINTS = 1024
 """Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers."""
@@ -98,17 +97,6 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class InterfaceLabel:
-    """What a robot says of one of its interfaces, for the choice of paths."""
-
-    interface: InterfaceName
-    carrier: str = ""
-    """Whose network it uses; interfaces with the same one fail together. Empty: not known."""
-    charge: float = DEFAULT_CHARGE
-    """What a request over it costs, in any one currency."""
-
-
-@dataclass(frozen=True, slots=True)
 class ServiceOffer:
     """A service that a cloud sidecar can run; `capacity` 0 means no limit."""
 
@@ -117,21 +105,6 @@ class ServiceOffer:
     capacity: int = 0
     charge: float = 0.0
     """What a request costs that it runs, in the currency of the interfaces' charges."""
-
-
-class Copies(NamedTuple):
-    """How many copies of a request are sent, each over another interface; 0: as many as there are interfaces."""
-
-    least: int = 0
-    most: int = 0
-
-    def over(self, interfaces: int) -> Copies:
-        """The numbers for so many interfaces."""
-        return Copies(*(min(count or interfaces, interfaces) for count in self))
-
-
-EVERY_INTERFACE = Copies()
-AT_MOST_EVERY_INTERFACE = Copies(least=1)
 
 
 @dataclass(frozen=True, slots=True)

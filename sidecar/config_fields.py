@@ -1,16 +1,16 @@
-"""The kinds of names and globs that the sidecar's configuration holds."""
+"""What the sections of the sidecar's configuration are made of."""
 
 from __future__ import annotations
 
 import re
 from typing import Annotated
 
-from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
 from protos.convert.fields import MAX_COPIES
 from protos.errors import DecodeError
-from protos.model import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 from protos.names import domain_label, node_name
+from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 
 _INTERFACE = re.compile(r"[^\s/]{1,15}")
 _INTERFACE_GLOB = re.compile(r"[^\s/]{1,64}")
@@ -73,6 +73,18 @@ def _check_copies(value: object) -> Copies:
     if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_COPIES:
         return Copies(value, value)
     raise ValueError(f"expected each, at_most or a number from 1 to {MAX_COPIES}, got {value!r}")
+
+
+# A YAML list becomes a tuple, a word an enum: strictness would refuse both. What the list holds stays strict.
+converted = Field(strict=False)
+
+
+class Section(BaseModel):
+    """A section: checked strictly, then frozen."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 SidecarName = Annotated[str, AfterValidator(_check_node_name)]

@@ -31,8 +31,9 @@ from sidecar.outage_log import OutageLog
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Candidate, InterfaceLabel, ServiceOffer, ServiceUse
+    from protos.model import Candidate, ServiceOffer, ServiceUse
     from protos.plr.v1 import control_pb2
+    from protos.preferences import InterfaceLabel
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
     from sidecar.core.control_session import ControlSession, ControlStats

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from protos.config_file import key_path
 from protos.errors import ConfigError
-from protos.identity import IdentityRole  # noqa: TC001 - pydantic reads the annotation
+from protos.identity import IdentityRole
 from protos.names import node_name
 
 if TYPE_CHECKING:

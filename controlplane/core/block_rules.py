@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from controlplane.core.problem import Target
-from protos.model import InterfaceLabel
+from protos.preferences import InterfaceLabel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -23,16 +23,8 @@ if TYPE_CHECKING:
     from controlplane.core.permits import Group, Permits
     from controlplane.core.problem import Block, Objective
     from controlplane.core.registry import Sidecar
-    from protos.model import (
-        InterfaceLabel,
-        InterfaceName,
-        NodeName,
-        Registration,
-        Report,
-        ServiceName,
-        ServiceOffer,
-        ServiceUse,
-    )
+    from protos.model import InterfaceName, NodeName, Registration, Report, ServiceName, ServiceOffer, ServiceUse
+    from protos.preferences import InterfaceLabel
 
 SLICE_PAIRS = 200
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""

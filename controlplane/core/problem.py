@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.posterior import Estimate
-from protos.model import EVERY_INTERFACE, Copies
+from protos.preferences import EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -23,16 +23,8 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import (
-        Candidate,
-        CandidateSet,
-        InterfaceLabel,
-        ServiceName,
-        ServiceOffer,
-        ServiceSet,
-        ServiceUse,
-        SessionId,
-    )
+    from protos.model import Candidate, CandidateSet, ServiceName, ServiceOffer, ServiceSet, ServiceUse, SessionId
+    from protos.preferences import InterfaceLabel
 
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""

@@ -29,9 +29,7 @@ from protos.model import (
     CallPermit,
     Candidate,
     CandidateKind,
-    Copies,
     InterfaceId,
-    InterfaceLabel,
     Peer,
     Role,
     ServiceName,
@@ -41,6 +39,7 @@ from protos.model import (
 )
 from protos.names import domain_label, interface_name, node_name, service_name, type_name
 from protos.plr.v1 import types_pb2
+from protos.preferences import Copies, InterfaceLabel
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,7 +10,7 @@ import fnmatch
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model import EVERY_INTERFACE, Copies
+from protos.preferences import EVERY_INTERFACE, Copies
 from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:

@@ -23,14 +23,8 @@ from controlplane.core.problem import (
     fleet_excess,
     is_valid,
 )
-from protos.model import (
-    AT_MOST_EVERY_INTERFACE,
-    EVERY_INTERFACE,
-    Copies,
-    InterfaceName,
-    NodeName,
-    ServiceName,
-)
+from protos.model import InterfaceName, NodeName, ServiceName
+from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
     import random

@@ -18,8 +18,6 @@ from controlplane.core.registry import Sidecar
 from protos.model import (
     Assignment,
     Candidate,
-    Copies,
-    InterfaceLabel,
     InterfaceName,
     JointReport,
     NodeName,
@@ -31,6 +29,7 @@ from protos.model import (
     ServiceSet,
     ServiceUse,
 )
+from protos.preferences import Copies, InterfaceLabel
 from tests.unit.controlplane.samples import (
     PLAN,
     candidate,

@@ -15,7 +15,6 @@ from protos.model import (
     ALL_CALLS,
     Assignment,
     CallPermit,
-    Copies,
     InterfaceName,
     NodeName,
     ServiceMapping,
@@ -23,6 +22,7 @@ from protos.model import (
     ServiceSet,
     ServiceUse,
 )
+from protos.preferences import Copies
 from tests.unit.controlplane.samples import PLAN, interfaces, registration, stream, use
 
 KEY = BlockKey(NodeName("robot"), PLAN)

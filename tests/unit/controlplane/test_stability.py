@@ -11,7 +11,8 @@ from controlplane.core.plan import Plan, make_plan, price
 from controlplane.core.problem import FleetKey, Objective, Problem, Target
 from controlplane.core.stability import CHANGE_WINDOW_S, MAX_CHANGES, Stability
 from controlplane.matcher import solve
-from protos.model import AT_MOST_EVERY_INTERFACE, NodeName
+from protos.model import NodeName
+from protos.preferences import AT_MOST_EVERY_INTERFACE
 from tests.unit.controlplane.problems import PLAN, block, choices_of, random_problem
 
 

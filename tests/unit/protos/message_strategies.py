@@ -33,11 +33,9 @@ from protos.model import (
     CandidateKind,
     CandidateSet,
     ControlMessage,
-    Copies,
     Drain,
     Heartbeat,
     InterfaceId,
-    InterfaceLabel,
     InterfaceName,
     JointReport,
     LatencyReport,
@@ -67,6 +65,7 @@ from protos.model import (
     Version,
     Welcome,
 )
+from protos.preferences import Copies, InterfaceLabel
 
 T = TypeVar("T")
 

@@ -10,15 +10,8 @@ from pydantic import ValidationError
 
 from protos.errors import ConfigError
 from protos.identity import Identity, IdentityRole
-from protos.model import (
-    AT_MOST_EVERY_INTERFACE,
-    EVERY_INTERFACE,
-    Copies,
-    InterfaceLabel,
-    InterfaceName,
-    NodeName,
-    Role,
-)
+from protos.model import InterfaceName, NodeName, Role
+from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
 from sidecar.config import (
     DEFAULT_CLOUD_UDP_PORT,
     LogLevel,

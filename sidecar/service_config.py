@@ -1,0 +1,156 @@
+"""The sections `services` and `networks` of the sidecar's configuration."""
+
+from __future__ import annotations
+
+import enum
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+
+from protos.convert.fields import MAX_CHARGE
+from protos.model import Role
+from protos.preferences import AT_MOST_EVERY_INTERFACE, DEFAULT_CHARGE, EVERY_INTERFACE
+from sidecar.config_fields import (
+    CopiesWanted,
+    DomainLabel,
+    InterfacePattern,
+    RepairShare,
+    Section,
+    ServicePattern,
+    converted,
+)
+from sidecar.core.priority import Priority
+from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sidecar.core.redundancy import Redundancy
+
+MAX_DEADLINE_MS = 60_000
+"""Where the latency histogram ends: a miss of a longer deadline could not be predicted."""
+
+MIN_DEFAULT_LIFETIME_MS = 10_000.0
+"""A request outlives its deadline at least until a dead path is noticed and another one has tried."""
+
+LIFETIME_PER_DEADLINE = 10.0
+"""Default lifetime, in deadlines."""
+
+CLOUD_LIFETIME_MS = 60_000.0
+"""How long a cloud sidecar waits for a local server by default."""
+
+_UNLIMITED = 0
+_MS_PER_S = 1000.0
+_MAX_LIFETIME_MS = MAX_LIFETIME_S * _MS_PER_S
+
+
+class PriorityWord(enum.Enum):
+    """Which of a robot's services go first."""
+
+    LOW = "low"
+    NORMAL = "normal"
+    HIGH = "high"
+
+
+class ModeWord(enum.Enum):
+    """What a service's mapping is chosen for."""
+
+    MOST_RELIABLE = "most_reliable"
+    CHEAPEST = "cheapest"
+
+
+class NetworkConfig(Section):
+    """What lies behind interfaces; the first entry that matches an interface's name decides."""
+
+    interface: InterfacePattern
+    """Name or glob."""
+    carrier: DomainLabel | None = None
+    """Whose network it is: interfaces with the same carrier are taken to fail together."""
+    cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] = DEFAULT_CHARGE
+    """What a copy of a request over it costs, in any one currency; for services with mode cheapest."""
+
+
+class ServiceConfig(Section):
+    """One service, or all whose name matches a glob; the first entry that matches a name decides."""
+
+    name: ServicePattern
+    """Full name such as /plan_path, or a glob such as /arm/*."""
+    deadline_ms: Annotated[float, Field(gt=0, le=MAX_DEADLINE_MS)] | None = None
+    """Robot, required: an answer is in time within this many milliseconds."""
+    lifetime_ms: Annotated[float, Field(gt=0, le=_MAX_LIFETIME_MS)] | None = None
+    """Milliseconds after which an unanswered request is given up; more than deadline_ms.
+
+    Robot: by default 10 deadlines, between 10000 and 300000. Cloud: how long a local server is waited for, by default
+    60000."""
+    idempotent: bool | None = None
+    """Robot: copies of one request may run on several servers. Default false."""
+    drop_late: bool | None = None
+    """Robot: an answer after the deadline is not delivered. Default false."""
+    priority: Annotated[PriorityWord | None, converted] = None
+    """Robot: low, normal or high; what is higher never waits for what is lower. Default normal."""
+    fec: RepairShare | None = None
+    """Repair symbols for each symbol of what is sent from here (robot: requests, cloud: answers), 0 to 1, or off, or
+    auto: as many as the loss measured on the path asks for. Default auto."""
+    copies: CopiesWanted | None = None
+    """Robot: over how many interfaces copies of a request are sent: each, at_most (each, but rather none than one too
+    many for a server or into a failure domain already used), or a number. Default each; with mode cheapest at_most."""
+    mode: Annotated[ModeWord | None, converted] = None
+    """Robot: most_reliable or cheapest, as long as target_miss is kept. Default most_reliable."""
+    target_miss: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Robot, with mode cheapest: the largest predicted probability that a request misses its deadline."""
+    capacity_interfaces: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    """Cloud: how many robot interfaces may be mapped to this server for the service; none: no limit."""
+    cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] | None = None
+    """Cloud: what a request costs that runs here, in the currency of the robots' networks. Default 0."""
+
+    def rule(self, role: Role) -> ServiceRule:
+        """As the cores want it."""
+        if role is Role.CLOUD:
+            lifetime_ms = self.lifetime_ms or CLOUD_LIFETIME_MS
+            deadline_ms = lifetime_ms
+        else:
+            deadline_ms = self.deadline_ms or MAX_DEADLINE_MS
+            default_ms = min(max(LIFETIME_PER_DEADLINE * deadline_ms, MIN_DEFAULT_LIFETIME_MS), _MAX_LIFETIME_MS)
+            lifetime_ms = self.lifetime_ms or default_ms
+        return ServiceRule(
+            pattern=self.name,
+            deadline_s=deadline_ms / _MS_PER_S,
+            lifetime_s=lifetime_ms / _MS_PER_S,
+            idempotent=bool(self.idempotent),
+            drop_late=bool(self.drop_late),
+            priority=Priority[(self.priority or PriorityWord.NORMAL).name],
+            fec=_redundancy(self.fec),
+            capacity=self.capacity_interfaces or _UNLIMITED,
+            copies=self.copies or (AT_MOST_EVERY_INTERFACE if self.target_miss else EVERY_INTERFACE),
+            target_miss=self.target_miss or 0.0,
+            charge=self.cost_per_request or 0.0,
+        )
+
+    def problems(self, role: Role) -> Iterator[tuple[str, str]]:
+        """What single keys cannot know: each key that is wrong in this role or beside others, and why."""
+        if role is Role.CLOUD:
+            for key in ("deadline_ms", "idempotent", "drop_late", "priority", "copies", "mode", "target_miss"):
+                if getattr(self, key) is not None:
+                    yield key, "expected on a robot only: it is the robot's sidecar that decides this"
+            return
+        if self.capacity_interfaces is not None:
+            yield "capacity_interfaces", "expected on a cloud only: it limits what that server takes"
+        if self.cost_per_request is not None:
+            yield "cost_per_request", "expected on a cloud only: a robot's costs are its networks'"
+        if self.mode is ModeWord.CHEAPEST and self.target_miss is None:
+            yield "target_miss", "expected a probability beside mode: cheapest, but missing"
+        if self.mode is not ModeWord.CHEAPEST and self.target_miss is not None:
+            yield "target_miss", "expected only beside mode: cheapest"
+        if self.deadline_ms is None:
+            yield "deadline_ms", "expected milliseconds, but missing"
+        elif self.lifetime_ms is not None and self.lifetime_ms <= self.deadline_ms:
+            yield (
+                "lifetime_ms",
+                f"expected more than deadline_ms ({self.deadline_ms:g}), got {self.lifetime_ms:g}",
+            )
+
+
+def _redundancy(fec: float | str | None) -> Redundancy:
+    if fec == "off":
+        return 0.0
+    return None if isinstance(fec, str) else fec
