@@ -28,7 +28,8 @@ def render(explanation: Explanation) -> str:
     """The mapping in force, what it rests on, what else there is, and how it came about."""
     found = explanation
     kind = "idempotent" if found.idempotent else "not idempotent: one server at a time"
-    lines = [f"{found.robot} {found.service}: deadline {_ms(found.deadline_s)}, {kind}, objective {found.objective}"]
+    aim = f"cheapest that misses at most {found.target_miss:g}" if found.target_miss else f"objective {found.objective}"
+    lines = [f"{found.robot} {found.service}: deadline {_ms(found.deadline_s)}, {kind}, {aim}"]
     for title, section in (
         ("mapping in force", list(_mapping(found))),
         ("pairs (times in ms, * in force)", list(_pairs(found))),
@@ -47,7 +48,8 @@ def _mapping(found: Explanation) -> Iterator[str]:
         return
     yield _paths(found.mapping.assignments)
     observed = f", observed lately {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
-    yield f"predicted miss {_probability(found.mapping.predicted_miss)}{observed}"
+    charge = f", a request costs {found.charge:g}" if found.charge is not None else ""
+    yield f"predicted miss {_probability(found.mapping.predicted_miss)}{observed}{charge}"
     age = f", goes there for {_age(found.in_force_s)}" if found.in_force_s is not None else ""
     refused = f" ({found.sync.error})" if found.sync.error else ""
     yield f"version {found.sync.version_sent}, {found.sync.state.value}{refused}{age}"
@@ -64,8 +66,8 @@ def _pairs(found: Explanation) -> Iterator[str]:
 def _pair(pair: PairExplanation) -> tuple[str, ...]:
     return (
         "*" if pair.chosen else "",
-        pair.path.interface,
-        pair.path.server,
+        _labelled(pair.path.interface, pair.carrier),
+        _labelled(pair.path.server, pair.region),
         {True: "up", False: "DOWN", None: "unknown"}[pair.up],
         _probability(pair.miss.mean) if pair.miss is not None else "-",
         f"{_probability(pair.miss.low)} .. {_probability(pair.miss.high)}" if pair.miss is not None else "-",
@@ -75,6 +77,10 @@ def _pair(pair: PairExplanation) -> tuple[str, ...]:
         *_quantiles(pair.latency),
         *_quantiles(pair.compute),
     )
+
+
+def _labelled(name: str, label: str) -> str:
+    return f"{name} ({label})" if label else name
 
 
 def _quantiles(histogram: Histogram) -> tuple[str, str]:
@@ -107,7 +113,8 @@ def _alternative(other: Alternative) -> tuple[str, ...]:
         case AlternativeKind.WITHOUT:
             what = f"without {other.without}"
     paths = _paths(other.assignments)
-    return what, _probability(other.predicted_miss), f"{paths} ({other.note})" if other.note else paths
+    charge = f"costs {other.charge:g}" if other.charge is not None else ""
+    return what, _probability(other.predicted_miss), charge, f"{paths} ({other.note})" if other.note else paths
 
 
 def _change(change: MappingChange) -> tuple[str, ...]:

@@ -45,6 +45,10 @@ class PairExplanation:
     """Of requests, from submit to this copy's response."""
     compute: Histogram
     """What the server needed for the service, whoever asked."""
+    carrier: str = ""
+    """Whose network the interface uses; empty if nobody said."""
+    region: str = ""
+    """Where the server stands; empty if nobody said."""
 
 
 class Correlation(enum.Enum):
@@ -98,6 +102,8 @@ class Alternative:
     without: NodeName | None = None
     note: str = ""
     """What speaks against it, in words."""
+    charge: float | None = None
+    """What a request would cost with all its copies; None unless the service is to be cheap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +131,10 @@ class Explanation:
     """As last sent; None if nothing was."""
     in_force_s: float | None = None
     """Since when requests go where they go; None if that is forgotten."""
+    target_miss: float = 0.0
+    """Above 0: the service goes where it is cheapest as long as it misses no more often."""
+    charge: float | None = None
+    """What a request costs with all its copies; None unless the service is to be cheap."""
     observed_miss: float | None = None
     """Share of recent requests that missed the deadline or failed; None without any."""
     pairs: tuple[PairExplanation, ...] = ()

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.choices import MAX_LISTED, list_choices, own_excess
-from controlplane.core.costs import block_cost, choice_costs
+from controlplane.core.costs import block_cost, charge, choice_costs
+from controlplane.core.domains import shared_domains
 from controlplane.core.objectives import joint_miss
 from controlplane.core.plan import choice_of
 from controlplane.core.problem import FleetKey, block_excess, loads, reachable
@@ -77,7 +78,8 @@ class _Alternatives:
         pairs = zip(block.interfaces, choice, strict=True)
         assignments = tuple(Assignment(nic, block.servers[server]) for nic, server in pairs if server is not None)
         note = "; ".join(self._against(choice)) if kind is AlternativeKind.OTHER else ""
-        return Alternative(kind, assignments, joint_miss(block, choice), without, note)
+        cost = charge(block.target, choice) if block.target is not None else None
+        return Alternative(kind, assignments, joint_miss(block, choice), without, note, cost)
 
     def _against(self, choice: Choice) -> Iterator[str]:
         block = self._block
@@ -91,6 +93,9 @@ class _Alternatives:
         ]
         if full:
             yield f"other robots leave no room on {', '.join(full)}"
+        shared = shared_domains(block, choice)
+        if shared:
+            yield f"copies share {', '.join(shared)}"
         if self._running is None or excess or full:
             return
         objective = self._problem.objective

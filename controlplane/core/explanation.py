@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from controlplane.core.estimator import Estimator
     from controlplane.core.mapping_history import History
     from controlplane.core.picture import Picture
-    from controlplane.core.plan import Plan
+    from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.posterior import Estimate
     from controlplane.core.problem import Block
     from controlplane.core.registry import Registry, Sidecar
@@ -93,6 +93,8 @@ def explain(
         sync=snapshots.mapping.status,
         in_force_s=now - history.since if history is not None else None,
         observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
+        target_miss=use.target_miss,
+        charge=_charge(block, plan.blocks.get(key)),
         pairs=_pairs(paths, block, estimator, key, mapping, now),
         pairs_left_out=max(0, len(paths) - MAX_PAIRS),
         joints=_joints(block, estimator, now) if block is not None else (),
@@ -139,6 +141,8 @@ def _pairs(
                 rtt=evidence.rtt,
                 latency=evidence.latency,
                 compute=evidence.compute,
+                carrier=_carrier(block, path),
+                region=_region(block, path),
             )
         )
     return tuple(found)
@@ -175,7 +179,7 @@ def _joints(block: Block, estimator: Estimator, now: float) -> tuple[JointExplan
             both_miss=belief,
             product=product,
             correlation=_correlation(belief, product, requests, both_missed),
-            shared=_shared(first, second),
+            shared=_shared(block, first, second),
         )
         for (first, second, requests, both_missed, product, _), belief in zip(raced, beliefs, strict=True)
     )
@@ -189,13 +193,34 @@ def _correlation(both_miss: Belief, product: float, requests: float, both_missed
     return Correlation.INDEPENDENT
 
 
-def _shared(first: Assignment, second: Assignment) -> tuple[str, ...]:
+def _shared(block: Block, first: Assignment, second: Assignment) -> tuple[str, ...]:
+    """What two paths have in common, the narrowest of each end."""
     shared = []
     if first.interface == second.interface:
         shared.append(f"interface {first.interface}")
+    elif (carrier := _carrier(block, first)) and carrier == _carrier(block, second):
+        shared.append(f"carrier {carrier}")
     if first.server == second.server:
         shared.append(f"server {first.server}")
+    elif (region := _region(block, first)) and region == _region(block, second):
+        shared.append(f"region {region}")
     return tuple(shared)
+
+
+def _carrier(block: Block | None, path: Assignment) -> str:
+    if block is None or not block.carriers or path.interface not in block.interfaces:
+        return ""
+    return block.carriers[block.interfaces.index(path.interface)]
+
+
+def _region(block: Block | None, path: Assignment) -> str:
+    if block is None or not block.regions or path.server not in block.servers:
+        return ""
+    return block.regions[block.servers.index(path.server)]
+
+
+def _charge(block: Block | None, plan: BlockPlan | None) -> float | None:
+    return plan.charge if block is not None and block.target is not None and plan is not None else None
 
 
 def _changes(history: History | None, now: float) -> tuple[MappingChange, ...]:

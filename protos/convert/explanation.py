@@ -93,6 +93,8 @@ def explanation_from_proto(message: admin_pb2.ExplainResponse) -> Explanation:
         sync=resource_from_proto(message.sync),
         in_force_s=_age(message.in_force_us, "in_force_us") if message.HasField("in_force_us") else None,
         observed_miss=_observed(message),
+        target_miss=probability(message.target_miss, "target_miss"),
+        charge=_charge(message),
         pairs=each(message.pairs, MAX_PAIRS, "pairs", _pair_from_proto),
         pairs_left_out=at_most(message.pairs_left_out, MAX_EVENTS, "pairs_left_out"),
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
@@ -114,6 +116,8 @@ def explanation_to_proto(explanation: Explanation) -> admin_pb2.ExplainResponse:
         sync=resource_to_proto(found.sync),
         in_force_us=microseconds(found.in_force_s) if found.in_force_s is not None else None,
         observed_miss=found.observed_miss,
+        target_miss=found.target_miss,
+        charge=found.charge,
         pairs=map(_pair_to_proto, found.pairs),
         pairs_left_out=found.pairs_left_out,
         joints=map(_joint_to_proto, found.joints),
@@ -124,6 +128,10 @@ def explanation_to_proto(explanation: Explanation) -> admin_pb2.ExplainResponse:
 
 def _observed(message: admin_pb2.ExplainResponse) -> float | None:
     return probability(message.observed_miss, "observed_miss") if message.HasField("observed_miss") else None
+
+
+def _charge(message: admin_pb2.ExplainResponse | admin_pb2.Alternative) -> float | None:
+    return _weight(message.charge, "charge") if message.HasField("charge") else None
 
 
 def _age(age_us: int, field: str) -> float:
@@ -161,6 +169,8 @@ def _pair_from_proto(message: admin_pb2.ExplainedPair) -> PairExplanation:
         rtt=histogram_from_proto(message.rtt),
         latency=histogram_from_proto(message.latency),
         compute=histogram_from_proto(message.compute),
+        carrier=text(message.carrier, "carrier"),
+        region=text(message.region, "region"),
     )
 
 
@@ -175,6 +185,8 @@ def _pair_to_proto(pair: PairExplanation) -> admin_pb2.ExplainedPair:
         rtt=histogram_to_proto(pair.rtt),
         latency=histogram_to_proto(pair.latency),
         compute=histogram_to_proto(pair.compute),
+        carrier=clean_text(pair.carrier),
+        region=clean_text(pair.region),
     )
 
 
@@ -216,6 +228,7 @@ def _alternative_from_proto(message: admin_pb2.Alternative) -> Alternative:
         predicted_miss=probability(message.predicted_miss, "predicted_miss"),
         without=node_name(message.without, "without") if message.without else None,
         note=text(message.note, "note"),
+        charge=_charge(message),
     )
 
 
@@ -226,6 +239,7 @@ def _alternative_to_proto(alternative: Alternative) -> admin_pb2.Alternative:
         predicted_miss=alternative.predicted_miss,
         without=alternative.without or "",
         note=clean_text(alternative.note),
+        charge=alternative.charge,
     )
 
 

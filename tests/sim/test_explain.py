@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from controlplane.core.explanation import UnknownNameError
 from controlplane.explanation_text import render
 from protos.explanation import AlternativeKind, Correlation, Explanation
-from protos.model import Assignment, InterfaceName, JointReport, NodeName, Report, ServiceName, SyncState
+from protos.model import (
+    AT_MOST_EVERY_INTERFACE,
+    Assignment,
+    CandidateSet,
+    InterfaceLabel,
+    InterfaceName,
+    JointReport,
+    NodeName,
+    Report,
+    Role,
+    ServiceName,
+    ServiceSet,
+    SyncState,
+)
 from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import PLAN, histogram, latency, path
+from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 
 ROBOT = NodeName("robot")
 LATENCY_S = {("wlan0", "a"): 0.02, ("wlan0", "b"): 0.05, ("wwan0", "a"): 0.04, ("wwan0", "b"): 0.03}
@@ -101,6 +116,36 @@ def test_it_remembers_what_changed_and_why(world: World) -> None:
     down = next(pair for pair in after.pairs if pair.path == on("wlan0", "a"))
     assert (down.up, down.miss) == (False, None)
     assert after.changes[0].mapping.reason in render(after)
+
+
+def test_what_paths_share_and_what_they_cost_is_told() -> None:
+    world = World()
+    for name in ("a", "b"):
+        cloud = world.join(replace(registration(name, Role.CLOUD), region="eu"))
+        world.say(cloud, CandidateSet(interfaces("eth0")))
+        world.say(cloud, ServiceSet((offer(),)))
+    robot = world.join(registration("robot"))
+    labels = tuple(
+        InterfaceLabel(InterfaceName(nic), "blue", charge) for nic, charge in (("wlan0", 1.0), ("wwan0", 3.0))
+    )
+    world.say(robot, CandidateSet(interfaces("wlan0", "wwan0"), labels))
+    world.say(robot, ServiceSet((), (replace(use(), target_miss=0.001, copies=AT_MOST_EVERY_INTERFACE),)))
+    world.all_up(robot, ("a", "b"))
+    world.run(2.0)
+    measured(world, robot, seconds=20, misses={("wlan0", "a"): 0.1, ("wwan0", "b"): 0.1})
+    found = asked(world)
+    assert found.target_miss == 0.001
+    assert found.charge == 1.0
+    assert found.mapping is not None
+    assert found.mapping.assignments == (on("wlan0", "b"),)
+    (joint,) = found.joints
+    assert joint.shared == ("carrier blue", "region eu")
+    other = next(other for other in found.alternatives if len(other.assignments) == 2)
+    assert (other.charge, other.note) == (4.0, "copies share region eu, carrier blue")
+    text = render(found)
+    assert "cheapest that misses at most 0.001" in text
+    assert "a request costs 1" in text
+    assert "wlan0 (blue)" in text
 
 
 def test_a_service_without_servers_is_explained_too(world: World) -> None:

@@ -295,11 +295,16 @@ class ExplainedPair(_message.Message):
     RTT_FIELD_NUMBER: _builtins.int
     LATENCY_FIELD_NUMBER: _builtins.int
     COMPUTE_FIELD_NUMBER: _builtins.int
+    CARRIER_FIELD_NUMBER: _builtins.int
+    REGION_FIELD_NUMBER: _builtins.int
     chosen: _builtins.bool
     state: Global___PathState.ValueType
     requests: _builtins.float
     """Requests and probes that are remembered."""
     probes: _builtins.float
+    carrier: _builtins.str
+    """Whose network the interface uses, and where the server stands; empty if nobody said."""
+    region: _builtins.str
     @_builtins.property
     def path(self) -> _control_pb2.Assignment: ...
     @_builtins.property
@@ -328,10 +333,12 @@ class ExplainedPair(_message.Message):
         rtt: _types_pb2.Histogram | None = ...,
         latency: _types_pb2.Histogram | None = ...,
         compute: _types_pb2.Histogram | None = ...,
+        carrier: _builtins.str = ...,
+        region: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "rtt", b"rtt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["chosen", b"chosen", "compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "probes", b"probes", "requests", b"requests", "rtt", b"rtt", "state", b"state"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -395,12 +402,15 @@ class Alternative(_message.Message):
     PREDICTED_MISS_FIELD_NUMBER: _builtins.int
     WITHOUT_FIELD_NUMBER: _builtins.int
     NOTE_FIELD_NUMBER: _builtins.int
+    CHARGE_FIELD_NUMBER: _builtins.int
     kind: Global___AlternativeKind.ValueType
     predicted_miss: _builtins.float
     without: _builtins.str
     """The server that is left out."""
     note: _builtins.str
     """What speaks against it, in words."""
+    charge: _builtins.float
+    """What a request would cost with all its copies; absent unless the service is to be cheap."""
     @_builtins.property
     def assignments(self) -> _containers.RepeatedCompositeFieldContainer[_control_pb2.Assignment]:
         """None if there is no such mapping."""
@@ -413,12 +423,15 @@ class Alternative(_message.Message):
         predicted_miss: _builtins.float = ...,
         without: _builtins.str = ...,
         note: _builtins.str = ...,
+        charge: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "charge", b"charge"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["assignments", b"assignments", "kind", b"kind", "note", b"note", "predicted_miss", b"predicted_miss", "without", b"without"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "assignments", b"assignments", "charge", b"charge", "kind", b"kind", "note", b"note", "predicted_miss", b"predicted_miss", "without", b"without"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__charge: _TypeAlias = _typing.Literal["charge"]  # noqa: Y015
+    _WhichOneofArgType__charge: _TypeAlias = _typing.Literal["_charge", b"_charge"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__charge) -> _WhichOneofReturnType__charge | None: ...
 
 Global___Alternative: _TypeAlias = Alternative  # noqa: Y015
 
@@ -466,6 +479,8 @@ class ExplainResponse(_message.Message):
     JOINTS_FIELD_NUMBER: _builtins.int
     ALTERNATIVES_FIELD_NUMBER: _builtins.int
     CHANGES_FIELD_NUMBER: _builtins.int
+    TARGET_MISS_FIELD_NUMBER: _builtins.int
+    CHARGE_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     service: _builtins.str
     deadline_us: _builtins.int
@@ -478,6 +493,10 @@ class ExplainResponse(_message.Message):
     """Share of recent requests that missed the deadline or failed; absent without any."""
     pairs_left_out: _builtins.int
     """Pairs that were too many to be told of."""
+    target_miss: _builtins.float
+    """Above 0: the service goes where it is cheapest as long as it misses no more often."""
+    charge: _builtins.float
+    """What a request costs with all its copies; absent unless the service is to be cheap."""
     @_builtins.property
     def mapping(self) -> _control_pb2.ServiceMapping:
         """As last sent; absent if nothing was."""
@@ -511,15 +530,21 @@ class ExplainResponse(_message.Message):
         joints: _abc.Iterable[Global___ExplainedJoint] | None = ...,
         alternatives: _abc.Iterable[Global___Alternative] | None = ...,
         changes: _abc.Iterable[Global___MappingChange] | None = ...,
+        target_miss: _builtins.float = ...,
+        charge: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "sync", b"sync"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "charge", b"charge", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "sync", b"sync"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "alternatives", b"alternatives", "changes", b"changes", "deadline_us", b"deadline_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "robot", b"robot", "service", b"service", "sync", b"sync"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "alternatives", b"alternatives", "changes", b"changes", "charge", b"charge", "deadline_us", b"deadline_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__charge: _TypeAlias = _typing.Literal["charge"]  # noqa: Y015
+    _WhichOneofArgType__charge: _TypeAlias = _typing.Literal["_charge", b"_charge"]  # noqa: Y015
     _WhichOneofReturnType__in_force_us: _TypeAlias = _typing.Literal["in_force_us"]  # noqa: Y015
     _WhichOneofArgType__in_force_us: _TypeAlias = _typing.Literal["_in_force_us", b"_in_force_us"]  # noqa: Y015
     _WhichOneofReturnType__observed_miss: _TypeAlias = _typing.Literal["observed_miss"]  # noqa: Y015
     _WhichOneofArgType__observed_miss: _TypeAlias = _typing.Literal["_observed_miss", b"_observed_miss"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__charge) -> _WhichOneofReturnType__charge | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__in_force_us) -> _WhichOneofReturnType__in_force_us | None: ...
     @_typing.overload

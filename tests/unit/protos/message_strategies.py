@@ -264,6 +264,8 @@ explained_pairs = st.builds(
     histograms(),
     histograms(),
     histograms(),
+    texts,
+    texts,
 )
 explained_joints = st.builds(
     JointExplanation,
@@ -283,6 +285,7 @@ alternatives = st.builds(
     probabilities,
     st.none() | node_names,
     texts,
+    st.none() | weights,
 )
 explanations = st.builds(
     Explanation,
@@ -294,6 +297,8 @@ explanations = st.builds(
     resource_statuses,
     st.none() | service_mappings,
     st.none() | durations,
+    probabilities,
+    st.none() | weights,
     st.none() | probabilities,
     _tuples(explained_pairs),
     events,
