@@ -26,8 +26,12 @@ SMALL_BLOCKS = 64
 """Groups of up to this many blocks are solved to the optimum, if the time allows."""
 
 GOOD_GAP = 0.002
-"""Larger groups are left alone once the plan costs at most this share more than the bound: below the resolution of
-any estimate."""
+"""The decomposition of a larger group ends when the plan costs at most this share more than the bound: below the
+resolution of any estimate."""
+
+WANTED_GAP = 0.01
+"""A larger group is searched by CP-SAT only beyond this: that takes all the time there is, which robots whose network
+changes meanwhile spend waiting, and saves little."""
 
 MIN_GROUP_TIME_S = 0.01
 """Time a group of blocks gets for the search even when those before it used up the limit."""
@@ -62,14 +66,16 @@ class GroupSolver:
         self._group = group
         self._end = end
         self._is_small = len(group.blocks) <= SMALL_BLOCKS
-        self._good_gap = 0.0 if self._is_small else GOOD_GAP
+        self._wanted_gap = 0.0 if self._is_small else WANTED_GAP
         self._limits = Limits(group)
 
     def solve(self, hint: Plan | None, prices: Mapping[FleetKey, float]) -> Found:
         """Start from the prices and the plan of before."""
         decomposition = Decomposition(self._group, self._limits, prices)
         relaxed = decomposition.run(
-            self._hinted(hint), good_gap=self._good_gap, out_of_time=lambda: time.monotonic() > self._end
+            self._hinted(hint),
+            good_gap=0.0 if self._is_small else GOOD_GAP,
+            out_of_time=lambda: time.monotonic() > self._end,
         )
         proven = self._is_good(relaxed.standing.cost, relaxed) and relaxed.excess_proven
         choices, bound = relaxed.standing.choices(), relaxed.bound
@@ -92,7 +98,7 @@ class GroupSolver:
     def _is_good(self, cost: float, relaxed: Relaxed) -> bool:
         if cost - relaxed.bound <= RESOLUTION * len(self._group.blocks):
             return True
-        return relative_gap(cost, relaxed.bound, relaxed.standing.size) <= self._good_gap
+        return relative_gap(cost, relaxed.bound, relaxed.standing.size) <= self._wanted_gap
 
     def _search(self, relaxed: Relaxed) -> tuple[dict[BlockKey, Choice], float, bool]:
         """Let CP-SAT choose among the choices that the bound leaves a chance."""

@@ -28,7 +28,8 @@ CHANGED_SHARE = 0.02
 """Beyond this share of changed blocks all are solved: it costs little more, and moves others out of the way."""
 
 INCREMENTAL_GAP = 0.01
-"""All blocks are solved again once the plan may cost this share more than the best."""
+"""All blocks are solved again once the plan may cost this share more than the best, beyond what the last whole solution
+left open: solving all could not be sure to do better."""
 
 
 def solve(problem: Problem, *, time_limit_s: float, hint: Plan | None = None) -> Plan:
@@ -46,6 +47,8 @@ class _Kept:
     load: Mapping[FleetKey, int]
     prices: Mapping[FleetKey, float]
     worth: Mapping[BlockKey, float]
+    gap: float
+    """Of the last whole solution."""
 
 
 class Matcher:
@@ -86,6 +89,7 @@ class Matcher:
             _loads(problem, plan, plan.blocks),
             {key: price for group in found for key, price in group.prices.items()},
             {key: worth for group in found for key, worth in group.worth.items()},
+            plan.gap,
         )
         return plan
 
@@ -124,9 +128,9 @@ class Matcher:
             bound=sum(worth.values()) - paid,
             unproven=kept.plan.unproven,
         )
-        if plan.gap > INCREMENTAL_GAP:
+        if plan.gap > kept.gap + INCREMENTAL_GAP:
             return None
-        self._kept = _Kept(problem, blocks, plan, load, kept.prices, worth)
+        self._kept = _Kept(problem, blocks, plan, load, kept.prices, worth, kept.gap)
         return plan
 
 

@@ -5,6 +5,7 @@ A move is taken if it exceeds the capacities by less in all, or by as much at le
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import numpy as np
 from controlplane.core.costs import block_cost
 from controlplane.core.plan import size
 from controlplane.core.problem import block_excess
+from controlplane.core.trades import trade
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from controlplane.core.limits import Limits
     from controlplane.core.problem import BlockKey, Choice, Objective
     from controlplane.core.stacks import Best, Stack
+    from controlplane.core.trades import Move
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]
@@ -110,12 +113,27 @@ class Standing:
 
     def settle(self, price: Floats, out_of_time: Callable[[], bool]) -> None:
         """Move blocks away from limits that are exceeded, those first that lose least at these prices; then to what
-        is cheaper for them, within the limits."""
+        is cheaper for them, within the limits; then two at a time."""
         nothing = np.zeros_like(price)
         for prices, crowded_only in ((price, True), (nothing, False)):
             for _ in range(MAX_SWEEPS):
                 if out_of_time() or not self._sweep(prices, crowded_only=crowded_only):
                     break
+
+        trade(self, out_of_time)
+
+    def exchange(self, goer: Move, comer: Move) -> bool:
+        """Make both moves if they cost less together and exceed no more; False if not."""
+        if (goer.stack, goer.row) == (comer.stack, comer.row):
+            return False
+        part = self.parts[goer.stack]
+        before = part.picks[goer.row].copy(), float(part.cost[goer.row]), int(part.excess[goer.row])
+        if not self._move(goer.stack, goer.row, goer.picks, goer.cost, goer.excess, may_lose=-comer.more):
+            return False
+        if self._move(comer.stack, comer.row, comer.picks, comer.cost, comer.excess):
+            return True
+        self._move(goer.stack, goer.row, *before, may_lose=math.inf)
+        return False
 
     def _sweep(self, price: Floats, *, crowded_only: bool) -> bool:
         crowded = np.append(self.load > self.limits.capacity, False)
@@ -152,7 +170,7 @@ class Standing:
         shut[:, stack.servers] = False
         return shut
 
-    def _move(self, number: int, row: int, picks: Indices, cost: float, excess: int) -> bool:
+    def _move(self, number: int, row: int, picks: Indices, cost: float, excess: int, *, may_lose: float = 0.0) -> bool:
         stack, part = self.stacks[number], self.parts[number]
         change: dict[int, int] = {}
         for limit in stack.limit[row, part.picks[row]].tolist():
@@ -164,7 +182,7 @@ class Standing:
         for limit, count in change.items():
             over = int(self.load[limit] - self.limits.capacity[limit])
             more += max(0, over + count) - max(0, over)
-        if more > 0 or (more == 0 and cost >= part.cost[row] - MIN_GAIN):
+        if more > 0 or (more == 0 and cost >= part.cost[row] + may_lose - MIN_GAIN):
             return False
         for limit, count in change.items():
             self.load[limit] += count
