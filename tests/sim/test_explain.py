@@ -10,9 +10,9 @@ from controlplane.core.explanation import UnknownNameError
 from controlplane.explanation_text import render
 from protos.explanation import AlternativeKind, Correlation, Explanation
 from protos.model import (
-    AT_MOST_EVERY_INTERFACE,
     Assignment,
     CandidateSet,
+    Copies,
     InterfaceLabel,
     InterfaceName,
     JointReport,
@@ -129,7 +129,7 @@ def test_what_paths_share_and_what_they_cost_is_told() -> None:
         InterfaceLabel(InterfaceName(nic), "blue", charge) for nic, charge in (("wlan0", 1.0), ("wwan0", 3.0))
     )
     world.say(robot, CandidateSet(interfaces("wlan0", "wwan0"), labels))
-    world.say(robot, ServiceSet((), (replace(use(), target_miss=0.001, copies=AT_MOST_EVERY_INTERFACE),)))
+    world.say(robot, ServiceSet((), (replace(use(), target_miss=0.001, copies=Copies(least=1)),)))
     world.all_up(robot, ("a", "b"))
     world.run(2.0)
     measured(world, robot, seconds=20, misses={("wlan0", "a"): 0.1, ("wwan0", "b"): 0.1})
