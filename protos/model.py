@@ -192,6 +192,8 @@ class ServiceMapping:
     assignments: tuple[Assignment, ...]
     predicted_miss: float = 1.0
     reason: str = ""
+    explore: Assignment | None = None
+    """A pair beside the assignments, of which a few requests would teach most; None if nothing is worth it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -139,6 +139,12 @@ def _requests(stats: EngineStats) -> Iterator[Metric]:
         stats.called_off,
     )
     yield counter(
+        "plr_copies_explored",
+        "Copies sent over paths that the mapping does not use, to learn of them.",
+        ("interface", "peer", "service"),
+        stats.explored,
+    )
+    yield counter(
         "plr_late_responses_dropped",
         "Responses after the deadline that drop_late kept from the application.",
         ("service",),

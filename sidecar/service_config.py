@@ -39,9 +39,16 @@ LIFETIME_PER_DEADLINE = 10.0
 CLOUD_LIFETIME_MS = 60_000.0
 """How long a cloud sidecar waits for a local server by default."""
 
+MAX_EXPLORATION = 0.1
+DEFAULT_EXPLORATION = 0.01
+"""What it costs is bounded besides, see `sidecar.core.exploration`."""
+
 _UNLIMITED = 0
 _MS_PER_S = 1000.0
 _MAX_LIFETIME_MS = MAX_LIFETIME_S * _MS_PER_S
+
+
+_ROBOTS_KEYS = ("deadline_ms", "idempotent", "drop_late", "priority", "exploration", "copies", "mode", "target_miss")
 
 
 class PriorityWord(enum.Enum):
@@ -98,6 +105,9 @@ class ServiceConfig(Section):
     """Robot: most_reliable or cheapest, as long as target_miss is kept. Default most_reliable."""
     target_miss: Annotated[float, Field(gt=0, lt=1)] | None = None
     """Robot, with mode cheapest: the largest predicted probability that a request misses its deadline."""
+    exploration: Annotated[float, Field(ge=0, le=MAX_EXPLORATION)] | None = None
+    """Robot: share of the requests that may get one more copy over a path that the mapping does not use, to learn how
+    good it is; idempotent services only. Default 0.01, at most 0.1."""
     capacity_interfaces: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Cloud: how many robot interfaces may be mapped to this server for the service; none: no limit."""
     cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] | None = None
@@ -120,6 +130,7 @@ class ServiceConfig(Section):
             drop_late=bool(self.drop_late),
             priority=Priority[(self.priority or PriorityWord.NORMAL).name],
             fec=_redundancy(self.fec),
+            exploration=DEFAULT_EXPLORATION if self.exploration is None else self.exploration,
             capacity=self.capacity_interfaces or _UNLIMITED,
             copies=self.copies or (AT_MOST_EVERY_INTERFACE if self.target_miss else EVERY_INTERFACE),
             target_miss=self.target_miss or 0.0,
@@ -129,7 +140,7 @@ class ServiceConfig(Section):
     def problems(self, role: Role) -> Iterator[tuple[str, str]]:
         """What single keys cannot know: each key that is wrong in this role or beside others, and why."""
         if role is Role.CLOUD:
-            for key in ("deadline_ms", "idempotent", "drop_late", "priority", "copies", "mode", "target_miss"):
+            for key in _ROBOTS_KEYS:
                 if getattr(self, key) is not None:
                     yield key, "expected on a robot only: it is the robot's sidecar that decides this"
             return
@@ -141,6 +152,8 @@ class ServiceConfig(Section):
             yield "target_miss", "expected a probability beside mode: cheapest, but missing"
         if self.mode is not ModeWord.CHEAPEST and self.target_miss is not None:
             yield "target_miss", "expected only beside mode: cheapest"
+        if self.exploration and not self.idempotent:
+            yield "exploration", "expected beside idempotent: true, as copies would run on several servers"
         if self.deadline_ms is None:
             yield "deadline_ms", "expected milliseconds, but missing"
         elif self.lifetime_ms is not None and self.lifetime_ms <= self.deadline_ms:

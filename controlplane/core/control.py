@@ -8,6 +8,7 @@ call it drains `next_event`. Times are monotonic seconds.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import TYPE_CHECKING, assert_never
 
 from controlplane.core.control_events import (
@@ -25,6 +26,7 @@ from controlplane.core.debounce import Change, Debounce
 from controlplane.core.drawing import Drawing
 from controlplane.core.estimator import Estimator
 from controlplane.core.explanation import explain, find
+from controlplane.core.exploration import Exploration
 from controlplane.core.mapping_history import MappingHistory
 from controlplane.core.permits import Permits
 from controlplane.core.picture import Picture
@@ -85,6 +87,7 @@ class ControlCore:
         self._debounce = Debounce()
         self._stability = Stability()
         self.history = MappingHistory()
+        self._exploration = Exploration()
         warm_until = now + settings.warm_up_s if settings.warm_up_s else None
         self._publisher = Publisher(self.registry, version_epoch=version_epoch, warm_until=warm_until)
         self._streams: dict[StreamId, NodeName] = {}
@@ -310,6 +313,7 @@ class ControlCore:
         self.counters.unproven += plan.unproven
         if settled.relaxed and settled.relaxed != self.plan.relaxed:
             self.counters.relaxations += 1
+        settled = replace(settled, explore=self._exploration.update(picture.problem, settled))
         robots = changed_robots(self.plan, settled, self._picture, picture)
         self.plan = settled
         self._picture = picture

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
-    from protos.model import InterfaceName, NodeName
+    from protos.model import Assignment, InterfaceName, NodeName
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +59,8 @@ class Plan:
     """By how many interfaces a server's limit over all robots is exceeded; only those that are."""
     bound: float = -math.inf
     """No plan that exceeds capacities by no more costs less."""
+    explore: Mapping[BlockKey, Assignment] = field(default_factory=dict)
+    """Pairs beside the planned ones of which a few requests would teach most."""
     unproven: int = 0
     """Groups of blocks whose gap stayed wider than wanted in the time given."""
 
@@ -136,7 +138,7 @@ def make_plan(
             charge=charge(block.target, choice) if block.target is not None else 0.0,
             shortfall=shortfall(block, choice),
         )
-    return Plan(plans, fleet_excess(problem, choices), bound, unproven)
+    return Plan(plans, fleet_excess(problem, choices), bound, unproven=unproven)
 
 
 def choice_of(block: Block, plan: BlockPlan | None) -> Choice | None:

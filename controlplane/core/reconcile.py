@@ -9,12 +9,12 @@ from controlplane.core.problem import BlockKey, Objective
 from protos.model import NO_CALLS, Assignment, ServiceMapping
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from controlplane.core.picture import BlockNotes, Picture
     from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.registry import Sidecar
-    from protos.model import CallPermit, InterfaceName, NodeName
+    from protos.model import CallPermit, InterfaceName, NodeName, ServiceName
 
 PREDICTION_CHANGE = 2.0
 """A new predicted miss probability alone is sent when it differs by this factor: it informs, nothing acts on it."""
@@ -58,13 +58,14 @@ def mapping_of(
         standby = _standby(planned, notes, before.get(use.name), single=not use.idempotent)
         standby = standby[: max(0, min(use.copies.most or wanted, wanted) - len(planned))]
         kept = tuple(
-            assignment
-            for assignment in (*planned, *standby)
-            if assignment.interface in interfaces and use.name in servers.get(assignment.server, NO_CALLS)
+            assignment for assignment in (*planned, *standby) if _is_allowed(assignment, use.name, interfaces, servers)
         )
         predicted = block.predicted_miss if set(planned) & set(kept) else 1.0
+        explore = plan.explore.get(key)
+        if explore is not None and (explore in kept or not _is_allowed(explore, use.name, interfaces, servers)):
+            explore = None
         reason = _reason(block, notes, plan, picture.problem.objective, standby=bool(standby))
-        mappings.append(ServiceMapping(use.name, kept, min(1.0, predicted), reason))
+        mappings.append(ServiceMapping(use.name, kept, min(1.0, predicted), reason, explore))
     return tuple(mappings)
 
 
@@ -77,12 +78,22 @@ def changed_robots(plan: Plan, new_plan: Plan, picture: Picture, new_picture: Pi
         for key in keys
         if everything
         or new_plan.blocks.get(key) is not plan.blocks.get(key)
+        or new_plan.explore.get(key) != plan.explore.get(key)
         or not _is_same(picture.notes.get(key), new_picture.notes.get(key))
     }
 
 
 def _is_same(one: BlockNotes | None, other: BlockNotes | None) -> bool:
     return one is other or one == other
+
+
+def _is_allowed(
+    assignment: Assignment,
+    service: ServiceName,
+    interfaces: Collection[InterfaceName],
+    servers: Mapping[NodeName, CallPermit],
+) -> bool:
+    return assignment.interface in interfaces and service in servers.get(assignment.server, NO_CALLS)
 
 
 def _standby(
@@ -141,7 +152,7 @@ def differs(new: tuple[ServiceMapping, ...], old: tuple[ServiceMapping, ...]) ->
     if len(new) != len(old):
         return True
     return any(
-        (a.service, a.assignments, a.reason) != (b.service, b.assignments, b.reason)
+        (a.service, a.assignments, a.reason, a.explore) != (b.service, b.assignments, b.reason, b.explore)
         or _prediction_differs(a.predicted_miss, b.predicted_miss)
         for a, b in zip(new, old, strict=True)
     )

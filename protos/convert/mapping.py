@@ -27,12 +27,14 @@ def mapping_set_to_proto(mapping: MappingSet) -> control_pb2.MappingSet:
 def service_mapping_from_proto(message: control_pb2.ServiceMapping) -> ServiceMapping:
     """Check the mapping of one service."""
     assignments = each(message.assignments, MAX_ASSIGNMENTS, "assignments", assignment_from_proto)
-    unique(((a.interface, a.server) for a in assignments), "assignments")
+    explore = assignment_from_proto(message.explore) if message.HasField("explore") else None
+    unique(((a.interface, a.server) for a in (*assignments, explore) if a is not None), "assignments and explore")
     return ServiceMapping(
         service=service_name(message.service, "service"),
         assignments=assignments,
         predicted_miss=probability(message.predicted_miss, "predicted_miss"),
         reason=text(message.reason, "reason"),
+        explore=explore,
     )
 
 
@@ -43,6 +45,7 @@ def service_mapping_to_proto(mapping: ServiceMapping) -> control_pb2.ServiceMapp
         assignments=map(assignment_to_proto, mapping.assignments),
         predicted_miss=mapping.predicted_miss,
         reason=clean_text(mapping.reason),
+        explore=assignment_to_proto(mapping.explore) if mapping.explore is not None else None,
     )
 
 

@@ -44,6 +44,8 @@ class Copy:
     certainly_not_run: bool = False
     in_time: bool = False
     """It was answered before the deadline."""
+    explores: bool = False
+    """It was sent to learn, over a path that the mapping does not use: nothing relies on it."""
 
 
 @dataclass(slots=True)
@@ -80,10 +82,17 @@ class Request:
     def pending(self) -> list[Copy]:
         return [copy for copy in self.copies if copy.state is CopyState.PENDING]
 
+    def relied_on(self) -> list[Copy]:
+        """Pending copies but those that explore."""
+        return [copy for copy in self.pending() if not copy.explores]
+
+    def asked(self) -> set[NodeName]:
+        """The servers of all copies but those that explore."""
+        return {copy.path.peer for copy in self.copies if not copy.explores}
+
     def waits_for_one_server(self) -> bool:
         """Whether a single server was asked, holds the request, and has not answered."""
-        asked = {copy.path.peer for copy in self.copies}
-        return len(asked) == 1 and any(copy.message.newest.over for copy in self.pending())
+        return len(self.asked()) == 1 and any(copy.message.newest.over for copy in self.relied_on())
 
     def certainly_not_run(self) -> bool:
         """Whether no server has run it, nor will."""
@@ -95,7 +104,7 @@ class Request:
         When all else is lost and this is not about a refusal (`rejected`): those that could not run it (starting,
         draining, full) and may do so now.
         """
-        busy = {copy.path.peer for copy in self.pending()}
+        busy = {copy.path.peer for copy in self.relied_on()}
         refused = {copy.path.peer for copy in self.copies if copy.state is CopyState.REJECTED}
         others = tuple(server for server in servers if server not in busy | refused)
         if others or rejected:
@@ -106,7 +115,14 @@ class Request:
     def choose_observation(self) -> None:
         """Decide, when the first copies go out, whether this request is a full race.
 
-        By a hash (the id), so without regard to the outcome, nor in step with anything that the application does
-        every so many requests. A single copy has nobody to lose against.
+        A single copy has nobody to lose against.
         """
-        self.observed = len(self.copies) < 2 or self.id[-1] % OBSERVED_ONE_IN == 0
+        self.observed = len(self.copies) < 2 or self.is_race()
+
+    def is_race(self) -> bool:
+        """Whether all its copies are to be measured.
+
+        By a hash (the id), so without regard to the outcome, nor in step with anything that the application does
+        every so many requests.
+        """
+        return self.id[-1] % OBSERVED_ONE_IN == 0

@@ -50,7 +50,8 @@ from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.peers import Peers
-from sidecar.core.requests import RequestParts, RequestTable
+from sidecar.core.request_parts import RequestParts
+from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule, find_rule
 from sidecar.core.serving import Serving, ServingParts

@@ -38,7 +38,7 @@ class MappingTable:
     ) -> str | None:
         """Put a mapping in force; returns what is wrong with it (and keeps the old one) or None."""
         for service in mapping.services:
-            for assignment in service.assignments:
+            for assignment in (*service.assignments, *((service.explore,) if service.explore else ())):
                 if assignment.interface not in interfaces:
                     return f"{service.service}: no interface {assignment.interface!r} here"
                 if assignment.server not in servers:

@@ -59,6 +59,10 @@ class Outbox:
         """How many messages to this peer are undelivered."""
         return self._shares_of_messages.held(peer)
 
+    def waiting_over(self, interface: InterfaceName) -> int:
+        """How many undelivered messages use this interface."""
+        return sum(interface in message.interfaces for message in self._messages.values())
+
     def has_room(self, peer: NodeName, size: int) -> bool:
         """Whether another message of this size may be sent to this peer."""
         held = self._shares_of_bytes

@@ -12,7 +12,6 @@ lost: its latency is known to be beyond the deadline, which is all that the pred
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
@@ -21,12 +20,12 @@ from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.events import (
-    ApplicationEvent,
     DeadlineMissed,
     RequestFailed,
     RequestId,
     ResponseArrived,
 )
+from sidecar.core.exploration import Exploration
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
     MAX_PAYLOAD_BYTES,
@@ -38,16 +37,9 @@ from sidecar.core.messages import (
 from sidecar.core.path_id import PathId, PathState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from protos.model import NodeName, ServiceName
-    from sidecar.core.mapping import MappingTable
-    from sidecar.core.measurements import Measurements
-    from sidecar.core.offers import Offers
-    from sidecar.core.outbox import Outbox
-    from sidecar.core.routes import Routes
+    from sidecar.core.request_parts import RequestParts
     from sidecar.core.rules import ServiceRule
-    from sidecar.core.stats import EngineStats
 
 MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""
@@ -55,21 +47,6 @@ MAX_HELD_BYTES = 256 * 1024 * 1024
 """Payloads of those requests, which may wait for the first path to a server: as much as the outbox takes."""
 MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""
-
-
-@dataclass(frozen=True, slots=True)
-class RequestParts:
-    """What the request table works with."""
-
-    offers: Offers
-    mapping: MappingTable
-    routes: Routes
-    outbox: Outbox
-    measurements: Measurements
-    stats: EngineStats
-    emit: Callable[[ApplicationEvent], None]
-    seek: Callable[[frozenset[NodeName]], None]
-    """Asks the links to look for a path to any of these peers."""
 
 
 class RequestTable:
@@ -80,6 +57,7 @@ class RequestTable:
         self._requests: dict[RequestId, Request] = {}
         self._timers: list[tuple[float, RequestId]] = []
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
+        self._exploration = Exploration(parts.mapping, parts.routes, parts.outbox)
         self.unanswered = 0
         self._held_bytes = 0
 
@@ -136,11 +114,14 @@ class RequestTable:
             self._send_copy(request, path, now)
         if servers and not request.copies:
             self._parts.seek(frozenset(servers))
-        if idempotent and len({copy.path.peer for copy in request.copies}) == 1:
+        if idempotent and len(request.asked()) == 1:
             heapq.heappush(self._timers, (request.hedge_at, request.id))
+        unmapped = self._exploration.path(request, servers, now)
+        if unmapped is not None:
+            self._send_copy(request, unmapped, now, explores=True)
         request.choose_observation()
 
-    def _send_copy(self, request: Request, path: PathId, now: float) -> None:
+    def _send_copy(self, request: Request, path: PathId, now: float, *, explores: bool = False) -> None:
         if request.payload is None or len(request.copies) >= MAX_COPIES:
             return
         head = RequestMessage(
@@ -162,7 +143,9 @@ class RequestTable:
             expires=request.expires_at,
         )
         if message is not None:
-            request.copies.append(Copy(path, now, message))
+            request.copies.append(Copy(path, now, message, explores=explores))
+            if explores:
+                self._parts.stats.explored[path.interface, path.peer, request.service] += 1
 
     # -- the peers ------------------------------------------------------------------------------------------------
 
@@ -279,13 +262,12 @@ class RequestTable:
             self._rescue(request, now)
 
     def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
-        """Send one more copy when no pending one is on a path that is up (or when `insist`).
+        """Send one more copy when none that is relied on is on a path that is up (or when `insist`).
 
         A request that is not idempotent may go to another server only when it is certain that none has run it.
         """
         routes = self._parts.routes
-        pending = request.pending()
-        if not insist and any(routes.state(copy.path) is PathState.UP for copy in pending):
+        if not insist and any(routes.state(copy.path) is PathState.UP for copy in request.relied_on()):
             return
         if not request.rule.idempotent and not request.certainly_not_run():
             return

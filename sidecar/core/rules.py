@@ -62,6 +62,8 @@ class ServiceRule:
     """Robot: how many copies of a request the control plane may map."""
     target_miss: float = 0.0
     """Robot: above 0, the cheapest mapping is wanted that misses no more often; 0: the most reliable one."""
+    exploration: float = 0.0
+    """Robot: at most this share of the requests gets one more copy over a path that the mapping does not use."""
     capacity: int = 0
     """Cloud: how many robot interfaces may be mapped here; 0 means no limit."""
     charge: float = 0.0

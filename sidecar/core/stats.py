@@ -63,6 +63,8 @@ class EngineStats:
     duplicate_responses: int = 0
     called_off: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
     """Copies no longer awaited since another won."""
+    explored: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
+    """Copies sent over paths that the mapping does not use, to learn of them."""
     late_dropped: Counter[ServiceName] = field(default_factory=Counter)
     executions: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
     """Cloud: (service, result: run | coalesced | cached | cancelled | refused | abandoned)."""

@@ -655,6 +655,7 @@ class ServiceMapping(_message.Message):
     ASSIGNMENTS_FIELD_NUMBER: _builtins.int
     PREDICTED_MISS_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
+    EXPLORE_FIELD_NUMBER: _builtins.int
     service: _builtins.str
     predicted_miss: _builtins.float
     """Predicted probability that all copies miss the deadline, in [0, 1]."""
@@ -662,6 +663,10 @@ class ServiceMapping(_message.Message):
     """Why this mapping; says also what was relaxed."""
     @_builtins.property
     def assignments(self) -> _containers.RepeatedCompositeFieldContainer[Global___Assignment]: ...
+    @_builtins.property
+    def explore(self) -> Global___Assignment:
+        """A pair beside the assignments, to which a few requests may be copied to learn how good it is. Absent: none."""
+
     def __init__(
         self,
         *,
@@ -669,10 +674,11 @@ class ServiceMapping(_message.Message):
         assignments: _abc.Iterable[Global___Assignment] | None = ...,
         predicted_miss: _builtins.float = ...,
         reason: _builtins.str = ...,
+        explore: Global___Assignment | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["explore", b"explore"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["assignments", b"assignments", "predicted_miss", b"predicted_miss", "reason", b"reason", "service", b"service"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["assignments", b"assignments", "explore", b"explore", "predicted_miss", b"predicted_miss", "reason", b"reason", "service", b"service"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 
 import pytest
 
@@ -74,6 +74,18 @@ def test_a_mapping_names_no_server_that_the_robot_may_not_call_there() -> None:
     assert pairs(mapping) == [("wwan0", "b")]
 
 
+def test_a_pair_to_explore_is_told_if_it_is_there_and_not_mapped() -> None:
+    def explored(interface: InterfaceName, server: NodeName) -> Assignment | None:
+        known = replace(plan((WLAN, A)), explore={KEY: Assignment(interface, server)})
+        dark = picture(servers=(A, B), dark=(WWAN,))
+        (mapping,) = mapping_of(robot(), servers("a", "b"), known, dark, ())
+        assert pairs(mapping) == [("wlan0", "a"), ("wwan0", "b")]
+        return mapping.explore
+
+    assert explored(WLAN, B) == Assignment(WLAN, B)
+    assert explored(WWAN, B) is explored(WLAN, C) is explored(InterfaceName("usb0"), A) is None
+
+
 def test_a_use_not_yet_solved_for_is_left_out() -> None:
     found = mapping_of(robot(use(), use("/new")), servers("a"), plan((WLAN, A)), picture(servers=(A,)), ())
     assert [mapping.service for mapping in found] == [PLAN]
@@ -118,6 +130,7 @@ def test_only_a_material_change_is_worth_a_version() -> None:
     assert differs((), (base,))
     assert differs((base,), (ServiceMapping(PLAN, (Assignment(WLAN, B),), 0.01, "because"),))
     assert differs((base,), (ServiceMapping(PLAN, base.assignments, 0.01, "for another reason"),))
+    assert differs((base,), (replace(base, explore=Assignment(WLAN, B)),))
     assert not differs((base,), (ServiceMapping(PLAN, base.assignments, 0.015, "because"),))
     assert differs((base,), (ServiceMapping(PLAN, base.assignments, 0.03, "because"),))
     tiny = (ServiceMapping(PLAN, base.assignments, 1e-9, "because"),)
@@ -126,8 +139,8 @@ def test_only_a_material_change_is_worth_a_version() -> None:
 
 def test_where_not_every_interface_is_to_carry_a_copy_none_stands_by_beyond_that() -> None:
     dark = picture(servers=(A, B), dark=(WWAN,))
-    one = dataclasses.replace(use(), copies=Copies(1, 1))
-    cheap = dataclasses.replace(use(), target_miss=0.01)
+    one = replace(use(), copies=Copies(1, 1))
+    cheap = replace(use(), target_miss=0.01)
     for wish in (one, cheap):
         (mapping,) = mapping_of(robot(wish), servers("a", "b"), plan((WLAN, A)), dark, ())
         assert pairs(mapping) == [("wlan0", "a")]
@@ -135,6 +148,6 @@ def test_where_not_every_interface_is_to_carry_a_copy_none_stands_by_beyond_that
 
 
 def test_the_reason_names_what_copies_share_and_by_how_much_a_target_is_missed() -> None:
-    made = dataclasses.replace(plan((WLAN, A)).blocks[KEY], shared=("region eu",), target_miss=0.1, shortfall="misses")
+    made = replace(plan((WLAN, A)).blocks[KEY], shared=("region eu",), target_miss=0.1, shortfall="misses")
     (mapping,) = mapping_of(robot(), servers("a"), Plan({KEY: made}), picture(servers=(A,)), ())
     assert mapping.reason == "misses; copies share region eu"

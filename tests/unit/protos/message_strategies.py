@@ -205,14 +205,17 @@ def joint_reports(draw: st.DrawFn) -> JointReport:
 
 
 reports = st.builds(Report, _tuples(latencies), _tuples(paths), _tuples(outcomes), _tuples(joint_reports()))
-service_mappings = st.builds(
-    ServiceMapping,
-    service_names,
-    st.lists(assignments, max_size=3, unique=True).map(lambda found: tuple(found)),
-    probabilities,
-    texts,
-)
-mapping_sets = st.builds(MappingSet, versions, uint64, _tuples(service_mappings, by="service"))
+
+
+@st.composite
+def service_mappings(draw: st.DrawFn) -> ServiceMapping:
+    pairs = draw(st.lists(assignments, max_size=4, unique=True))
+    explores = draw(st.sampled_from((True, False)))
+    explore = pairs.pop() if pairs and explores else None
+    return ServiceMapping(draw(service_names), tuple(pairs), draw(probabilities), draw(texts), explore)
+
+
+mapping_sets = st.builds(MappingSet, versions, uint64, _tuples(service_mappings(), by="service"))
 welcomes = st.builds(Welcome, durations, durations, _tuples(texts), st.binary(max_size=50))
 
 
@@ -246,7 +249,7 @@ statuses = st.builds(
     _tuples(uses),
     resource_statuses,
     resource_statuses,
-    _tuples(service_mappings),
+    _tuples(service_mappings()),
     _tuples(paths),
     _tuples(service_names),
 )
@@ -295,7 +298,7 @@ explanations = st.builds(
     st.booleans(),
     texts,
     resource_statuses,
-    st.none() | service_mappings,
+    st.none() | service_mappings(),
     st.none() | durations,
     probabilities,
     st.none() | weights,
@@ -304,5 +307,5 @@ explanations = st.builds(
     events,
     _tuples(explained_joints),
     _tuples(alternatives),
-    _tuples(st.builds(MappingChange, durations, versions, service_mappings)),
+    _tuples(st.builds(MappingChange, durations, versions, service_mappings())),
 )

@@ -242,6 +242,9 @@ def test_a_broken_rule_is_named(message: control_pb2.SidecarMessage, field: str)
         sidecar_message_from_proto(message)
 
 
+PAIR = control_pb2.Assignment(interface="w", server="a")
+
+
 def mapping(**changes: Any) -> control_pb2.ControlMessage:
     made = control_pb2.ServiceMapping(**({"service": "/plan"} | changes))
     return control_pb2.ControlMessage(mapping=control_pb2.MappingSet(version=1, services=[made]))
@@ -256,7 +259,9 @@ def mapping(**changes: Any) -> control_pb2.ControlMessage:
         (mapping(predicted_miss=float("nan")), "predicted_miss"),
         (mapping(predicted_miss=1.5), "predicted_miss"),
         (mapping(predicted_miss=-0.1), "predicted_miss"),
-        (mapping(assignments=[control_pb2.Assignment(interface="w", server="a")] * 2), "assignments"),
+        (mapping(assignments=[PAIR] * 2), "assignments"),
+        (mapping(assignments=[PAIR], explore=PAIR), "assignments and explore"),
+        (mapping(explore=control_pb2.Assignment(interface="w")), "server"),
         (
             control_pb2.ControlMessage(peers=control_pb2.PeerSet(removed=[control_pb2.RemovedPeer(name="a")])),
             "removal reason",

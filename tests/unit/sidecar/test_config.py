@@ -146,6 +146,13 @@ def test_the_first_network_that_matches_an_interface_labels_it() -> None:
     )
 
 
+def test_a_hundredth_of_the_requests_may_explore_unless_told_otherwise() -> None:
+    assert parse(with_service(ROBOT, idempotent=True)).service_rules()[0].exploration == 0.01
+    for share in (0, 0.1):
+        (rule,) = parse(with_service(ROBOT, idempotent=True, exploration=share)).service_rules()
+        assert rule.exploration == share
+
+
 @pytest.mark.parametrize("priority", Priority)
 def test_priorities_are_words(priority: Priority) -> None:
     (rule,) = parse(with_service(ROBOT, priority=priority.name.lower())).service_rules()
@@ -200,6 +207,9 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(CLOUD, deadline_ms=100), "services[0].deadline_ms", "on a robot only"),
     (with_service(CLOUD, idempotent=False), "services[0].idempotent", "on a robot only"),
     (with_service(CLOUD, drop_late=True), "services[0].drop_late", "on a robot only"),
+    (with_service(CLOUD, exploration=0.01), "services[0].exploration", "on a robot only"),
+    (with_service(ROBOT, exploration=0.01), "services[0].exploration", "expected beside idempotent: true"),
+    (with_service(ROBOT, exploration=0.2), "services[0].exploration", "0.1"),
     (with_service(CLOUD, priority="high"), "services[0].priority", "on a robot only"),
     (with_service(ROBOT, fec=True), "services[0].fec", "expected off, auto or a number from 0 to 1, got True"),
     (with_service(ROBOT, fec="lots"), "services[0].fec", "expected off, auto or a number from 0 to 1, got 'lots'"),

@@ -76,6 +76,7 @@ def busy() -> Counters:
     engine.wins[WLAN, CLOUD, PLAN] = 7
     engine.duplicate_responses = 5
     engine.called_off[WLAN, CLOUD, PLAN] = 6
+    engine.explored[WLAN, CLOUD, PLAN] = 2
     engine.executions[PLAN, "run"] = 3
     engine.dropped["outbox_full"] = 1
     engine.late_dropped[PLAN] = 1
@@ -125,6 +126,7 @@ def test_counters_become_samples() -> None:
         "plr_path_wins_total{interface=wlan0,peer=cloud-a,service=/plan}": 7,
         "plr_duplicate_responses_total{}": 5,
         "plr_copies_called_off_total{interface=wlan0,peer=cloud-a,service=/plan}": 6,
+        "plr_copies_explored_total{interface=wlan0,peer=cloud-a,service=/plan}": 2,
         "plr_executions_total{result=run,service=/plan}": 3,
         "plr_messages_dropped_total{reason=outbox_full}": 1,
         "plr_late_responses_dropped_total{service=/plan}": 1,

@@ -14,7 +14,8 @@ from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.priority import Priority
-from sidecar.core.requests import RequestParts, RequestTable
+from sidecar.core.request_parts import RequestParts
+from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
 from sidecar.core.stats import EngineStats
@@ -32,8 +33,8 @@ RACE = OBSERVED_ONE_IN
 class Table:
     """A request table whose commands and events the test reads; wlan0 reaches cloud-a, wwan0 cloud-b."""
 
-    def __init__(self, *, idempotent: bool = True, drop_late: bool = False) -> None:
-        self.rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=idempotent, drop_late=drop_late)
+    def __init__(self, *, idempotent: bool = True, drop_late: bool = False, exploration: float = 0.0) -> None:
+        self.rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=idempotent, drop_late=drop_late, exploration=exploration)
         self.routes, self.stats, self.measurements = Routes(), EngineStats(), Measurements()
         self.commands: list[LinkCommand] = []
         self.events: list[ApplicationEvent] = []
@@ -41,10 +42,10 @@ class Table:
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
         offers = Offers((self.rule,))
         offers.set_peers([peer(A), peer(B, session=2)])
-        mapping = MappingTable(self.routes)
+        self.mapping = MappingTable(self.routes)
         parts = RequestParts(
             offers,
-            mapping,
+            self.mapping,
             self.routes,
             self.outbox,
             self.measurements,
@@ -88,8 +89,8 @@ class Table:
         response = ResponseMessage(request_id(number), copy, 0.01, (b"from " + server.encode()).ljust(size))
         self.table.on_response(peer(server).name, response, now)
 
-    def reject(self, reason: RejectReason, server: str = A, copy: int = 0, now: float = 0.1) -> None:
-        self.table.on_rejection(peer(server).name, RejectionMessage(request_id(1), copy, reason, "why"), now)
+    def reject(self, reason: RejectReason, server: str = A, copy: int = 0, now: float = 0.1, number: int = 1) -> None:
+        self.table.on_rejection(peer(server).name, RejectionMessage(request_id(number), copy, reason, "why"), now)
 
     def change(self, changed: PathId, state: PathState, now: float = 0.1) -> None:
         self.routes.set_state(changed, state)

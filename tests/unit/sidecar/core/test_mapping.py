@@ -31,6 +31,18 @@ def apply(mapping: MappingTable, *pairs: tuple[str, str], version: int = 1) -> s
     return mapping.apply(mapping_set, {WLAN, WWAN}, BOTH)
 
 
+def test_a_pair_to_explore_has_to_be_there_as_mapped_ones_have() -> None:
+    mapping = table(*MAPPED)
+    for explore, error in (
+        (Assignment(WLAN, A), None),
+        (Assignment(InterfaceName("usb0"), A), "no interface 'usb0'"),
+        (Assignment(WLAN, NodeName("elsewhere")), "no peer 'elsewhere'"),
+    ):
+        found = ServiceMapping(ECHO, (Assignment(WLAN, B),), explore=explore)
+        problem = mapping.apply(MappingSet(Version(2), 1, (found,)), {WLAN, WWAN}, BOTH)
+        assert problem is None if error is None else error in (problem or "")
+
+
 def choose(
     mapping: MappingTable, servers: tuple[NodeName, ...] = BOTH, *, idempotent: bool = True
 ) -> tuple[PathId, ...]:

@@ -1,0 +1,33 @@
+"""Robot side: what the table of requests works with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import NodeName
+    from sidecar.core.events import ApplicationEvent
+    from sidecar.core.mapping import MappingTable
+    from sidecar.core.measurements import Measurements
+    from sidecar.core.offers import Offers
+    from sidecar.core.outbox import Outbox
+    from sidecar.core.routes import Routes
+    from sidecar.core.stats import EngineStats
+
+
+@dataclass(frozen=True, slots=True)
+class RequestParts:
+    """What the request table works with."""
+
+    offers: Offers
+    mapping: MappingTable
+    routes: Routes
+    outbox: Outbox
+    measurements: Measurements
+    stats: EngineStats
+    emit: Callable[[ApplicationEvent], None]
+    seek: Callable[[frozenset[NodeName]], None]
+    """Asks the links to look for a path to any of these peers."""
