@@ -12,8 +12,6 @@ from protos.explanation import AlternativeKind, Correlation, Explanation
 from protos.model import (
     Assignment,
     CandidateSet,
-    Copies,
-    InterfaceLabel,
     InterfaceName,
     JointReport,
     NodeName,
@@ -23,6 +21,7 @@ from protos.model import (
     ServiceSet,
     SyncState,
 )
+from protos.preferences import AT_MOST_EVERY_INTERFACE, InterfaceLabel
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 
@@ -129,7 +128,7 @@ def test_what_paths_share_and_what_they_cost_is_told() -> None:
         InterfaceLabel(InterfaceName(nic), "blue", charge) for nic, charge in (("wlan0", 1.0), ("wwan0", 3.0))
     )
     world.say(robot, CandidateSet(interfaces("wlan0", "wwan0"), labels))
-    world.say(robot, ServiceSet((), (replace(use(), target_miss=0.001, copies=Copies(least=1)),)))
+    world.say(robot, ServiceSet((), (replace(use(), target_miss=0.001, copies=AT_MOST_EVERY_INTERFACE),)))
     world.all_up(robot, ("a", "b"))
     world.run(2.0)
     measured(world, robot, seconds=20, misses={("wlan0", "a"): 0.1, ("wwan0", "b"): 0.1})
