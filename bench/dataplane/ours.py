@@ -36,19 +36,20 @@ class Ours:
         answer_bytes: int = HEADER.size,
         name: str = "ours",
         null_cipher: bool = False,
+        before: Sequence[str] = (),
     ) -> None:
         """Start them; hosts are the lab's, None is this machine. Without `mapping` the engine picks the paths.
 
-        `null_cipher`: nothing is sealed.
+        `null_cipher`: nothing is sealed. `before`: a command that starts each program, chrt say.
         """
         self._stack = contextlib.ExitStack()
         start = self._stack.enter_context
         try:
             self.clouds = {
-                cloud: start(Remote.start("engine", folder, host=host, name=f"{name}.{cloud}"))
+                cloud: start(Remote.start("engine", folder, host=host, name=f"{name}.{cloud}", before=before))
                 for cloud, host in clouds.items()
             }
-            self.robot = start(Remote.start("engine", folder, host=robot, name=f"{name}.robot"))
+            self.robot = start(Remote.start("engine", folder, host=robot, name=f"{name}.robot", before=before))
             seal = {"null_cipher": null_cipher}
             common = {"stun": {"enabled": False}, "udp_port": 0, "log_level": "warning"}
             self._peers: list[Any] = []

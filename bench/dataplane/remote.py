@@ -17,7 +17,7 @@ import traceback
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -57,13 +57,14 @@ class Remote:
         host: Host | None = None,
         name: str | None = None,
         environment: Mapping[str, str] | None = None,
+        before: Sequence[str] = (),
     ) -> Remote:
         """Run `python -m bench.dataplane.programs.MODULE` on this host or on one of the lab; logs go to `folder`.
 
-        `environment` comes on top of what the program would have.
+        `environment` comes on top of what the program would have. `before`: a command that starts it.
         """
         name = name or module
-        argv = [sys.executable, "-m", f"bench.dataplane.programs.{module}"]
+        argv = [*before, sys.executable, "-m", f"bench.dataplane.programs.{module}"]
         log = folder / f"{name}.log"
         pipe = subprocess.PIPE
         with log.open("ab") as errors:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from bench.dataplane.sections import blackhole, flood, goodput, loss, one_way, outage, overload, ros_calls, share
+from bench.dataplane.sections import blackhole, busy, flood, goodput, loss, one_way, outage, overload, ros_calls, share
 
 SECTIONS = (
     one_way.SECTION,
     goodput.SECTION,
     ros_calls.SECTION,
     blackhole.SECTION,
+    busy.SECTION,
     loss.SECTION,
     overload.SECTION,
     outage.SECTION,

@@ -1,0 +1,79 @@
+"""The robot's and the cloud's processors are busy with other programs: what becomes of small requests.
+
+50 requests a second of 1 kB over two plain cables, beside as many computing programs as there are processors. Once as
+any program is scheduled, once with the real-time priority that `deploy/systemd/realtime.conf` gives the sidecar.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+from bench.dataplane.ours import Ours
+from bench.dataplane.section import Findings, Section, Table
+from bench.dataplane.statistics import Row, median, ratio
+from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, cables
+from bench.netlab import Lab
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from bench.dataplane.section import Context
+
+SIZE = 1_000
+RATE_HZ = 50.0
+COUNT = 400
+WARM_UP = 50
+REALTIME = ("chrt", "--rr", "1")
+
+
+def measure(context: Context) -> Findings:
+    """Measure."""
+    rows: dict[str, list[Row]] = {"as any program": [], "real-time priority": []}
+    count = context.scaled(COUNT)
+    with Lab(cables()) as lab:
+        for repeat in range(context.repeats):
+            for name, before in zip(rows, ((), REALTIME), strict=True):
+                context.say(f"busy: {name}, {repeat + 1} of {context.repeats}")
+                with Ours(
+                    context.folder,
+                    robot=lab.host(ROBOT),
+                    clouds={CLOUD: lab.host(CLOUD)},
+                    interfaces=CARRIERS,
+                    cloud_interface=CLOUD_INTERFACE,
+                    mapping=[(carrier, CLOUD) for carrier in CARRIERS],
+                    answer_bytes=SIZE,
+                    before=before,
+                ) as ours:
+                    ours.call(size=SIZE, count=WARM_UP, rate_hz=RATE_HZ)
+                    with _computing():
+                        calls = ours.call(size=SIZE, count=count, rate_hz=RATE_HZ)
+                    rows[name].append(calls.row(name))
+    ordinary, realtime = ([row.p99_ms for row in repeats] for repeats in rows.values())
+    return Findings(
+        figures={
+            "busy_p99_ms": median(ordinary),
+            "busy_realtime_p99_ms": median(realtime),
+            "busy_p99_over_realtime": median(ratio(*pair) for pair in zip(ordinary, realtime, strict=True)),
+            "busy_lost": sum(row.lost for repeats in rows.values() for row in repeats),
+        },
+        tables=[Table.of_rows("1 kB at 50 Hz, all processors busy", [Row.of_repeats(each) for each in rows.values()])],
+    )
+
+
+@contextlib.contextmanager
+def _computing() -> Iterator[None]:
+    """As many programs that never pause as there are processors."""
+    programs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
+SECTION = Section("busy", "Requests on busy processors", measure)
