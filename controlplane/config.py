@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from controlplane.core.control_events import Settings
+from controlplane.core.path_rules import MAX_PATH_RULES, PathRule
 from controlplane.core.problem import Objective
-from controlplane.policy_config import PolicyConfig, one_or_list
+from controlplane.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
+from controlplane.policy_config import PolicyConfig
 from protos.config_fields import (
     ListenAddress,
     RemoteAddress,
@@ -30,6 +32,17 @@ RECONNECT_MAX_MS = 10_000
 def _empty_if_null(value: object) -> object:
     # "policy:" with nothing after it denies everything; it must not be taken for no policy, which allows everything.
     return {} if value is None else value
+
+
+class PathRuleConfig(BaseModel):
+    """Over these interfaces of these robots requests may go to these clouds, or may not."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    robots: NodePatterns = Field(default=("*",), description="Patterns of names of robots.")
+    interfaces: InterfacePatterns = Field(default=("*",), description="Patterns of names of the robots' interfaces.")
+    clouds: NodePatterns = Field(default=("*",), description="Patterns of names of clouds.")
+    allow: bool = Field(description="Whether mappings may use these pairs.")
 
 
 class ControlPlaneConfig(BaseModel):
@@ -103,6 +116,12 @@ class ControlPlaneConfig(BaseModel):
     solver_time_limit_ms: int = Field(
         default=2000, ge=10, le=60_000, description="Longest time for one solving; then the best plan found is taken."
     )
+    paths: tuple[PathRuleConfig, ...] = Field(
+        default=(),
+        max_length=MAX_PATH_RULES,
+        description="Which pairs of an interface and a cloud mappings may use: the first rule that matches decides, "
+        "and what none matches is allowed.",
+    )
     policy: Annotated[PolicyConfig | None, BeforeValidator(_empty_if_null)] = Field(
         default=None,
         description="Access control. Without this key everything is allowed; with it, what no rule allows is denied.",
@@ -133,6 +152,7 @@ class ControlPlaneConfig(BaseModel):
             default_capacity_interfaces=self.default_capacity_interfaces,
             objective=self.objective,
             stun_servers=self.stun_servers,
+            path_rules=tuple(PathRule(rule.robots, rule.interfaces, rule.clouds, rule.allow) for rule in self.paths),
             policy=self.policy.policy() if self.policy is not None else None,
         )
 

@@ -80,7 +80,9 @@ class ControlCore:
         self.plan = Plan({})
         self._picture = Picture(Problem(()))
         self._drawing = Drawing(
-            default_capacity_interfaces=settings.default_capacity_interfaces, objective=settings.objective
+            default_capacity_interfaces=settings.default_capacity_interfaces,
+            objective=settings.objective,
+            path_rules=settings.path_rules,
         )
         self._drawing_since: float | None = None
         """When the drawing of the next problem began, None while none is drawn."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.problem import Objective
 
 if TYPE_CHECKING:
+    from controlplane.core.path_rules import PathRule
     from controlplane.core.policy import Policy
     from controlplane.core.registry import StreamId
     from protos.model import ControlMessage, Nack, NodeName, RemovalReason, ResourceKind, ServiceName
@@ -26,6 +27,7 @@ class Settings:
     default_capacity_interfaces: int = 1
     objective: Objective = Objective.JOINT
     stun_servers: tuple[str, ...] = ()
+    path_rules: tuple[PathRule, ...] = ()
     policy: Policy | None = None
 
 

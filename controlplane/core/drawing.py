@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from controlplane.core.path_rules import PathRules
 from controlplane.core.picture import BlockNotes, Picture, draw_block, interfaces_of
 from controlplane.core.problem import BlockKey, FleetKey, Problem
 from protos.model import Role
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from controlplane.core.estimator import Estimator
+    from controlplane.core.path_rules import PathRule
     from controlplane.core.permits import Group, Permits
     from controlplane.core.problem import Block, Objective
     from controlplane.core.registry import Sidecar
@@ -54,6 +56,7 @@ class _Inputs:
     labels: tuple[InterfaceLabel, ...]
     use: ServiceUse
     offers: tuple[tuple[Registration, ServiceOffer], ...]
+    barred: frozenset[tuple[InterfaceName, NodeName]]
     unserved: str
     robot: Sidecar = field(compare=False)
     clouds: tuple[Sidecar, ...] = field(compare=False)
@@ -84,7 +87,10 @@ class _Frame:
 class Drawing:
     """Keeps the picture up to date. Times are monotonic seconds."""
 
-    def __init__(self, *, default_capacity_interfaces: int, objective: Objective) -> None:
+    def __init__(
+        self, *, default_capacity_interfaces: int, objective: Objective, path_rules: Sequence[PathRule] = ()
+    ) -> None:
+        self._path_rules = PathRules(path_rules)
         self._capacity = default_capacity_interfaces
         self._objective = objective
         self._frame: _Frame | None = None
@@ -174,7 +180,9 @@ class Drawing:
                 offering = clouds.get((use.name, use.type), [])
                 if kind not in callable_by:
                     callable_by[kind] = tuple(cloud for cloud in offering if use.name in permits.of(group, cloud))
-                found.append((BlockKey(robot.name, use.name), _inputs(robot, use, offering, callable_by[kind])))
+                found.append(
+                    (BlockKey(robot.name, use.name), _inputs(robot, use, offering, callable_by[kind], self._path_rules))
+                )
             uses[robot.name] = tuple(found)
         self._forget_others(uses)
         for name, wanted in uses.items():
@@ -216,7 +224,9 @@ class Drawing:
                 servers = tuple(cloud.name for cloud in inputs.clouds)
                 self._drawn[key] = _Drawn(inputs, None, BlockNotes(servers, unserved=inputs.unserved))
                 continue
-            block, notes = draw_block(inputs.robot, inputs.use, inputs.clouds, estimator, now, capacity=self._capacity)
+            block, notes = draw_block(
+                inputs.robot, inputs.use, inputs.clouds, estimator, now, capacity=self._capacity, barred=inputs.barred
+            )
             if before is not None and before.block is not None and is_alike(block, before.block):
                 block = before.block
             self._drawn[key] = _Drawn(inputs, block, notes)
@@ -226,17 +236,28 @@ class Drawing:
         return pairs
 
 
-def _inputs(robot: Sidecar, use: ServiceUse, offering: Sequence[Sidecar], clouds: tuple[Sidecar, ...]) -> _Inputs:
+def _inputs(
+    robot: Sidecar,
+    use: ServiceUse,
+    offering: Sequence[Sidecar],
+    clouds: tuple[Sidecar, ...],
+    path_rules: PathRules,
+) -> _Inputs:
     """Of those who offer the service the robot may call it on `clouds`."""
     interfaces = interfaces_of(robot)
+    barred = path_rules.barred(robot.name, interfaces, [cloud.name for cloud in clouds])
     if not offering:
         unserved = f"no live server offers it as {use.type}"
     elif not clouds:
         unserved = "the access policy lets this robot call it on no live server"
+    elif not interfaces:
+        unserved = "the robot has told no address yet"
+    elif len(barred) == len(interfaces) * len(clouds):
+        unserved = "the path rules let this robot use no path to a live server"
     else:
-        unserved = "" if interfaces else "the robot has told no address yet"
+        unserved = ""
     offers = tuple((cloud.registration, offer) for cloud in clouds for offer in cloud.offers if offer.name == use.name)
-    return _Inputs(interfaces, robot.labels, use, offers, unserved, robot, clouds)
+    return _Inputs(interfaces, robot.labels, use, offers, barred, unserved, robot, clouds)
 
 
 def _epsilon(block: Block, interface: InterfaceName, server: NodeName) -> float:

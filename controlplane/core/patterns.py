@@ -15,6 +15,7 @@ MAX_PATTERN_CHARACTERS = 255
 """No name is longer (protos/names.py)."""
 
 _LETTERS = frozenset(string.ascii_letters)
+_GRAPHIC = frozenset(map(chr, range(ord("!"), ord("~") + 1))) - {"/"}
 _ALNUM = _LETTERS | frozenset(string.digits)
 
 
@@ -23,12 +24,15 @@ class NameKind(enum.Enum):
 
     NODE = "a sidecar"
     SERVICE = "a service"
+    INTERFACE = "an interface"
 
 
 _State = tuple[tuple[frozenset[str], int], ...]
 _STATES: dict[NameKind, tuple[tuple[_State, ...], int]] = {
     # What protos/names.py lets through, as automata: where each state leads by which characters; the last one accepts.
     NameKind.NODE: ((((_ALNUM, 1),), ((_ALNUM | frozenset("_.-"), 1),)), 1),
+    # Printable ASCII but for the slash.
+    NameKind.INTERFACE: ((((_GRAPHIC, 1),), ((_GRAPHIC, 1),)), 1),
     NameKind.SERVICE: (
         (
             ((frozenset("/"), 1),),

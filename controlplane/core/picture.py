@@ -31,6 +31,8 @@ class BlockNotes:
     """Interfaces left out of the problem, as no path over them is up."""
     all_dark: bool = False
     """No path at all is up, so every pair was let in."""
+    barred: frozenset[tuple[InterfaceName, NodeName]] = frozenset()
+    """Pairs that the operator's path rules keep mappings from."""
     unserved: str = ""
     """Why there is nothing to assign; then the problem has no such block."""
 
@@ -56,22 +58,20 @@ def draw_block(
     now: float,
     *,
     capacity: int,
+    barred: frozenset[tuple[InterfaceName, NodeName]] = frozenset(),
 ) -> tuple[Block, BlockNotes]:
     """One robot's use of a service on these clouds, of which there is one at least, as of its interfaces.
 
-    Only paths that are up are candidates, unless none is.
+    Only paths that are up are candidates, unless none is, and none of the pairs that are `barred`, of which not all
+    may be.
     """
     interfaces = interfaces_of(robot)
     servers = tuple(cloud.name for cloud in clouds)
-    up = {
-        (interface, server)
-        for interface in interfaces
-        for server in servers
-        if estimator.path_up(robot.name, interface, server)
-    }
+    allowed = {(interface, server) for interface in interfaces for server in servers} - barred
+    up = {(interface, server) for interface, server in allowed if estimator.path_up(robot.name, interface, server)}
     all_dark = not up
     if all_dark:
-        up = {(interface, server) for interface in interfaces for server in servers}
+        up = allowed
     lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
     reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
     overhead_s = estimator.overhead(robot.name, use.name, now)
@@ -93,8 +93,9 @@ def draw_block(
         lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
         weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
-    dark = tuple(interface for interface in interfaces if interface not in lit)
-    return with_rules(block, robot, use, clouds), BlockNotes(servers, dark, all_dark)
+    usable = {interface for interface, _ in allowed}
+    dark = tuple(interface for interface in interfaces if interface in usable and interface not in lit)
+    return with_rules(block, robot, use, clouds), BlockNotes(servers, dark, all_dark, barred)
 
 
 def _lifts(

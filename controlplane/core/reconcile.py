@@ -112,11 +112,12 @@ def _standby(
     standby: list[Assignment] = []
     for interface in notes.dark:
         server = had.get(interface)
+        allowed = [name for name in notes.servers if (interface, name) not in notes.barred]
         if single:
             server = planned[0].server
-        elif server not in notes.servers:
-            server = next((name for name in notes.servers if name not in taken), planned[0].server)
-        if server is not None:
+        elif server not in allowed:
+            server = next((name for name in allowed if name not in taken), next(iter(allowed), None))
+        if server is not None and server in allowed:
             standby.append(Assignment(interface, server))
             taken.add(server)
     return standby

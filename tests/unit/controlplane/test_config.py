@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from controlplane.config import ControlPlaneConfig, load_config, parse_config
+from controlplane.core.path_rules import PathRule
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from protos.config_fields import check_remote, split_host_port
 from protos.config_file import MAX_CONFIG_BYTES
@@ -41,6 +42,14 @@ def test_one_address_may_stand_without_a_list() -> None:
     )
 
 
+def test_path_rules_match_everything_that_they_do_not_name() -> None:
+    text = "paths: [{robots: 'arm-*', interfaces: [wwan*, sat0], allow: true}, {clouds: far, allow: false}]"
+    assert read(text).settings().path_rules == (
+        PathRule(("arm-*",), ("wwan*", "sat0"), ("*",), allow=True),
+        PathRule(("*",), ("*",), ("far",), allow=False),
+    )
+
+
 def test_no_policy_is_another_thing_than_an_empty_one() -> None:
     assert read("").settings().policy is None
     assert read("policy:").settings().policy == Policy()
@@ -58,6 +67,11 @@ def test_a_policy_is_read_with_lists_or_single_patterns() -> None:
     ("text", "line"),
     [
         ("lease: 3", "lease: unknown key; did you mean lease_ms?"),
+        ("paths: [{robots: a}]", "paths[0].allow: expected, but missing"),
+        (
+            "paths: [{interfaces: 'wlan 0', allow: true}]",
+            "paths[0].interfaces[0]: matches no name",
+        ),
         ("policy: []", "policy: expected keys and values, got []"),
         ("policy: {call: []}", "policy.call: unknown key; did you mean calls?"),
         ("policy: {calls: null}", "policy.calls: expected a list, got nothing"),

@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 
 from controlplane.core.patterns import NameKind, can_match, matches
 from protos.errors import DecodeError
-from protos.names import node_name, service_name
+from protos.names import interface_name, node_name, service_name
 
-CHECKS = {NameKind.NODE: node_name, NameKind.SERVICE: service_name}
+CHECKS = {NameKind.NODE: node_name, NameKind.SERVICE: service_name, NameKind.INTERFACE: interface_name}
 NAMES = {
     NameKind.NODE: st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,20}", fullmatch=True),
+    NameKind.INTERFACE: st.from_regex(r"[!-.0-~]{1,15}", fullmatch=True),
     NameKind.SERVICE: st.from_regex(r"(/[A-Za-z_][A-Za-z0-9_]{0,6}){1,3}", fullmatch=True),
 }
 
@@ -52,6 +53,9 @@ def test_matching(name: str, patterns: tuple[str, ...], expected: bool) -> None:
         (NameKind.NODE, "a[", False),
         (NameKind.NODE, "a[]_]", True),
         (NameKind.NODE, "/arm", False),
+        (NameKind.INTERFACE, "wwan*", True),
+        (NameKind.INTERFACE, "wlan0/1", False),
+        (NameKind.INTERFACE, "wlan 0", False),
         (NameKind.SERVICE, "*", True),
         (NameKind.SERVICE, "/plan", True),
         (NameKind.SERVICE, "plan", False),

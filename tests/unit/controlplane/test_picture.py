@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import pytest
 
 from controlplane.core.drawing import Drawing
 from controlplane.core.estimator import Estimator
 from controlplane.core.objectives import joint_miss
+from controlplane.core.path_rules import PathRule
 from controlplane.core.permits import Permits
 from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.policy import CallRule, OfferRule, Policy
@@ -43,6 +45,9 @@ from tests.unit.controlplane.samples import (
     use,
 )
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 KEY = BlockKey(NodeName("robot"), PLAN)
 
 
@@ -57,16 +62,26 @@ def cloud(name: str, *offers: ServiceOffer, draining: bool = False) -> Sidecar:
 
 
 def picture(
-    *sidecars: Sidecar, paths: tuple[PathReport, ...] = (), capacity: int = 1, policy: Policy | None = None
+    *sidecars: Sidecar,
+    paths: tuple[PathReport, ...] = (),
+    capacity: int = 1,
+    policy: Policy | None = None,
+    path_rules: Sequence[PathRule] = (),
 ) -> Picture:
     estimator = Estimator(half_life_s=60.0)
     if paths:
         estimator.merge(NodeName("robot"), Report(paths=paths), 0.0)
-    return drawn_by(estimator, *sidecars, capacity=capacity, policy=policy)
+    return drawn_by(estimator, *sidecars, capacity=capacity, policy=policy, path_rules=path_rules)
 
 
-def drawn_by(estimator: Estimator, *sidecars: Sidecar, capacity: int = 1, policy: Policy | None = None) -> Picture:
-    drawing = Drawing(default_capacity_interfaces=capacity, objective=Objective.SUM)
+def drawn_by(
+    estimator: Estimator,
+    *sidecars: Sidecar,
+    capacity: int = 1,
+    policy: Policy | None = None,
+    path_rules: Sequence[PathRule] = (),
+) -> Picture:
+    drawing = Drawing(default_capacity_interfaces=capacity, objective=Objective.SUM, path_rules=path_rules)
     assert drawing.advance(sidecars, Permits(policy), estimator, 0.0)
     return drawing.picture()
 
@@ -196,6 +211,24 @@ def test_labels_charges_and_wishes_become_rules_of_the_block() -> None:
     assert block.target == Target(0.01, ((1.0, 1.5), (2.0, 2.5)))
     (plain,) = picture(robot(), cloud("a")).problem.blocks
     assert (plain.carriers, plain.regions, plain.target) == ((), (), None)
+
+
+def test_pairs_that_the_path_rules_bar_are_no_candidates() -> None:
+    no_satellite = PathRule(("robot",), ("sat*",), ("*",), allow=False)
+    only_a = [
+        PathRule(("ro*",), ("wwan0",), ("a",), allow=True),
+        PathRule(("*",), ("wwan0",), ("*",), allow=False),
+        no_satellite,
+    ]
+    here = robot(candidates=interfaces("wlan0", "wwan0", "sat0"))
+    drawn = picture(here, cloud("a"), cloud("b"), path_rules=only_a)
+    (block,) = drawn.problem.blocks
+    assert block.interfaces == ("wlan0", "wwan0")
+    assert [[epsilon is not None for epsilon in row] for row in block.epsilon] == [[True, True], [True, False]]
+    assert drawn.notes[KEY].dark == ()
+    nothing = picture(robot(candidates=interfaces("sat0")), cloud("a"), path_rules=[no_satellite])
+    assert nothing.problem.blocks == ()
+    assert nothing.notes[KEY].unserved == "the path rules let this robot use no path to a live server"
 
 
 def test_each_use_has_its_own_deadline() -> None:

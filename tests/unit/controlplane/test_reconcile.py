@@ -151,3 +151,11 @@ def test_the_reason_names_what_copies_share_and_by_how_much_a_target_is_missed()
     made = replace(plan((WLAN, A)).blocks[KEY], shared=("region eu",), target_miss=0.1, shortfall="misses")
     (mapping,) = mapping_of(robot(), servers("a"), Plan({KEY: made}), picture(servers=(A,)), ())
     assert mapping.reason == "misses; copies share region eu"
+
+
+def test_a_dark_interface_stands_by_for_no_server_that_it_may_not_be_used_to() -> None:
+    dark = picture(servers=(A, B), dark=(WWAN,), barred=frozenset({(WWAN, B)}))
+    (mapping,) = mapping_of(robot(), servers("a", "b"), plan((WLAN, A)), dark, ())
+    assert pairs(mapping) == [("wlan0", "a"), ("wwan0", "a")]
+    single = mapping_of(robot(use(idempotent=False)), servers("a", "b"), plan((WLAN, B)), dark, ())
+    assert pairs(single[0]) == [("wlan0", "b")]

@@ -1,0 +1,65 @@
+"""Which pairs of an interface and a cloud mappings may use, as the operator's rules have it.
+
+The first rule that matches a robot, one of its interfaces and a cloud decides; what none matches is allowed. This is
+about where requests should go, not about who may do what: that is the access policy's (`policy`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from controlplane.core.pattern_index import PatternIndex
+from controlplane.core.patterns import matches
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Sequence
+
+    from protos.model import InterfaceName, NodeName
+
+MAX_PATH_RULES = 1024
+"""Rules in the list."""
+
+MAX_KEPT_VERDICTS = 65_536
+"""Verdicts on pairs that are kept, of some hundred bytes each; then all are worked out anew."""
+
+
+@dataclass(frozen=True, slots=True)
+class PathRule:
+    """Over these interfaces of these robots requests may go to these clouds, or may not."""
+
+    robots: tuple[str, ...]
+    interfaces: tuple[str, ...]
+    clouds: tuple[str, ...]
+    allow: bool
+
+
+class PathRules:
+    """All rules, in order."""
+
+    def __init__(self, rules: Sequence[PathRule] = ()) -> None:
+        self._rules = tuple(rules)
+        self._robots = PatternIndex(rule.robots for rule in self._rules)
+        self._verdicts: dict[tuple[frozenset[int], InterfaceName, NodeName], bool] = {}
+
+    def barred(
+        self, robot: NodeName, interfaces: Iterable[InterfaceName], clouds: Collection[NodeName]
+    ) -> frozenset[tuple[InterfaceName, NodeName]]:
+        """The pairs of these that the robot's mappings may not use."""
+        about = self._robots.matching(robot) if self._rules else frozenset[int]()
+        if not about:
+            return frozenset()
+        pairs = ((interface, cloud) for interface in interfaces for cloud in clouds)
+        return frozenset(pair for pair in pairs if not self._allows(about, *pair))
+
+    def _allows(self, about: frozenset[int], interface: InterfaceName, cloud: NodeName) -> bool:
+        key = about, interface, cloud
+        verdict = self._verdicts.get(key)
+        if verdict is None:
+            rules = (self._rules[number] for number in sorted(about))
+            found = (rule for rule in rules if matches(interface, rule.interfaces) and matches(cloud, rule.clouds))
+            first = next(found, None)
+            if len(self._verdicts) >= MAX_KEPT_VERDICTS:
+                self._verdicts.clear()
+            verdict = self._verdicts[key] = first is None or first.allow
+        return verdict
