@@ -30,6 +30,7 @@ NOBODY = 65534
 OWNER = """
 import json, signal, sys, time
 from bench.netlab import Lab, LinkProfile
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 with Lab(seed=1) as lab:
     robot = lab.host("robot")
     lab.link("wlan0").set(LinkProfile(delay_ms=5))
@@ -128,7 +129,10 @@ def test_nothing_is_left_however_the_owner_ends(how: str) -> None:
         text=True,
         cwd=REPOSITORY,
     ) as owner:
-        check_that_nothing_is_left(owner, how)
+        try:
+            check_that_nothing_is_left(owner, how)
+        finally:
+            owner.kill()
         assert owner.stderr is not None
         errors = owner.stderr.read()
     expected = {"exception": "ZeroDivisionError", "interrupted": "KeyboardInterrupt"}.get(how, "")
@@ -141,7 +145,8 @@ def test_nothing_is_left_however_the_owner_ends(how: str) -> None:
 def world_readable_copy() -> Iterator[Path]:
     """The lab where anybody may read it; a checkout may lie in a home directory that is closed to others."""
     folder = Path(tempfile.mkdtemp(prefix="netlab-test-"))
-    shutil.copytree(REPOSITORY / "bench", folder / "bench", ignore=shutil.ignore_patterns("__pycache__"))
+    for package in ("bench", "controlplane"):  # it reads traces as `plr plan` does
+        shutil.copytree(REPOSITORY / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
     for path in (folder, *folder.rglob("*")):
         path.chmod(0o755 if path.is_dir() else 0o644)
     yield folder
@@ -183,5 +188,8 @@ def test_unprivileged_lab_works_and_leaves_nothing(prefix: list[str], world_read
         cwd=world_readable_copy,
         env={"PATH": os.environ["PATH"], "PYTHONDONTWRITEBYTECODE": "1"},
     ) as owner:
-        check_that_nothing_is_left(owner, "killed")
+        try:
+            check_that_nothing_is_left(owner, "killed")
+        finally:
+            owner.kill()
     assert traces_of_a_lab() == before
