@@ -68,7 +68,7 @@ def _pair(pair: PairExplanation) -> tuple[str, ...]:
         "*" if pair.chosen else "",
         _labelled(pair.path.interface, pair.carrier),
         _labelled(pair.path.server, pair.region),
-        {True: "up", False: "DOWN", None: "unknown"}[pair.up],
+        {True: "up", False: "DOWN", None: "unknown"}[pair.up] + (", barred" if pair.barred else ""),
         _probability(pair.miss.mean) if pair.miss is not None else "-",
         f"{_probability(pair.miss.low)} .. {_probability(pair.miss.high)}" if pair.miss is not None else "-",
         f"{pair.requests:.0f}",

@@ -49,6 +49,8 @@ class PairExplanation:
     """Whose network the interface uses; empty if nobody said."""
     region: str = ""
     """Where the server stands; empty if nobody said."""
+    barred: bool = False
+    """The operator's path rules keep mappings from it."""
 
 
 class Correlation(enum.Enum):

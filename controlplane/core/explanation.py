@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.core import alternatives
 from controlplane.core.beta import intervals
-from controlplane.core.picture import interfaces_of
+from controlplane.core.picture import BlockNotes, interfaces_of
 from controlplane.core.problem import BlockKey
 from protos.explanation import Belief, Correlation, Explanation, JointExplanation, MappingChange, PairExplanation
 from protos.model import Assignment, Role
@@ -95,7 +95,7 @@ def explain(
         observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
         target_miss=use.target_miss,
         charge=_charge(block, plan.blocks.get(key)),
-        pairs=_pairs(paths, block, estimator, key, mapping, now),
+        pairs=_pairs(paths, picture.notes.get(key) or BlockNotes(), block, estimator, key, mapping, now),
         pairs_left_out=max(0, len(paths) - MAX_PAIRS),
         joints=_joints(block, estimator, now) if block is not None else (),
         alternatives=alternatives.of(picture.problem, plan, block) if block is not None else (),
@@ -114,6 +114,7 @@ def _paths(robot: Sidecar, picture: Picture, key: BlockKey, mapping: ServiceMapp
 
 def _pairs(
     paths: list[Assignment],
+    notes: BlockNotes,
     block: Block | None,
     estimator: Estimator,
     key: BlockKey,
@@ -143,6 +144,7 @@ def _pairs(
                 compute=evidence.compute,
                 carrier=_carrier(block, path),
                 region=_region(block, path),
+                barred=(path.interface, path.server) in notes.barred,
             )
         )
     return tuple(found)

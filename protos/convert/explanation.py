@@ -171,6 +171,7 @@ def _pair_from_proto(message: admin_pb2.ExplainedPair) -> PairExplanation:
         compute=histogram_from_proto(message.compute),
         carrier=text(message.carrier, "carrier"),
         region=text(message.region, "region"),
+        barred=message.barred,
     )
 
 
@@ -187,6 +188,7 @@ def _pair_to_proto(pair: PairExplanation) -> admin_pb2.ExplainedPair:
         compute=histogram_to_proto(pair.compute),
         carrier=clean_text(pair.carrier),
         region=clean_text(pair.region),
+        barred=pair.barred,
     )
 
 

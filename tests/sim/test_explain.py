@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+from controlplane.core.control_events import Settings
 from controlplane.core.explanation import UnknownNameError
+from controlplane.core.path_rules import PathRule
 from controlplane.explanation_text import render
 from protos.explanation import AlternativeKind, Correlation, Explanation
 from protos.model import (
@@ -145,6 +147,18 @@ def test_what_paths_share_and_what_they_cost_is_told() -> None:
     assert "cheapest that misses at most 0.001" in text
     assert "a request costs 1" in text
     assert "wlan0 (blue)" in text
+
+
+def test_a_pair_that_the_operator_bars_is_said_to_be() -> None:
+    rule = PathRule(("*",), ("wlan0",), ("a",), allow=False)
+    world = World(Settings(warm_up_s=0.0, path_rules=(rule,)))
+    world.cloud("a")
+    world.cloud("b")
+    world.all_up(world.robot(), ("a", "b"))
+    world.run(2.0)
+    barred = [pair.path for pair in asked(world).pairs if pair.barred]
+    assert barred == [on("wlan0", "a")]
+    assert "up, barred" in render(asked(world))
 
 
 def test_a_service_without_servers_is_explained_too(world: World) -> None:

@@ -297,6 +297,7 @@ class ExplainedPair(_message.Message):
     COMPUTE_FIELD_NUMBER: _builtins.int
     CARRIER_FIELD_NUMBER: _builtins.int
     REGION_FIELD_NUMBER: _builtins.int
+    BARRED_FIELD_NUMBER: _builtins.int
     chosen: _builtins.bool
     state: Global___PathState.ValueType
     requests: _builtins.float
@@ -305,6 +306,8 @@ class ExplainedPair(_message.Message):
     carrier: _builtins.str
     """Whose network the interface uses, and where the server stands; empty if nobody said."""
     region: _builtins.str
+    barred: _builtins.bool
+    """The operator's path rules keep mappings from it."""
     @_builtins.property
     def path(self) -> _control_pb2.Assignment: ...
     @_builtins.property
@@ -335,10 +338,11 @@ class ExplainedPair(_message.Message):
         compute: _types_pb2.Histogram | None = ...,
         carrier: _builtins.str = ...,
         region: _builtins.str = ...,
+        barred: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "rtt", b"rtt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["barred", b"barred", "carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

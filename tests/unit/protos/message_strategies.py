@@ -269,6 +269,7 @@ explained_pairs = st.builds(
     histograms(),
     texts,
     texts,
+    st.booleans(),
 )
 explained_joints = st.builds(
     JointExplanation,
