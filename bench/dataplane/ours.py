@@ -8,16 +8,21 @@ from typing import TYPE_CHECKING, Any, Self
 from bench.dataplane.calling import HEADER
 from bench.dataplane.remote import Remote
 from bench.dataplane.statistics import Calls
+from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
 
-    from bench.netlab import Host
+    from bench.netlab import Host, Lab
 
 Service = dict[str, Any]
 SERVICE: Service = {"name": "/bench", "deadline_ms": 1_000.0, "lifetime_ms": 30_000.0, "idempotent": True}
+
+
+EVERY_CARRIER = [(carrier, CLOUD) for carrier in CARRIERS]
+"""A mapping that sends each request over all of them."""
 
 
 class Ours:
@@ -68,6 +73,22 @@ class Ours:
         except BaseException:
             self._stack.close()
             raise
+
+    @classmethod
+    def in_lab(
+        cls,
+        lab: Lab,
+        folder: Path,
+        *,
+        clouds: Sequence[str] = (CLOUD,),
+        mapping: Sequence[tuple[str, str]] | None = EVERY_CARRIER,
+        **more: Any,
+    ) -> Self:
+        """Start them in a lab of `topology`, the robot with the carriers that it is mapped to; `more` as above."""
+        carriers = CARRIERS if mapping is None else tuple(dict.fromkeys(carrier for carrier, _ in mapping))
+        hosts = {cloud: lab.host(cloud) for cloud in clouds}
+        more = {"interfaces": carriers, "cloud_interface": CLOUD_INTERFACE, **more}
+        return cls(folder, robot=lab.host(ROBOT), clouds=hosts, mapping=mapping, **more)
 
     def __enter__(self) -> Self:
         return self

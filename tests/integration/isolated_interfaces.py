@@ -6,7 +6,6 @@ be full.
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import dataclasses
 import functools
@@ -17,10 +16,11 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
-from bench.dataplane.programs.engine import TYPE, peer_of
+from bench.dataplane.programs.engine import TYPE, described, peer_of
 from bench.dataplane.remote import Remote
 from protos.model import (
     Assignment,
+    Candidate,
     CandidateKind,
     InterfaceId,
     InterfaceName,
@@ -118,17 +118,9 @@ class Robot:
             identity = LinkIdentity.of(own.credential, TOKEN, InterfaceName(name), InterfaceId(number))
             link = Link(identity, random.Random(number), time.monotonic())
             self.threads[name] = InterfaceThread(sock, link, None, self.plane)
-            host = CandidateKind.HOST.value
-            address = sock.getsockname()
-            candidates.append({"interface_id": number, "interface": name, "kind": host, "address": address})
-        me = {
-            "name": "robot",
-            "role": "robot",
-            "session": SESSION,
-            "token": "AAAAAAAAAAAAAAAAAAAAcg==",
-            "credential": base64.b64encode(own.credential.encode()).decode(),
-            "candidates": candidates,
-        }
+            host, port = sock.getsockname()
+            candidates.append(Candidate(identity.interface_id, identity.interface, CandidateKind.HOST, (host, port)))
+        me = described(own.credential, TOKEN, candidates)
         clouds = sorted({cloud for _, cloud in mapping.values()})
         self.clouds = {name: self._stack.enter_context(Remote.start("engine", folder, name=name)) for name in clouds}
         peers = []

@@ -10,7 +10,7 @@ import pytest
 
 from bench import __main__ as bench
 from bench.dataplane.ours import Ours
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, SilentCut, cables
+from bench.dataplane.topology import CARRIERS, SilentCut, cables
 from bench.netlab import Lab
 
 if TYPE_CHECKING:
@@ -36,14 +36,7 @@ def test_a_section_writes_figures_verdicts_and_a_page(tmp_path: Path, monkeypatc
 def test_the_engine_answers_over_cables_while_one_is_silent_and_after_it(tmp_path: Path) -> None:
     with (
         Lab(cables()) as lab,
-        Ours(
-            tmp_path,
-            robot=lab.host(ROBOT),
-            clouds={CLOUD: lab.host(CLOUD)},
-            interfaces=CARRIERS,
-            cloud_interface=CLOUD_INTERFACE,
-            mapping=[(carrier, CLOUD) for carrier in CARRIERS],
-        ) as ours,
+        Ours.in_lab(lab, tmp_path) as ours,
     ):
         cut = SilentCut(lab)
         ours.begin(size=1000, count=60, rate_hz=30.0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bench.dataplane.ours import Ours
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, SilentCut, cables
+from bench.dataplane.topology import CARRIERS, ROBOT, SilentCut, cables
 from bench.netlab import Lab
 
 if TYPE_CHECKING:
@@ -38,12 +38,7 @@ def lab() -> Iterator[Lab]:
 
 @pytest.fixture
 def ours(lab: Lab, tmp_path: Path) -> Iterator[Ours]:
-    both = [(carrier, CLOUD) for carrier in CARRIERS]
-    clouds = {CLOUD: lab.host(CLOUD)}
-    robot = lab.host(ROBOT)
-    with Ours(
-        tmp_path, robot=robot, clouds=clouds, interfaces=CARRIERS, cloud_interface=CLOUD_INTERFACE, mapping=both
-    ) as running:
+    with Ours.in_lab(lab, tmp_path) as running:
         yield running
 
 

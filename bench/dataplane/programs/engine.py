@@ -45,6 +45,9 @@ from sidecar.net.interface_manager import InterfaceManager
 from sidecar.start_session import start_session
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from protos.credential import SessionCredential
     from sidecar.core.events import ApplicationEvent
 
 SERVICE = ServiceName("/bench")
@@ -81,7 +84,6 @@ class EngineProgram:
         self._role, self._answer_bytes = parsed.role, answer_bytes
         logging.basicConfig(level=parsed.log_level.name, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
         interpreter.share()
-        self._name = parsed.name
         self._own = start_session(parsed.node_name, parsed.role, 1, None)
         self._token = random.randbytes(16)
         hooks = DataPlaneHooks(self, lambda _interface, _event: None, lambda: None)
@@ -96,7 +98,7 @@ class EngineProgram:
         if not self._have_candidates.wait(READY_TIMEOUT_S):
             raise TimeoutError("no interface came into use")
         interpreter.settle()
-        return self._as_peer(parsed.name)
+        return described(self._own.credential, self._token, self._candidates)
 
     def meet(self, peers: list[dict[str, Any]], mapping: list[tuple[str, str]] | None = None) -> None:
         """Take these peers, and (robot) send every request over these (interface, server) pairs."""
@@ -186,22 +188,24 @@ class EngineProgram:
         if candidates:
             self._have_candidates.set()
 
-    def _as_peer(self, name: str) -> dict[str, Any]:
-        return {
-            "name": name,
-            "role": self._role.value,
-            "session": self._plane.session,
-            "token": base64.b64encode(self._token).decode(),
-            "credential": base64.b64encode(self._own.credential.encode()).decode(),
-            "candidates": [
-                {"interface_id": c.interface_id, "interface": c.interface, "kind": c.kind.value, "address": c.address}
-                for c in self._candidates
-            ],
-        }
+
+def described(credential: SessionCredential, token: bytes, candidates: Sequence[Candidate]) -> dict[str, Any]:
+    """Describe ourselves as a peer, for the other side's `meet`."""
+    return {
+        "name": credential.name,
+        "role": credential.role.value,
+        "session": credential.session,
+        "token": base64.b64encode(token).decode(),
+        "credential": base64.b64encode(credential.encode()).decode(),
+        "candidates": [
+            {"interface_id": c.interface_id, "interface": c.interface, "kind": c.kind.value, "address": c.address}
+            for c in candidates
+        ],
+    }
 
 
 def peer_of(fields: dict[str, Any]) -> Peer:
-    """Return the peer that `start` described."""
+    """Return the peer that was `described`."""
     role = Role(fields["role"])
     candidates = tuple(
         Candidate(c["interface_id"], c["interface"], CandidateKind(c["kind"]), (c["address"][0], c["address"][1]))

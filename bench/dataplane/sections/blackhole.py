@@ -16,7 +16,7 @@ from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import Calls, Row, median, ratio, worst
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, SilentCut, allow_multipath, cables
+from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, SilentCut, allow_multipath, cables
 from bench.netlab import Lab
 
 if TYPE_CHECKING:
@@ -133,15 +133,7 @@ def _sent_bytes(host: Host) -> dict[str, int]:
 
 @contextlib.contextmanager
 def _ours(world: World) -> Iterator[Remote]:
-    with Ours(
-        world.context.folder,
-        robot=world.robot,
-        clouds={CLOUD: world.cloud},
-        interfaces=CARRIERS,
-        cloud_interface=CLOUD_INTERFACE,
-        mapping=[(carrier, CLOUD) for carrier in CARRIERS],
-        answer_bytes=SIZE,
-    ) as ours:
+    with Ours.in_lab(world.lab, world.context.folder, answer_bytes=SIZE) as ours:
         yield ours.robot
 
 

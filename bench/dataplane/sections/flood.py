@@ -100,13 +100,7 @@ def measure(context: Context) -> Findings:
     with (
         Lab(cables()) as lab,
         Tap(lab.host(CLOUD), CLOUD_INTERFACE) as tap,
-        Ours(
-            context.folder,
-            robot=lab.host(ROBOT),
-            clouds={CLOUD: lab.host(CLOUD)},
-            interfaces=CARRIERS,
-            cloud_interface=CLOUD_INTERFACE,
-        ) as ours,
+        Ours.in_lab(lab, context.folder, mapping=None) as ours,
         Remote.start("flood", context.folder, host=lab.host(ATTACKER)) as attacker,
     ):
         ours.call(size=SIZE, count=WARM_UP, rate_hz=RATE_HZ)

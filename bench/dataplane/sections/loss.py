@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bench.dataplane.ours import SERVICE, Ours
+from bench.dataplane.ours import EVERY_CARRIER, SERVICE, Ours
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import Row, difference, median, quantile, ratio
 from bench.dataplane.targets import RTT_MS
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, emulated
+from bench.dataplane.topology import CARRIERS, emulated
 from bench.netlab import Lab, LinkProfile
 
 if TYPE_CHECKING:
@@ -62,16 +62,8 @@ def measure(context: Context) -> Findings:
 
 
 def _start(context: Context, lab: Lab, mode: str) -> Ours:
-    return Ours(
-        context.folder,
-        robot=lab.host(ROBOT),
-        clouds={CLOUD: lab.host(CLOUD)},
-        interfaces=CARRIERS[:1],
-        cloud_interface=CLOUD_INTERFACE,
-        mapping=[(CARRIERS[0], CLOUD)],
-        service={**SERVICE, "fec": MODES[mode]},
-        name=f"ours-{mode}",
-    )
+    service = {**SERVICE, "fec": MODES[mode]}
+    return Ours.in_lab(lab, context.folder, mapping=EVERY_CARRIER[:1], service=service, name=f"ours-{mode}")
 
 
 def _run(ours: Ours, name: str, count: int) -> tuple[Row, float]:

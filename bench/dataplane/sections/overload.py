@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bench.dataplane.ours import Ours
+from bench.dataplane.ours import EVERY_CARRIER, Ours
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import Row, median, ratio, worst
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, emulated
+from bench.dataplane.topology import CARRIERS, emulated
 from bench.netlab import Lab, LinkProfile
 
 if TYPE_CHECKING:
@@ -32,17 +32,10 @@ def measure(context: Context) -> Findings:
     rows: dict[str, list[Row]] = {"undisturbed": [], "overloaded": []}
     last: dict[str, Calls] = {}
     growth: list[float] = []
-    mappings = {"undisturbed": [(CARRIERS[0], CLOUD)], "overloaded": [(carrier, CLOUD) for carrier in CARRIERS]}
+    mappings = {"undisturbed": EVERY_CARRIER[:1], "overloaded": EVERY_CARRIER}
     with (
         Lab(emulated(GOOD, SLOW)) as lab,
-        Ours(
-            context.folder,
-            robot=lab.host(ROBOT),
-            clouds={CLOUD: lab.host(CLOUD)},
-            interfaces=CARRIERS,
-            cloud_interface=CLOUD_INTERFACE,
-            mapping=mappings["undisturbed"],
-        ) as ours,
+        Ours.in_lab(lab, context.folder, mapping=mappings["undisturbed"], interfaces=CARRIERS) as ours,
     ):
         ours.call(size=SIZE, count=WARM_UP, rate_hz=RATE_HZ)
         for repeat in range(context.repeats):

@@ -10,10 +10,10 @@ import json
 import time
 from typing import TYPE_CHECKING
 
-from bench.dataplane.ours import SERVICE, Ours
+from bench.dataplane.ours import EVERY_CARRIER, SERVICE, Ours
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import median, ratio
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, emulated
+from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, emulated
 from bench.netlab import Lab, LinkProfile
 
 if TYPE_CHECKING:
@@ -42,15 +42,7 @@ def measure(context: Context) -> Findings:
     alone: list[float | None] = []
     with (
         Lab(emulated(LINK)) as lab,
-        Ours(
-            context.folder,
-            robot=lab.host(ROBOT),
-            clouds={CLOUD: lab.host(CLOUD)},
-            interfaces=CARRIERS[:1],
-            cloud_interface=CLOUD_INTERFACE,
-            mapping=[(CARRIERS[0], CLOUD)],
-            service=PATIENT,
-        ) as ours,
+        Ours.in_lab(lab, context.folder, mapping=EVERY_CARRIER[:1], service=PATIENT) as ours,
     ):
         robot, cloud = lab.host(ROBOT), lab.host(CLOUD)
         server = cloud.popen(["iperf3", "-s"], log_path=context.folder / "iperf3.log")
