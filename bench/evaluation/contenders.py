@@ -1,4 +1,4 @@
-"""Ways to get answers from a cloud over two carriers: each gives a client that is connected and ready to call.
+"""Ways to get answers from a cloud over two carriers: each gives a client, or one for each carrier, ready to call.
 
 All of them run in the same lab: a robot with a carrier `a` and a carrier `b`, two servers that take the same time for a
 request, one request at a time. Nobody stands behind a NAT, as DDS does not pass one.
@@ -18,12 +18,15 @@ from bench.netlab import HostSpec, InterfaceSpec, LabConfig, LinkProfile, server
 from bench.system import System
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from contextlib import AbstractContextManager
     from pathlib import Path
 
     from bench.evaluation.scenario import Traffic
     from bench.netlab import Host, Lab
+
+    Clients = Sequence[Remote]
+    """Each sends every request, at the same moments; the first answer counts."""
 
 PATHS = dict(zip(CARRIERS, ("a", "b"), strict=True))
 """The robot's interface -> the path of the trace behind it."""
@@ -69,7 +72,7 @@ class Contender:
 
     name: str
     about: str
-    start: Callable[[World], AbstractContextManager[Remote]]
+    start: Callable[[World], AbstractContextManager[Clients]]
     carriers: tuple[str, ...] = CARRIERS
     """Interfaces that the robot has."""
 
@@ -81,7 +84,7 @@ class Contender:
         )
 
 
-def _direct(world: World, *, carrier: str) -> Iterator[Remote]:
+def _direct(world: World, *, carrier: str) -> Iterator[Clients]:
     cloud = world.clouds[0]
     # Multicast does not cross routers: each is told where the other is.
     there = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": cloud.address()}
@@ -90,10 +93,10 @@ def _direct(world: World, *, carrier: str) -> Iterator[Remote]:
     cloud.popen(argv, env=here, log_path=world.folder / "direct.server.log")
     with world.remote("ros", world.robot, **there) as client:
         client.ask("connect", **world.service)
-        yield client
+        yield (client,)
 
 
-def _mptcp(world: World) -> Iterator[Remote]:
+def _mptcp(world: World) -> Iterator[Clients]:
     cloud = world.clouds[0]
     allow_multipath(world.robot, cloud)
     with world.remote("tcp", cloud) as listener, world.remote("tcp", world.robot) as client:
@@ -102,25 +105,25 @@ def _mptcp(world: World) -> Iterator[Remote]:
         client.ask("call", size=1000, count=5, rate_hz=20.0)
         if client.ask("subflows") != 1:
             raise RuntimeError("the second subflow did not come up")
-        yield client
+        yield (client,)
 
 
-def _zenoh(world: World) -> Iterator[Remote]:
+def _zenoh(world: World) -> Iterator[Clients]:
     common = {"max_links": 1, "lease_ms": ZENOH_LEASE_MS}
     with contextlib.ExitStack() as stack:
         for cloud in world.clouds:
             listener = stack.enter_context(world.remote("zenoh", cloud))
             listener.ask("listen", ports=[ZENOH_PORT], **common, **world.service)
-        client = stack.enter_context(world.remote("zenoh", world.robot))
-        sessions = [
-            [f"tcp/{cloud.address()}:{ZENOH_PORT}#iface={carrier}"]
-            for cloud, carrier in zip(world.clouds, CARRIERS, strict=True)
-        ]
-        client.ask("connect", sessions=sessions, **common)
-        yield client
+        # A process for each session: one that blocks, its link being full, holds up no other.
+        clients = []
+        for cloud, carrier in zip(world.clouds, CARRIERS, strict=True):
+            client = stack.enter_context(world.remote("zenoh", world.robot))
+            client.ask("connect", sessions=[[f"tcp/{cloud.address()}:{ZENOH_PORT}#iface={carrier}"]], **common)
+            clients.append(client)
+        yield tuple(clients)
 
 
-def _plr(world: World) -> Iterator[Remote]:
+def _plr(world: World) -> Iterator[Clients]:
     service = {"name": "/echo", "deadline_ms": world.traffic.deadline_ms, "idempotent": True}
     system = System(world.lab, world.folder)
     try:
@@ -131,7 +134,7 @@ def _plr(world: World) -> Iterator[Remote]:
         system.wait_for_offer(system.start_robot([service]))
         with world.remote("ros", world.robot) as client:
             client.ask("connect", **world.service)
-            yield client
+            yield (client,)
     finally:
         system.close()
 

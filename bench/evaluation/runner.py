@@ -42,20 +42,23 @@ def run(scenario: Scenario, contender: Contender, folder: Path, *, seed: int = 1
     traffic = scenario.traffic
     trace = scenario.trace()
     plan = {"size": traffic.request_bytes, "rate_hz": traffic.rate_hz}
-    with Lab(contender.lab(), seed=seed) as lab, contender.start(World(lab, folder, traffic)) as client:
-        client.ask("call", **plan, count=max(1, round(WARM_UP_S * traffic.rate_hz)))
+    with Lab(contender.lab(), seed=seed) as lab, contender.start(World(lab, folder, traffic)) as clients:
+        _call(clients, {**plan, "count": max(1, round(WARM_UP_S * traffic.rate_hz))})
         before = {name: lab.link(name).stats(reset=True) for name in contender.carriers}
         pressure = CpuPressure()
         start = time.monotonic() + LEAD_S
         lab.replay(trace, {name: PATHS[name] for name in contender.carriers}, start=start)
         seconds = scenario.duration_s + UNANSWERED_S
-        client.begin("call", **plan, count=scenario.count, start_s=start, seconds=seconds, grace_s=UNANSWERED_S)
-        client.ready(start + seconds - time.monotonic())
+        whole = {**plan, "count": scenario.count, "start_s": start, "seconds": seconds, "grace_s": UNANSWERED_S}
+        for client in clients:
+            client.begin("call", **whole)
+        for client in clients:
+            client.ready(start + seconds - time.monotonic())
         busy = pressure.share()
         after = {name: lab.link(name).stats() for name in contender.carriers}
-        calls = _finish(client, lab, contender.carriers)
+        calls = _finish(clients, lab, contender.carriers)
     sent = {name: after[name].up.sent_bytes - before[name].up.sent_bytes for name in after}
-    late_s = [at - start - number / traffic.rate_hz for number, at in enumerate(calls.sent_s)]
+    late_s = [at - start - number / traffic.rate_hz for one in calls for number, at in enumerate(one.sent_s)]
     return Outcome(
         scenario=scenario.name,
         case=scenario.case,
@@ -88,21 +91,32 @@ def disturbances(links: Mapping[str, LinkStats], busy: float | None) -> tuple[st
     return tuple(found)
 
 
-def _finish(client: Remote, lab: Lab, carriers: Sequence[str]) -> Calls:
-    """The client's log. What it is still blocked with may leave now; no answer counts any more."""
+def _call(clients: Sequence[Remote], plan: Mapping[str, Any]) -> None:
+    for client in clients:
+        client.begin("call", **plan)
+    for client in clients:
+        client.finish()
+
+
+def _finish(clients: Sequence[Remote], lab: Lab, carriers: Sequence[str]) -> list[Calls]:
+    """The clients' logs. What they are still blocked with may leave now; no answer counts any more."""
     for name in carriers:
         lab.link(name).set(WARM)
-    return Calls.of(client.finish(DRAIN_S))
+    return [Calls.of(client.finish(DRAIN_S)) for client in clients]
 
 
-def _requests(calls: Calls, start: float, scenario: Scenario) -> tuple[Request, ...]:
+def _requests(logs: Sequence[Calls], start: float, scenario: Scenario) -> tuple[Request, ...]:
+    """Each request with the first moment at which it left, and its first answer."""
     requests = []
     for number in range(scenario.count):
+        sent = [log.sent_s[number] - start for log in logs if number < len(log.sent_s)]
+        answered = [
+            log.sent_s[number] - start + latency_s
+            for log in logs
+            if number < len(log.sent_s) and (latency_s := log.latency_s[number]) is not None
+        ]
         due_s = number / scenario.traffic.rate_hz
-        sent_s = calls.sent_s[number] - start if number < len(calls.sent_s) else None
-        latency_s = calls.latency_s[number] if sent_s is not None else None
-        answered_s = sent_s + latency_s if sent_s is not None and latency_s is not None else None
-        requests.append(Request(due_s, sent_s, answered_s))
+        requests.append(Request(due_s, min(sent, default=None), min(answered, default=None)))
     return tuple(requests)
 
 

@@ -46,7 +46,8 @@ class RosProgram:
         return usage()
 
     def close(self) -> None:
-        """End; the executor's thread is a daemon."""
+        """End."""
+        self._executor.shutdown()
         rclpy.try_shutdown()
 
     def _send(self, number: int, data: bytes) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import queue
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -26,7 +25,6 @@ class ZenohProgram:
 
     def __init__(self) -> None:
         self._sessions: list[zenoh.Session] = []
-        self._outboxes: list[queue.SimpleQueue[bytes]] = []
         self._caller = Caller(self._send)
         self._answer_bytes = HEADER.size
         self._compute_s = 0.0
@@ -58,10 +56,6 @@ class ZenohProgram:
             if time.monotonic() > end:
                 raise TimeoutError("not all links came up")
             time.sleep(0.05)
-        for session in self._sessions:
-            outbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-            self._outboxes.append(outbox)
-            threading.Thread(target=self._query, args=(session, outbox), daemon=True).start()
 
     def call(self, **plan: Any) -> dict[str, Any]:
         """Send a plan's requests."""
@@ -83,16 +77,11 @@ class ZenohProgram:
         query.reply(KEY, query.payload.to_bytes()[: self._answer_bytes])
 
     def _send(self, _number: int, data: bytes) -> None:
-        for outbox in self._outboxes:
-            outbox.put(data)
-
-    def _query(self, session: zenoh.Session, outbox: queue.SimpleQueue[bytes]) -> None:
-        """Send one session's queries; a session that blocks, its link being full, holds up no other."""
-        while True:
+        for session in self._sessions:
             session.get(
                 KEY,
                 self._on_reply,
-                payload=outbox.get(),
+                payload=data,
                 timeout=QUERY_TIMEOUT_S,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -121,4 +110,5 @@ def _open(max_links: int, lease_ms: int, *, listen: Sequence[str] = (), connect:
 
 
 if __name__ == "__main__":
+    zenoh.init_log_from_env_or("error")
     serve(ZenohProgram())
