@@ -121,7 +121,7 @@ class Decomposition:
         for stack in self.stacks:
             prices = price[stack.limit]
             best = stack.best(stack.every, prices)
-            values = stack.bound(prices, best, np.zeros(len(stack.blocks)))
+            values = stack.bound(prices, best, best.excess, OWN_EXCESS_PRICE)
             found.update(zip((block.key for block in stack.blocks), values.tolist(), strict=True))
         return found
 
@@ -161,8 +161,7 @@ class Decomposition:
         for stack, forced in zip(self.stacks, self._forced, strict=True):
             prices = price[stack.limit]
             best = stack.best(stack.every, prices, excess_price)
-            more = np.multiply(best.excess - forced, excess_price, dtype=np.float64)
-            total += float(stack.bound(prices, best, more).sum())
+            total += float(stack.bound(prices, best, forced, excess_price).sum())
             found.append(best)
         return total, found
 

@@ -86,6 +86,19 @@ def chooses_interfaces(block: Block) -> bool:
     return block.copies_wanted.least < len(block.interfaces)
 
 
+def least_violations(block: Block) -> int:
+    """How many violations no choice is below that does not crowd a server: as many as copies outnumber domains."""
+    if block.target is not None:
+        return 0
+    least = block.copies_wanted.least
+    count = 0
+    if block.idempotent and block.regions and all(block.regions):
+        count += max(0, least - len(set(block.regions)))
+    if block.idempotent and block.carriers and all(block.carriers) and chooses_interfaces(block):
+        count += max(0, least - len(set(block.carriers)))
+    return count
+
+
 def has_shared_regions(block: Block) -> bool:
     """Whether two of its copies may meet in a region that is known."""
     labels = [region for region in block.regions if region]

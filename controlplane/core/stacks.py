@@ -20,16 +20,15 @@ from controlplane.core.choices import (
     MAX_LISTED,
     OWN_EXCESS_PRICE,
     combinations,
-    lift_floor,
     list_choices,
     nearest,
     own_excess,
 )
-from controlplane.core.costs import TARGET_FLOOR, choice_costs
+from controlplane.core.costs import choice_costs
 from controlplane.core.domains import repeats
 from controlplane.core.matching import cheapest_matching
-from controlplane.core.objectives import cost_of_none, epsilon_matrix, path_costs
-from controlplane.core.problem import Objective
+from controlplane.core.objectives import epsilon_matrix, path_costs
+from controlplane.core.path_bound import PathBound, path_bound
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.choices import Near
     from controlplane.core.limits import Limits
-    from controlplane.core.problem import Block, Choice
+    from controlplane.core.problem import Block, Choice, Objective
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]
@@ -81,10 +80,11 @@ class Stack(abc.ABC):
     def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
         """Choices of one block within `margin` of its best."""
 
-    def bound(self, price: Floats, best: Best, more_excess: Floats) -> Floats:
-        """What the best of each block is worth at least: `best` at these prices, where `more_excess` is the price of
-        what it exceeds the block's own capacity by beyond what it must."""
-        return best.value + more_excess
+    def bound(self, price: Floats, best: Best, forced: Indices, excess_price: float) -> Floats:
+        """What the best of each block is worth at least: `best` at these prices, and `excess_price` for each interface
+        by which it exceeds the block's own capacity beyond what it must (`forced`)."""
+        value: Floats = best.value + np.multiply(best.excess - forced, excess_price, dtype=np.float64)
+        return value
 
     def picks_of(self, choice: Choice) -> list[int]:
         """A choice in this stack's numbering."""
@@ -156,8 +156,7 @@ def _match(priced: Floats, capacity: Indices, excess_price: float) -> Best:
 class EnumeratedStack(Stack):
     """Blocks whose choices are listed: all others.
 
-    Where a block has more than `at_most` choices, only some are. Its bound then rests on each path's own cost, no
-    violation, and the miss probability being no less than the product of its epsilons and of the lifts below 1.
+    Where a block has more than `at_most` choices, only some are, and its bound comes from `path_bound`.
     """
 
     def __init__(self, objective: Objective, blocks: Sequence[Block], limits: Limits, *, at_most: int) -> None:
@@ -168,7 +167,7 @@ class EnumeratedStack(Stack):
         self._cost = np.full((len(blocks), longest), np.inf)
         self._excess = np.zeros((len(blocks), longest), dtype=np.intp)
         self._count = [len(listed.choices) for listed in lists]
-        self._trimmed: dict[int, _PathBound] = {}
+        self._trimmed: dict[int, PathBound] = {}
         """By row."""
         for row, (block, (choices, complete)) in enumerate(zip(blocks, lists, strict=True)):
             count = len(choices)
@@ -176,7 +175,7 @@ class EnumeratedStack(Stack):
             self._choices[row, :count] = np.where(choices < 0, self.servers, choices)
             self._excess[row, :count] = own_excess(block, choices)
             if not complete:
-                self._trimmed[row] = _PathBound(objective, block)
+                self._trimmed[row] = path_bound(objective, block)
 
     def _priced(self, rows: Indices, price: Floats) -> Floats:
         values = self._cost[rows]
@@ -201,30 +200,8 @@ class EnumeratedStack(Stack):
             complete=row not in self._trimmed,
         )
 
-    def bound(self, price: Floats, best: Best, more_excess: Floats) -> Floats:
-        bound = best.value + more_excess
+    def bound(self, price: Floats, best: Best, forced: Indices, excess_price: float) -> Floats:
+        bound = super().bound(price, best, forced, excess_price)
         for row, paths in self._trimmed.items():
-            bound[row] = paths.at(price[row])
+            bound[row] = paths.at(price[row], int(forced[row]), excess_price)
         return bound
-
-
-class _PathBound:
-    """What no choice of a block is below, path by path."""
-
-    def __init__(self, objective: Objective, block: Block) -> None:
-        least, most = block.copies_wanted
-        self._least, self._most = least if block.idempotent else 1, most
-        if block.target is not None:
-            self._costs = np.where(np.isnan(epsilon_matrix(block)), np.inf, 0.0)
-            self._none, self._rest = 0.0, TARGET_FLOOR
-        else:
-            self._costs = path_costs(objective, epsilon_matrix(block))
-            self._none = cost_of_none(objective)
-            self._rest = lift_floor(block) if objective is Objective.JOINT else 0.0
-
-    def at(self, price: Floats) -> float:
-        """At these prices of the servers."""
-        interfaces, servers = self._costs.shape
-        gains = np.sort((self._costs + price[:servers]).min(axis=1) - self._none)
-        copies = max(self._least, min(self._most, int((gains < 0).sum())))
-        return float(self._none * interfaces + gains[:copies].sum() + self._rest)

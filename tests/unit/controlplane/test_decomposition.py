@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from ortools.graph.python import min_cost_flow
 
+from controlplane.core.choices import OWN_EXCESS_PRICE
 from controlplane.core.decomposition import Decomposition, stack_blocks
 from controlplane.core.limits import Limits
 from controlplane.core.objectives import path_costs
@@ -59,7 +60,7 @@ def test_what_is_not_listed_is_not_below_the_bound(at_most: int, ruled: bool) ->
             stack = EnumeratedStack(Objective.JOINT, [part], Limits(problem), at_most=at_most)
             prices = np.array([[*(rng.random() for _ in part.servers), 0.0]])
             found = stack.best(stack.every, prices)
-            (bound,) = stack.bound(prices, found, np.zeros(1))
+            (bound,) = stack.bound(prices, found, found.excess, OWN_EXCESS_PRICE)
             _, best = best_at(Objective.JOINT, part, prices[0].tolist())
             if found.excess[0] == best_at(Objective.JOINT, part, prices[0].tolist())[0]:
                 assert bound <= best + 1e-9

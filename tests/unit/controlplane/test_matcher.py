@@ -10,10 +10,11 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from controlplane.core.plan import price
-from controlplane.core.problem import FleetKey, Objective, Problem, is_valid
+from controlplane.core.problem import Block, FleetKey, Objective, Problem, Target, is_valid
 from controlplane.matcher import Matcher, solve
 from controlplane.solver import RESOLUTION
 from protos.model import NodeName
+from protos.preferences import AT_MOST_EVERY_INTERFACE, Copies
 from tests.unit.controlplane.problems import PLAN, best_price, block, choices_of, fleet, random_problem
 
 AMPLE_S = 60.0
@@ -157,6 +158,37 @@ def test_robots_that_leave_and_come_need_no_other_to_move() -> None:
     assert back.relaxed == 0
     assert matcher.incremental == 2
     assert matcher.solve(problem, time_limit_s=AMPLE_S) == back
+
+
+def test_a_fleet_with_rules_shares_servers_within_the_capacities_and_near_the_bound() -> None:
+    rng = random.Random(9)
+    problem = fleet(rng, 100, 3, 12, Objective.JOINT, 1.1)
+    problem = replace(problem, blocks=tuple(ruled(rng, part) for part in problem.blocks))
+    matcher = Matcher()
+    plan = matcher.solve(problem, time_limit_s=AMPLE_S)
+    assert plan.relaxed == 0
+    assert plan.gap <= 0.01
+    choices = choices_of(problem, {key: made.assignments for key, made in plan.blocks.items()})
+    assert all(is_valid(part, choices[part.key]) for part in problem.blocks)
+    assert price(problem, choices).cost == pytest.approx(plan.cost)
+    plain = [plan.blocks[part.key] for part in problem.blocks if part.target is None]
+    assert sum(bool(made.shared) for made in plain) <= 0.05 * len(plain), "there are three regions and carriers"
+    met = [not made.shortfall for made in plan.blocks.values() if made.target_miss]
+    assert sum(met) >= 0.9 * len(met)
+    problem = with_block(problem, 3, problem.blocks[4].epsilon)
+    again = matcher.solve(problem, time_limit_s=AMPLE_S)
+    assert matcher.incremental == 1
+    assert again.bound <= solve(problem, time_limit_s=AMPLE_S).cost
+
+
+def ruled(rng: random.Random, part: Block) -> Block:
+    """Three regions and carriers; two copies of the one half's requests, the other half cheap."""
+    regions = tuple(("eu", "us", "asia")[number % 3] for number in range(len(part.servers)))
+    labelled = replace(part, regions=regions, carriers=("a", "a", "b"))
+    if rng.random() < 0.5:
+        return replace(labelled, copies=Copies(2, 2))
+    charges = tuple(tuple(float(rng.randint(1, 9)) for _ in part.servers) for _ in part.interfaces)
+    return replace(labelled, copies=AT_MOST_EVERY_INTERFACE, target=Target(0.01, charges))
 
 
 def test_what_all_share_changes_all() -> None:
