@@ -16,8 +16,10 @@ from rich.console import Console
 from bench.dataplane.command import rich_table
 from bench.dataplane.report import machine
 from bench.dataplane.section import Figure, Table
+from bench.evaluation.comparison import compare, gains
 from bench.evaluation.contenders import CONTENDERS
 from bench.evaluation.ideal import IDEALS, compute
+from bench.evaluation.outcome import Outcome
 from bench.evaluation.runner import run as run_in_lab
 from bench.evaluation.scenario import Scenario, read_scenarios
 from bench.netlab import LabConfigError
@@ -28,8 +30,8 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
-    from bench.evaluation.outcome import Outcome
-
+RUNS = "evaluation"
+"""Folder of the records, within that of the reports."""
 QUICK_SCENARIO = "drive-1"
 QUICK_SECONDS = 20.0
 _COLUMNS = ("", "missed", "never answered", "mean ms", "P50 ms", "P99 ms", "kB/request", "void")
@@ -57,14 +59,14 @@ def run(options: argparse.Namespace) -> int:
         print(error, file=sys.stderr)
         return 2
     console = Console(highlight=False, soft_wrap=True)
-    outcomes: list[Outcome] = []
     failed: list[str] = []
+    void = False
     for scenario in scenarios:
         console.print(f"{scenario.name} (case {scenario.case}): {scenario.about}, {scenario.duration_s:g} s")
         for contender in options.contender or (*IDEALS, *CONTENDERS):
             with console.status(f"{scenario.name}: {contender}"):
                 try:
-                    outcomes.append(_run(scenario, contender, options.keep_logs))
+                    outcome = _run(scenario, contender, options.keep_logs)
                 except LabConfigError as error:
                     print(error, file=sys.stderr)
                     return 2
@@ -72,14 +74,19 @@ def run(options: argparse.Namespace) -> int:
                     traceback.print_exc()
                     failed.append(f"{scenario.name}, {contender}: {error}".splitlines()[0])
                     continue
-            outcomes[-1].write(options.out / "evaluation")
-            for why in outcomes[-1].disturbances:
+            outcome.write(options.out / RUNS)
+            void |= bool(outcome.disturbances)
+            for why in outcome.disturbances:
                 console.print(f"{contender}: void, {why}")
+        try:
+            outcomes = [Outcome.read(file) for file in sorted((options.out / RUNS).glob("*/*.json"))]
+        except ValueError as error:
+            print(error, file=sys.stderr)
+            return 2
         console.print(rich_table(_table(scenario, outcomes)))
-        _write(options, outcomes, failed)
+        _write(options.out, outcomes, failed)
     for text in failed:
         console.print(f"failed: {text}")
-    void = any(outcome.disturbances for outcome in outcomes)
     return 1 if failed or (void and not options.quick) else 0
 
 
@@ -118,14 +125,19 @@ def _table(scenario: Scenario, outcomes: Sequence[Outcome]) -> Table:
     return Table(title, _COLUMNS, tuple(rows))
 
 
-def _write(options: argparse.Namespace, outcomes: Sequence[Outcome], failed: Sequence[str]) -> None:
+def _write(folder: Path, outcomes: Sequence[Outcome], failed: Sequence[str]) -> None:
+    """The figures of all runs whose records are in the folder, of this call or an earlier one."""
     runs: dict[str, dict[str, Any]] = {}
+    compared = compare(outcomes)
     for outcome in outcomes:
+        comparison = compared.get(outcome.scenario, {}).get(outcome.contender)
         runs.setdefault(outcome.scenario, {})[outcome.contender] = {
             **asdict(outcome.figures()),
+            **(asdict(comparison) if comparison else {}),
             "case": outcome.case,
             "deadline_ms": outcome.deadline_ms,
             "void": list(outcome.disturbances),
         }
-    report = {"runs": runs, "failed": list(failed), "machine": machine(), "quick": options.quick}
-    (options.out / "evaluation.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    medians = {name: asdict(gain) for name, gain in gains(outcomes).items()}
+    report = {"gains": medians, "runs": runs, "failed": list(failed), "machine": machine()}
+    (folder / "evaluation.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")

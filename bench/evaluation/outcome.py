@@ -91,9 +91,12 @@ class Outcome:
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """The inverse of `write`."""
-        fields: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        del fields["figures"]
-        fields["requests"] = tuple(Request(**request) for request in fields["requests"])
-        fields["disturbances"] = tuple(fields["disturbances"])
-        return cls(**fields)
+        """The inverse of `write`. Raises ValueError: not such a file; names it."""
+        try:
+            fields: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+            del fields["figures"]
+            fields["requests"] = tuple(Request(**request) for request in fields["requests"])
+            fields["disturbances"] = tuple(fields["disturbances"])
+            return cls(**fields)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{file}: expected the record of a run, remove it: {error}") from None

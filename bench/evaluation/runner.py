@@ -69,6 +69,7 @@ def run(scenario: Scenario, contender: Contender, folder: Path, *, seed: int = 1
         disturbances=disturbances(after, busy),
         conditions={
             "cpu_pressure": busy,
+            "unsent": sum(max(0, scenario.count - len(one.sent_s)) for one in calls),
             "client_late_p99_ms": (quantile(late_s, 0.99) or 0.0) * MS,
             "links": {name: _conditions(stats) for name, stats in after.items()},
         },

@@ -107,10 +107,11 @@ class Scenario:
         return generate(self.kind, self.seed, self.duration_s)
 
     def shortened(self, duration_s: float) -> Scenario:
-        """At most this long: a shorter generated window, the middle of a recorded one."""
-        shorter = min(self.duration_s, duration_s)
-        window = None if self.window is None else self.window.middle(shorter)
-        return replace(self, duration_s=shorter, window=window)
+        """At most this long: a shorter generated window, the middle of a recorded one; another name, if shorter."""
+        if duration_s >= self.duration_s:
+            return self
+        window = None if self.window is None else self.window.middle(duration_s)
+        return replace(self, name=f"{self.name}-{duration_s:g}s", duration_s=duration_s, window=window)
 
 
 def read_scenarios(traces: Sequence[TraceEntry], folder: Path = FOLDER) -> list[Scenario]:

@@ -25,8 +25,8 @@ def test_ros_over_one_carrier_replays_a_window_beside_the_ideal(
     assert bench.main() == 0
     report = json.loads((tmp_path / "evaluation.json").read_text())
     assert report["failed"] == []
-    assert set(report["runs"]["blind-spot-1"]) == set(contenders)
-    outcome = Outcome.read(tmp_path / "evaluation" / "blind-spot-1" / "direct-b.json")
+    assert set(report["runs"]["blind-spot-1-2s"]) == set(contenders)
+    outcome = Outcome.read(tmp_path / "evaluation" / "blind-spot-1-2s" / "direct-b.json")
     assert [request.due_s for request in outcome.requests] == pytest.approx([number / 5 for number in range(10)])
     assert any(request.answered_s is not None for request in outcome.requests)
     assert outcome.bytes_sent["wwan0"] > 10 * 120_000

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 import pytest
 
+from bench.evaluation.comparison import Comparison, compare, gains
 from bench.evaluation.ideal import compute
 from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request
 from bench.evaluation.scenario import read_scenarios
@@ -95,7 +96,8 @@ def test_the_ideal_takes_the_faster_path_of_each_request(tmp_path: Path, monkeyp
     assert both.requests == a.requests
     assert both.figures().p99_ms == pytest.approx(120_000 * 8 / 20_000 + 20 + 1000 * 8 / 20_000 + 20)
     assert b.figures().unanswered_ratio == b.figures().miss_ratio == 1.0
-    assert scenario.shortened(10.0).count == 50
+    assert (scenario.shortened(10.0).count, scenario.shortened(10.0).name) == (50, "some-1-10s")
+    assert scenario.shortened(30.0) == scenario
 
 
 def test_whoever_has_no_answer_counts_as_ten_seconds_and_the_sender_s_delay_counts() -> None:
@@ -115,4 +117,35 @@ def test_whoever_has_no_answer_counts_as_ten_seconds_and_the_sender_s_delay_coun
 def test_an_outcome_is_written_and_read(tmp_path: Path) -> None:
     outcome = Outcome("s", "A", "c", 1000.0, (Request(0.0, 0.0, None),), {"wlan0": 1}, ("late",), {"p99_s": 0.1})
     assert Outcome.read(outcome.write(tmp_path)) == outcome
-    assert replace(outcome, contender="d").write(tmp_path) == tmp_path / "s" / "d.json"
+    file = replace(outcome, contender="d").write(tmp_path)
+    assert file == tmp_path / "s" / "d.json"
+    for text in ("{", "{}", '{"figures": {}, "requests": [{"x": 1}], "disturbances": []}'):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=r"d\.json: expected the record of a run"):
+            Outcome.read(file)
+
+
+def ran(scenario: str, contender: str, *latencies_s: float | None, void: bool = False) -> Outcome:
+    requests = tuple(Request(0.0, 0.0, latency_s) for latency_s in latencies_s)
+    return Outcome(scenario, "A", contender, 1000.0, requests, disturbances=("late",) if void else ())
+
+
+def test_a_contender_is_compared_with_the_better_direct_run_and_the_ideal() -> None:
+    hard = [
+        ran("hard", "direct-a", 0.4, 2.0),
+        ran("hard", "direct-b", 0.2, None),
+        ran("hard", "ideal", 0.1, 0.5),
+        ran("hard", "ours", 0.2, 0.4),
+    ]
+    easy = [ran("easy", "direct-a", 0.4), ran("easy", "direct-b", 0.4), ran("easy", "ours", 0.1)]
+    void = [ran("void", "direct-a", None), ran("void", "direct-b", 0.4, void=True), ran("void", "ours", 0.1)]
+    found = compare([*hard, *easy, *void])
+    hard_one = {"mean_gain": 4.0, "p99_gain": 5.0, "miss_over_ideal": 0.0, "p99_over_ideal": 0.8}
+    assert asdict(found["hard"]["ours"]) == pytest.approx(hard_one)
+    assert found["hard"]["direct-a"].miss_over_ideal == 0.5
+    assert "ideal" not in found["hard"]
+    assert found["easy"]["ours"].p99_gain == pytest.approx(4.0)
+    assert found["void"]["ours"] == Comparison(None, None, None, None)
+    medians = gains([*hard, *easy, *void])
+    assert list(medians) == ["ours"]
+    assert asdict(medians["ours"]) == pytest.approx({"windows": 1, "mean_gain": 4.0, "p99_gain": 5.0})

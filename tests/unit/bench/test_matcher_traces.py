@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import random
 
+from bench.evaluation.generator import generate
 from bench.matcher.calibration import DEADLINES_S, Cell, cells_of, paired, predict, share_calibrated
 from bench.matcher.choosing import choose
 from bench.matcher.feed import LIFETIME_S, Reporter
 from bench.matcher.races import Probe, Race, Workload, replay
-from bench.matcher.sources import synthetic
 from protos.convert import report_from_proto, report_to_proto
 
 
@@ -56,8 +56,8 @@ def test_of_a_request_that_is_no_full_race_only_the_pair_is_told() -> None:
 
 
 def test_predictions_meet_what_is_observed_on_random_paths() -> None:
-    races = replay(synthetic(3), Workload("20 kB", 20_000, 10.0))
-    assert races == replay(synthetic(3), Workload("20 kB", 20_000, 10.0)), "the same every time"
+    races = replay(generate("drive", 3, 600.0), Workload("20 kB", 20_000, 10.0))
+    assert races == replay(generate("drive", 3, 600.0), Workload("20 kB", 20_000, 10.0)), "the same every time"
     predicted = {deadline_s: predict(races, deadline_s) for deadline_s in DEADLINES_S}
     cells = [cell for deadline_s in DEADLINES_S for cell in cells_of(races, deadline_s, predicted[deadline_s])]
     share = share_calibrated(cells)
