@@ -44,6 +44,10 @@ MAX_CHANGES = 4
 CHANGE_WINDOW_S = 60.0
 """So often in so long a robot's service moves to something better. What died, or has no room, is left at once."""
 
+HOPELESS = 0.5
+"""Where all copies are expected to miss more often than this, the paths are as good as dead: no number of changes keeps
+a robot there."""
+
 
 class _Difference(NamedTuple):
     """A block whose new choice is not its running one."""
@@ -98,11 +102,13 @@ class Stability:
         more = _more_excess(problem, together, load)
         if more:
             return more < 0
-        spent = any(self._is_spent(difference.block.key, now) for difference in together)
+        spent = any(self._is_spent(difference, now) for difference in together)
         return not spent and _is_worth_it(problem.objective, together)
 
-    def _is_spent(self, key: BlockKey, now: float) -> bool:
-        times = self._changed.get(key, ())
+    def _is_spent(self, difference: _Difference, now: float) -> bool:
+        if difference.old is not None and joint_miss(difference.block, difference.old) > HOPELESS:
+            return False
+        times = self._changed.get(difference.block.key, ())
         return sum(now - time < CHANGE_WINDOW_S for time in times) >= MAX_CHANGES
 
 

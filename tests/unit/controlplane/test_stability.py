@@ -188,6 +188,16 @@ def test_a_robot_moves_to_something_better_only_so_often_in_a_minute() -> None:
     assert len(moves) == MAX_CHANGES * 5
 
 
+def test_no_number_of_changes_keeps_a_robot_where_all_copies_miss() -> None:
+    stability = Stability()
+    sides = [block([[0.01, 0.9]]), block([[0.9, 0.01]])]
+    plan = Plan({})
+    for second in range(20):
+        problem = Problem((sides[second % 2],))
+        plan = stability.settle(problem, solve(problem, time_limit_s=60), plan, float(second))
+        assert plan.blocks[sides[0].key].assignments == (("if0", f"cloud-{second % 2}"),)
+
+
 def test_a_path_that_dies_is_left_however_often_that_happens() -> None:
     stability = Stability()
     sides = [block([[0.1, None]]), block([[None, 0.1]])]
