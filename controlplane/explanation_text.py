@@ -54,6 +54,8 @@ def _mapping(found: Explanation) -> Iterator[str]:
     refused = f" ({found.sync.error})" if found.sync.error else ""
     yield f"version {found.sync.version_sent}, {found.sync.state.value}{refused}{age}"
     yield f"reason: {found.mapping.reason or '-'}"
+    if found.mapping.explore is not None:
+        yield f"explores {_path(found.mapping.explore)}: a few requests send one more copy there"
 
 
 def _pairs(found: Explanation) -> Iterator[str]:

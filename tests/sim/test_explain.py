@@ -149,6 +149,14 @@ def test_what_paths_share_and_what_they_cost_is_told() -> None:
     assert "wlan0 (blue)" in text
 
 
+def test_what_is_explored_is_told(world: World) -> None:
+    found = asked(world)
+    assert found.mapping is not None
+    exploring = replace(found, mapping=replace(found.mapping, explore=on("wlan0", "b")))
+    assert "explores wlan0 -> b" in render(exploring)
+    assert "explores" not in render(replace(found, mapping=replace(found.mapping, explore=None)))
+
+
 def test_a_pair_that_the_operator_bars_is_said_to_be() -> None:
     rule = PathRule(("*",), ("wlan0",), ("a",), allow=False)
     world = World(Settings(warm_up_s=0.0, path_rules=(rule,)))
