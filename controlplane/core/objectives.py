@@ -102,14 +102,31 @@ def _joint_costs(block: Block, epsilon: NDArray[np.float64], choices: NDArray[np
     if not block.lifts:
         return total
     cap = singles.min(axis=1)
-    named = np.array(list(block.lifts), dtype=np.intp)
-    logs = np.log(np.maximum(np.fromiter(block.lifts.values(), np.float64, len(named)), PROBABILITY_FLOOR))
-    interfaces, servers = epsilon.shape
-    # An interface without a server has index -1: the last row and column, which stay 0.
-    lifts = np.zeros((interfaces, servers + 1, interfaces, servers + 1))
-    lifts[named[:, 0, 0], named[:, 0, 1], named[:, 1, 0], named[:, 1, 1]] = logs
-    for i, k in itertools.combinations(range(interfaces), 2):
-        lift = lifts[i, choices[:, i], k, choices[:, k]]
-        total = total + lift
-        cap = np.minimum(cap, singles[:, i] + singles[:, k] + lift)
+    of_pairs = _lifts_of_pairs(block, epsilon.shape[1])
+    for i, k in itertools.combinations(range(epsilon.shape[0]), 2):
+        both = singles[:, i] + singles[:, k]
+        if (i, k) in of_pairs:
+            codes, logs = of_pairs[i, k]
+            there = (choices[:, i] >= 0) & (choices[:, k] >= 0)
+            wanted = np.where(there, choices[:, i] * epsilon.shape[1] + choices[:, k], -1)
+            at = np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)
+            lift = np.where(codes[at] == wanted, logs[at], 0.0)
+            total = total + lift
+            both = both + lift
+        cap = np.minimum(cap, both)
     return np.where(np.isinf(total), np.inf, np.minimum(total, cap))
+
+
+def _lifts_of_pairs(block: Block, servers: int) -> dict[tuple[int, int], tuple[NDArray[np.intp], NDArray[np.float64]]]:
+    """By pair of interfaces: codes of the two servers, ascending, and the logarithms of their lifts.
+
+    A table of all interfaces and servers would be as large as a robot likes that names hundreds of interfaces.
+    """
+    lifts: dict[tuple[int, int], list[tuple[int, float]]] = {}
+    for ((i, j), (k, m)), lift in block.lifts.items():
+        lifts.setdefault((i, k), []).append((j * servers + m, math.log(max(lift, PROBABILITY_FLOOR))))
+    found = {}
+    for pair, entries in lifts.items():
+        codes, logs = zip(*sorted(entries), strict=True)
+        found[pair] = np.array(codes, dtype=np.intp), np.array(logs)
+    return found

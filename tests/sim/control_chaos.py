@@ -18,16 +18,19 @@ from typing import TYPE_CHECKING
 from controlplane.core.control_events import Settings
 from protos.model import (
     CandidateSet,
+    InterfaceName,
     MappingSet,
     NodeName,
     PeerSet,
     Role,
     ServiceName,
     ServiceSet,
+    ServiceUse,
     SessionId,
     SyncState,
     Version,
 )
+from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import PLAN_TYPE, interfaces, offer, path, registration, use
 
@@ -121,7 +124,8 @@ class Chaos:
         if anew:
             self.incarnations[name] = self.incarnations.get(name, 0) + 1
         said = registration(name, role, incarnation=self.incarnations[name])
-        said = dataclasses.replace(said, session=SessionId(zlib.crc32(name.encode()) << 20 | self.incarnations[name]))
+        session = SessionId(zlib.crc32(name.encode()) << 20 | self.incarnations[name])
+        said = dataclasses.replace(said, session=session, region=self.rng.choice(["", "eu", "us"]))
         if known is not None:
             lost_disk = anew and self.rng.random() < 0.3
             if lost_disk:
@@ -136,7 +140,9 @@ class Chaos:
         nics = self.rng.sample(NICS, self.rng.randint(0 if self.rng.random() < 0.1 else 1, len(NICS)))
         # What the sidecar told before may stand in a mapping that is on its way.
         self.told_interfaces[sidecar.name] = set(nics)
-        self.world.say(sidecar, CandidateSet(interfaces(*nics)))
+        labelled = [InterfaceName(nic) for nic in nics if self.rng.random() < 0.5]
+        labels = (InterfaceLabel(nic, self.rng.choice(["", "a", "b"]), self.rng.random()) for nic in labelled)
+        self.world.say(sidecar, CandidateSet(interfaces(*nics), tuple(labels)))
 
     def tell_services(self, sidecar: SimSidecar) -> None:
         names = self.rng.sample(SERVICES, self.rng.randint(1, len(SERVICES)))
@@ -145,8 +151,12 @@ class Chaos:
             offers = tuple(offer(name, capacity=self.rng.choice([0, 0, 1, 3])) for name in names)
             self.world.say(sidecar, ServiceSet(offers))
         else:
-            uses = tuple(use(name, idempotent=self.rng.random() < 0.7, type_=PLAN_TYPE) for name in names)
-            self.world.say(sidecar, ServiceSet((), uses))
+            self.world.say(sidecar, ServiceSet((), tuple(self.use(name) for name in names)))
+
+    def use(self, name: str) -> ServiceUse:
+        plain = use(name, idempotent=self.rng.random() < 0.7, type_=PLAN_TYPE)
+        copies = self.rng.choice([EVERY_INTERFACE, EVERY_INTERFACE, AT_MOST_EVERY_INTERFACE, Copies(2, 2)])
+        return dataclasses.replace(plain, copies=copies, target_miss=self.rng.choice([0.0, 0.0, 0.3, 1e-4]))
 
     def report(self, robot: SimSidecar) -> None:
         self.world.report(

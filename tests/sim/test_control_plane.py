@@ -9,10 +9,11 @@ import pytest
 
 from controlplane.core.control_events import Settings
 from controlplane.core.policy import CallRule, OfferRule, Policy
-from protos.model import CandidateSet, MappingSet, PeerSet, Role, ServiceSet
+from protos.model import CandidateSet, InterfaceName, MappingSet, PeerSet, Role, ServiceSet
+from protos.preferences import AT_MOST_EVERY_INTERFACE, Copies, InterfaceLabel
 from tests.sim.control_chaos import Chaos
 from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import interfaces, offer, use
+from tests.unit.controlplane.samples import interfaces, offer, registration, use
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -87,3 +88,27 @@ def test_a_restarted_control_plane_never_takes_a_living_server_from_a_robot(seed
         assert now.peers_version > robot.peers_version
         assert len(now.peer_sets) == 1
         assert len(now.pairs()) == 2
+
+
+def test_labels_and_wishes_of_sidecars_decide_their_mappings() -> None:
+    world = World()
+    for name, region in (("cloud-a", "eu"), ("cloud-b", "eu"), ("cloud-c", "us")):
+        cloud = world.join(dataclasses.replace(registration(name, Role.CLOUD), region=region))
+        world.say(cloud, CandidateSet(interfaces("eth0")))
+        world.say(cloud, ServiceSet((offer(),)))
+    robot = world.robot("robot", copies=Copies(2, 2))
+    nics = ("wlan0", "wwan0", "wwan1")
+    carriers = {"wlan0": "own", "wwan0": "telekom", "wwan1": "telekom"}
+    labels = tuple(InterfaceLabel(InterfaceName(nic), carrier) for nic, carrier in carriers.items())
+    world.say(robot, CandidateSet(interfaces(*nics), labels))
+    world.all_up(robot, ("cloud-a", "cloud-b", "cloud-c"), *nics)
+    world.run(3.0)
+    (mapping,) = robot.services
+    assert len(mapping.assignments) == 2
+    assert len({carriers[assignment.interface] for assignment in mapping.assignments}) == 2
+    assert "cloud-c" in {assignment.server for assignment in mapping.assignments}
+    world.say(robot, ServiceSet((), (use(copies=AT_MOST_EVERY_INTERFACE, target_miss=0.95),)))
+    world.run(3.0)
+    (mapping,) = robot.services
+    assert len(mapping.assignments) == 1
+    assert mapping.reason.startswith("least cost that meets the target")

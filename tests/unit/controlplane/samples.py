@@ -23,6 +23,7 @@ from protos.model import (
     SessionId,
     Version,
 )
+from protos.preferences import EVERY_INTERFACE, Copies
 
 PLAN = ServiceName("/plan")
 PLAN_TYPE = "nav_msgs/srv/GetPlan"
@@ -58,8 +59,16 @@ def interfaces(*names: str) -> tuple[Candidate, ...]:
     return tuple(candidate(name, number) for number, name in enumerate(names))
 
 
-def use(name: str = PLAN, *, deadline_s: float = 0.1, idempotent: bool = True, type_: str = PLAN_TYPE) -> ServiceUse:
-    return ServiceUse(ServiceName(name), type_, deadline_s, idempotent)
+def use(
+    name: str = PLAN,
+    *,
+    deadline_s: float = 0.1,
+    idempotent: bool = True,
+    type_: str = PLAN_TYPE,
+    copies: Copies = EVERY_INTERFACE,
+    target_miss: float = 0.0,
+) -> ServiceUse:
+    return ServiceUse(ServiceName(name), type_, deadline_s, idempotent, copies, target_miss)
 
 
 def offer(name: str = PLAN, *, capacity: int = 0, type_: str = PLAN_TYPE) -> ServiceOffer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -149,6 +150,13 @@ def at(ip: bytes, port: int = 4000) -> dict[str, Any]:
     return {"address": types_pb2.Address(ip=ip, port=port)}
 
 
+def labels(*changes: dict[str, Any]) -> control_pb2.SidecarMessage:
+    message = candidates({})
+    fields: dict[str, Any] = {"interface": "wlan0", "carrier": "telekom", "charge": 2.0}
+    message.candidates.labels.extend(types_pb2.InterfaceLabel(**(fields | change)) for change in changes)
+    return message
+
+
 def services(offers: Any = (), uses: Any = ()) -> control_pb2.SidecarMessage:
     return control_pb2.SidecarMessage(services=control_pb2.Services(offers=offers, uses=uses))
 
@@ -177,7 +185,7 @@ def joint(**changes: Any) -> control_pb2.SidecarMessage:
 
 
 def test_the_samples_that_the_next_test_breaks_are_good() -> None:
-    for message in (register(), candidates({}), services(uses=[use()]), latency(), joint()):
+    for message in (register(), candidates({}), labels({}), services(uses=[use()]), latency(), joint()):
         sidecar_message_from_proto(message)
 
 
@@ -225,6 +233,19 @@ def test_the_samples_that_the_next_test_breaks_are_good() -> None:
         (services(uses=[use(), use()]), "uses"),
         (services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A", capacity=1 << 31)]), "capacity"),
         (services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A")] * 2), "offers"),
+        (services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A", charge=-1.0)]), "charge"),
+        (services(uses=[use(target_miss=1.5)]), "target_miss"),
+        (services(uses=[use(target_miss=math.nan)]), "target_miss"),
+        (services(uses=[use(least_copies=257)]), "least_copies"),
+        (services(uses=[use(most_copies=257)]), "most_copies"),
+        (services(uses=[use(least_copies=3, most_copies=2)]), "least_copies"),
+        (services(uses=[use(most_copies=2)]), "least_copies"),
+        (register(region="eu central"), "region"),
+        (register(region="-eu"), "region"),
+        (labels({"interface": "wwan0"}), "labels"),
+        (labels({}, {}), "labels"),
+        (labels({"carrier": "a\n"}), "carrier"),
+        (labels({"charge": math.inf}), "charge"),
         (latency(server=""), "server"),
         (latency(latency=types_pb2.Histogram(layout=2, index=[1], count=[1])), "layout"),
         (latency(latency=types_pb2.Histogram(layout=1, index=[1], count=[])), "histogram"),
