@@ -20,7 +20,7 @@ LEAST_SHOWN = 1e-9
 
 _PAIR_HEADER = (
     *("", "INTERFACE", "SERVER", "STATE", "MISS", "90 % BETWEEN", "REQUESTS", "PROBES"),
-    *("RTT P50", "P99", "LATENCY P50", "P99", "COMPUTE P50", "P99"),
+    *("RTT P50", "P99", "NETWORK P50", "P99", "COMPUTE P50", "P99"),
 )
 
 
@@ -76,7 +76,7 @@ def _pair(pair: PairExplanation) -> tuple[str, ...]:
         f"{pair.requests:.0f}",
         f"{pair.probes:.0f}",
         *_quantiles(pair.rtt),
-        *_quantiles(pair.latency),
+        *_quantiles(pair.network),
         *_quantiles(pair.compute),
     )
 

@@ -41,8 +41,8 @@ class PairExplanation:
     """Requests whose outcome on this very pair is remembered."""
     probes: float
     rtt: Histogram
-    latency: Histogram
-    """Of requests, from submit to this copy's response."""
+    network: Histogram
+    """What the network took of requests of the service's sizes, whichever service they were for."""
     compute: Histogram
     """What the server needed for the service, whoever asked."""
     carrier: str = ""

@@ -51,6 +51,9 @@ NO_POLICY = 1
 MAX_CREDENTIAL_BYTES = 2048
 """Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
 
+MAX_LATENCIES = 4096
+"""Pairs (interface, server) in one report, counted anew for each service and size class that they carried."""
+
 MAX_JOINTS = 1024
 """Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers."""
 
@@ -283,17 +286,23 @@ class Nack:
 
 @dataclass(frozen=True, slots=True)
 class LatencyReport:
-    """Latency of one interface to one server for one service since the last report.
+    """What requests of one service and size class took over one interface to one server since the last report.
 
-    Beside the histogram, which knows a latency when it is over: how many of `requests` missed the service's deadline,
+    Beside the histograms, which know a time when it is over: how many of `requests` missed the service's deadline,
     known when that is over.
     """
 
     interface: InterfaceName
     server: NodeName
     service: ServiceName
-    latency: Histogram
+    size_class: int
+    """See `protos.size_class`."""
+    network: Histogram
+    """From sending to the answer, without the processing; lost is what the server never had whole."""
+    called_off: Histogram
+    """When copies were called off that the server did not have yet: the network takes longer than that."""
     processing: Histogram
+    """The server's share; lost is what it had and did not answer."""
     requests: int = 0
     missed: int = 0
 

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import beta
 
 from bench.matcher.feed import PAIRS, REPORT_INTERVAL_S, ROBOT, SERVICE, Reporter
+from bench.matcher.races import ANSWER_BYTES
 from controlplane.core.estimator import Estimator
 from controlplane.core.posterior import Estimate
 
@@ -92,7 +93,8 @@ Arrays = tuple["np.ndarray[tuple[int, ...], np.dtype[np.float64]]", ...]
 
 def predict(races: Races, deadline_s: float) -> Arrays:
     """For each report's interval: requests; Beta parameters of each kind; misses on a, on b, on both."""
-    reporter = Reporter(deadline_s, random.Random(zlib.crc32(races.trace.encode())))
+    rng = random.Random(zlib.crc32(races.trace.encode()))
+    reporter = Reporter(deadline_s, rng, size=races.workload.size + ANSWER_BYTES)
     estimator = Estimator(half_life_s=HALF_LIFE_S)
     probes, waiting = iter(races.probes), iter(races.races)
     probe, race = next(probes, None), next(waiting, None)
@@ -125,11 +127,7 @@ def predict(races: Races, deadline_s: float) -> Arrays:
 
 def predictions(estimator: Estimator, deadline_s: float, now: float) -> tuple[Estimate, ...]:
     """What is believed of each path, of both together if independent, and as measured."""
-    overhead_s = estimator.overhead(ROBOT, SERVICE, now)
-    one, other = (
-        estimator.estimate(ROBOT, pair.interface, pair.server, SERVICE, deadline_s, now, overhead_s=overhead_s)
-        for pair in PAIRS
-    )
+    one, other = (estimator.estimate(ROBOT, pair.interface, pair.server, SERVICE, deadline_s, now) for pair in PAIRS)
     product = _product(one, other)
     return one, other, product, estimator.both_miss(ROBOT, SERVICE, *PAIRS, product.mean, now)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import enum
 import heapq
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from protos.model import (
     Report,
     ServiceName,
 )
+from protos.size_class import size_class
 from sidecar.core.copies import OBSERVED_ONE_IN
 
 if TYPE_CHECKING:
@@ -38,19 +39,27 @@ PAIRS = (
 PROBE_TIMEOUT_S = 1.0
 
 
+class _Ended(enum.IntEnum):
+    ANSWERED = 0
+    CALLED_OFF = 1
+    LOST = 2
+
+
 @dataclass(frozen=True, slots=True, order=True)
 class _News:
     at_s: float
     path: int
-    latency_s: float
+    ended: _Ended
+    after_s: float
     processing_s: float
 
 
 class Reporter:
     """Turns races into reports, no sooner than a sidecar could know of each outcome."""
 
-    def __init__(self, deadline_s: float, rng: random.Random) -> None:
+    def __init__(self, deadline_s: float, rng: random.Random, *, size: int = 0) -> None:
         self._deadline_s = deadline_s
+        self._size_class = size_class(size)
         self._rng = rng
         self._news: list[_News] = []
         """Latencies and when they are known."""
@@ -62,18 +71,19 @@ class Reporter:
         """A request went out over both paths."""
         missed = (race.latency_s[0] > self._deadline_s, race.latency_s[1] > self._deadline_s)
         full = not self._rng.randrange(OBSERVED_ONE_IN)
-        ended = max(race.latency_s) if full else min(race.latency_s)
-        heapq.heappush(self._judged, (race.at_s + min(ended, self._deadline_s), missed, full))
+        over = max(race.latency_s) if full else min(race.latency_s)
+        heapq.heappush(self._judged, (race.at_s + min(over, self._deadline_s), missed, full))
         if not full:
             return
         for path, (latency, processing) in enumerate(zip(race.latency_s, race.processing_s, strict=True)):
-            if missed[path] and not missed[1 - path]:
-                latency, known = math.inf, self._deadline_s
+            # The answer is small: what is on its way for so long has not arrived at its server yet.
+            if latency - processing > self._deadline_s and not missed[1 - path]:
+                known, ended = self._deadline_s, _Ended.CALLED_OFF
             elif latency > LIFETIME_S:
-                latency, known = math.inf, LIFETIME_S
+                known, ended = LIFETIME_S, _Ended.LOST
             else:
-                known = latency
-            heapq.heappush(self._news, _News(race.at_s + known, path, latency, processing))
+                known, ended = latency, _Ended.ANSWERED
+            heapq.heappush(self._news, _News(race.at_s + known, path, ended, known, processing))
 
     def probed(self, probe: Probe) -> None:
         """A probe went out."""
@@ -81,7 +91,7 @@ class Reporter:
 
     def take(self, now: float) -> Report:
         """The report of what is known by `now` and was not reported yet."""
-        latencies, processing, rtts = ([Histogram(), Histogram()] for _ in range(3))
+        network, called_off, processing, rtts = ([Histogram(), Histogram()] for _ in range(4))
         judged, missed = [0, 0], [0, 0]
         together = both_missed = 0
         while self._judged and self._judged[0][0] <= now:
@@ -93,10 +103,12 @@ class Reporter:
                 missed[path] += misses[path]
         while self._news and self._news[0].at_s <= now:
             news = heapq.heappop(self._news)
-            if math.isinf(news.latency_s):
-                latencies[news.path].record_lost()
+            if news.ended is _Ended.CALLED_OFF:
+                called_off[news.path].record(news.after_s)
+            elif news.ended is _Ended.LOST:
+                network[news.path].record_lost()
             else:
-                latencies[news.path].record(news.latency_s)
+                network[news.path].record(news.after_s - news.processing_s)
                 processing[news.path].record(news.processing_s)
         while self._probes and self._probes[0][0] <= now:
             _, path, rtt = heapq.heappop(self._probes)
@@ -107,10 +119,18 @@ class Reporter:
         return Report(
             tuple(
                 LatencyReport(
-                    pair.interface, pair.server, SERVICE, latencies[path], processing[path], judged[path], missed[path]
+                    pair.interface,
+                    pair.server,
+                    SERVICE,
+                    self._size_class,
+                    network[path],
+                    called_off[path],
+                    processing[path],
+                    judged[path],
+                    missed[path],
                 )
                 for path, pair in enumerate(PAIRS)
-                if latencies[path].total or judged[path]
+                if network[path].total or called_off[path].total or judged[path]
             ),
             tuple(PathReport(pair.interface, pair.server, True, rtts[path]) for path, pair in enumerate(PAIRS)),
             joints=(JointReport(SERVICE, *PAIRS, together, both_missed),) if together else (),

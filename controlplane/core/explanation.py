@@ -140,7 +140,7 @@ def _pairs(
                 requests=evidence.requests,
                 probes=evidence.probes,
                 rtt=evidence.rtt,
-                latency=evidence.latency,
+                network=evidence.network,
                 compute=evidence.compute,
                 carrier=_carrier(block, path),
                 region=_region(block, path),

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protos.histogram import BUCKETS, EDGES, MAX_S, MIDS, Histogram
+from controlplane.core.distribution import Distribution
+from protos.histogram import BUCKETS, Histogram
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
-_EDGES = np.array(EDGES)
-_MIDS = np.array(MIDS)
+_FORGOTTEN = 1e-9
+"""Samples that together weigh less are none: a few steps on, floats run out of range."""
 
 
 class FadedCount:
@@ -44,92 +46,110 @@ class FadedCount:
         return self._bad / self._all if self._all else math.nan
 
 
-class FadedHistogram:
-    """Weights by bucket of `protos.histogram`, and of the lost, fading with a half-life in seconds."""
+class FadedShares:
+    """How often each of a few kinds came lately, numbered from 0; fading with a half-life in seconds."""
 
-    __slots__ = ("_at", "_counts", "_half_life_s", "_lost")
+    __slots__ = ("_at", "_counts", "_half_life_s")
+
+    def __init__(self, kinds: int, half_life_s: float, now: float) -> None:
+        self._half_life_s = half_life_s
+        self._at = now
+        self._counts = [0.0] * kinds
+
+    def add(self, kind: int, count: float, now: float) -> None:
+        """Count more of one kind."""
+        factor = math.exp2((self._at - now) / self._half_life_s)
+        self._at = now
+        self._counts = [old * factor for old in self._counts]
+        self._counts[kind] += count
+
+    def shares(self, least: float) -> Iterator[tuple[int, float]]:
+        """(kind, share) of those that make up at least `least` of all; their shares sum up to 1."""
+        limit = least * sum(self._counts)
+        common = [(kind, count) for kind, count in enumerate(self._counts) if count and count >= limit]
+        total = sum(count for _, count in common)
+        yield from ((kind, count / total) for kind, count in common)
+
+
+class FadedHistogram:
+    """Weights by bucket of `protos.histogram`, and of the lost, fading with a half-life in seconds.
+
+    Samples that were called off count for as long as they lasted: `distribution` follows Kaplan and Meier.
+    """
+
+    __slots__ = ("_at", "_called_off", "_counts", "_distribution", "_half_life_s", "_lost", "_total")
 
     def __init__(self, half_life_s: float, now: float) -> None:
         self._half_life_s = half_life_s
         self._at = now
         self._counts: NDArray[np.float64] = np.zeros(BUCKETS)
+        self._called_off: NDArray[np.float64] | None = None
         self._lost = 0.0
+        self._total = 0.0
+        self._distribution: Distribution | None = None
 
-    def add(self, histogram: Histogram, now: float) -> None:
-        """Merge new samples."""
+    def add(self, histogram: Histogram, now: float, called_off: Histogram | None = None) -> None:
+        """Merge new samples, and of those called off when they were."""
         factor = math.exp2((self._at - now) / self._half_life_s)
         self._at = now
-        self._counts *= factor
-        self._lost *= factor
-        indices, counts, lost = histogram.to_sparse()
-        self._counts[indices] += counts
-        self._lost += lost
+        self._counts = self._counts * factor + histogram.counts
+        self._lost = self._lost * factor + histogram.lost
+        ended = 0
+        if called_off is not None and (ended := called_off.answered) and self._called_off is None:
+            self._called_off = np.zeros(BUCKETS)
+        if self._called_off is not None:
+            self._called_off *= factor
+            if called_off is not None:
+                self._called_off += called_off.counts
+        self._total = self._total * factor + histogram.total + ended
+        self._distribution = None
 
     def weight(self, now: float) -> float:
-        """How many samples it is worth by now, the lost included."""
-        return float(self._counts.sum() + self._lost) * math.exp2((self._at - now) / self._half_life_s)
+        """How many samples it is worth by now, the lost and those called off included."""
+        return self._total * math.exp2((self._at - now) / self._half_life_s)
 
     def scaled(self, now: float, sample: int) -> Histogram:
-        """As a histogram of whole counts, where a sample that has not faded counts `sample`."""
-        scale = sample * math.exp2((self._at - now) / self._half_life_s)
-        counts = np.rint(self._counts * scale).astype(np.int64)
+        """The distribution as whole counts, where a sample that has not faded counts `sample`."""
+        found = self.distribution()
+        if found is None:
+            return Histogram()
+        scale = sample * self.weight(now)
+        counts = np.rint(found.mass * scale).astype(np.int64)
         used = np.flatnonzero(counts)
-        return Histogram.from_sparse(used.tolist(), counts[used].tolist(), round(self._lost * scale))
-
-    def fraction_over(self, seconds: float) -> float:
-        """Share of all samples slower than `seconds`, the lost included; NaN without samples."""
-        total = float(self._counts.sum()) + self._lost
-        if total <= 0.0:
-            return math.nan
-        return (self._over(seconds) + self._lost) / total
-
-    def _over(self, seconds: float) -> float:
-        index = bisect_right(EDGES, seconds)
-        over = float(self._counts[index + 1 :].sum())
-        if index == BUCKETS - 1:
-            return over + float(self._counts[index])
-        low = EDGES[index - 1] if index else 0.0
-        share = min(1.0, (EDGES[index] - seconds) / (EDGES[index] - low))
-        return over + share * float(self._counts[index])
+        return Histogram.from_sparse(used.tolist(), counts[used].tolist(), round(found.never * scale))
 
     def lost_share(self) -> float:
         """Share of the lost; NaN without samples."""
-        total = float(self._counts.sum()) + self._lost
-        return self._lost / total if total > 0.0 else math.nan
+        return self._lost / self._total if self._total > _FORGOTTEN else math.nan
 
     def median(self) -> float:
         """Median of the answered samples, within 2 %; NaN without any."""
-        cumulated = self._counts.cumsum()
-        if cumulated[-1] <= 0.0:
-            return math.nan
-        return float(_MIDS[int(np.searchsorted(cumulated, cumulated[-1] / 2))])
+        answered = self.answered()
+        return answered.median() if answered is not None else math.nan
 
-    def shares(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Values in seconds and their shares among the answered samples; both empty without any."""
-        used = np.flatnonzero(self._counts)
-        weights = self._counts[used]
-        return _MIDS[used], weights / weights.sum() if used.size else weights
+    def answered(self) -> Distribution | None:
+        """The answered samples alone; None without any."""
+        total = float(self._counts.sum())
+        return Distribution.of(self._counts / total, 0.0) if total > _FORGOTTEN else None
 
-    def shares_over(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """For each of `seconds`, the share of answered samples that are slower; at least one sample needed."""
-        tail = self._counts[::-1].cumsum()[::-1]
-        edges = np.concatenate(([0.0], _EDGES))
-        over: NDArray[np.float64] = np.interp(seconds, edges, tail / tail[0])
-        # The overflow bucket has no upper edge: past its lower one it stays over, below zero everything is.
-        over = np.where(seconds >= MAX_S, tail[-1] / tail[0], over)
-        result: NDArray[np.float64] = np.where(seconds <= 0.0, 1.0, over)
-        return result
+    def distribution(self) -> Distribution | None:
+        """What the samples tell; None without any.
 
+        At the end of each bucket the share that is slower is that of those known to be, among all that got there
+        (Kaplan and Meier 1958). Beyond the last that was answered, what was called off counts as never answered.
+        """
+        if self._distribution is None and self._total > _FORGOTTEN:
+            self._distribution = self._known() if self._called_off is None else self._survived(self._called_off)
+        return self._distribution
 
-def sum_exceeds(first: FadedHistogram, second: FadedHistogram | None, seconds: float, *, times: float = 1.0) -> float:
-    """P(times x A + B > seconds) for independent answered samples A of `first` and B of `second`.
+    def _known(self) -> Distribution:
+        total = float(self._counts.sum()) + self._lost
+        return Distribution.of(self._counts / total, self._lost / total)
 
-    Without samples in `second` B is 0; NaN without any in `first`.
-    """
-    values, shares = first.shares()
-    if not values.size:
-        return math.nan
-    left = seconds - times * values
-    if second is None or not second.shares()[0].size:
-        return float(shares[left < 0.0].sum())
-    return float(shares @ second.shares_over(left))
+    def _survived(self, called_off: NDArray[np.float64]) -> Distribution:
+        ended = self._counts + called_off
+        there = ended[::-1].cumsum()[::-1] + self._lost
+        hazard = np.divide(self._counts, there, out=np.zeros(BUCKETS), where=there > 0.0)
+        slower = np.cumprod(1.0 - np.minimum(hazard, 1.0))
+        before = np.concatenate(([1.0], slower[:-1]))
+        return Distribution.of(before - slower, float(slower[-1]))

@@ -74,12 +74,11 @@ def draw_block(
         up = allowed
     lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
     reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
-    overhead_s = estimator.overhead(robot.name, use.name, now)
 
     def estimate(interface: InterfaceName, server: NodeName) -> Estimate | None:
         if (interface, server) not in up:
             return None
-        return estimator.estimate(robot.name, interface, server, use.name, use.deadline_s, now, overhead_s=overhead_s)
+        return estimator.estimate(robot.name, interface, server, use.name, use.deadline_s, now)
 
     estimates = [[estimate(interface, server) for server in reached] for interface in lit]
     epsilons = tuple(tuple(found.mean if found else None for found in row) for row in estimates)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from google.protobuf import json_format
 
-from controlplane.core.fading import FadedHistogram, sum_exceeds
+from controlplane.core.distribution import Distribution
 from controlplane.core.objectives import joint_miss, objective_costs
 from controlplane.core.posterior import IGNORANCE
 from controlplane.core.problem import Block, BlockKey, Objective
@@ -58,7 +58,7 @@ class RecordedService:
 
     def __init__(self, explanation: Explanation) -> None:
         self._explanation = explanation
-        self._pairs = {pair.path: pair for pair in explanation.pairs if pair.latency.total or pair.rtt.answered}
+        self._pairs = {pair.path: pair for pair in explanation.pairs if pair.network.total or pair.rtt.answered}
         self._overhead_s = _overhead(self._pairs.values())
         self.requests = max((pair.requests for pair in self._pairs.values()), default=0.0)
         self.title = (
@@ -125,38 +125,37 @@ class RecordedService:
         pair = self._pairs[path]
         if deadline_s == self.deadline_s and pair.miss is not None:
             return pair.miss.mean
-        if pair.latency.total:
-            over, samples = pair.latency.fraction_over(deadline_s), pair.latency.total / SAMPLE
+        network = _distribution(pair.network)
+        if network is not None:
+            over, samples = network.sum_exceeds(_distribution(pair.compute), deadline_s), pair.network.total / SAMPLE
         else:
             over, samples = self._from_probes(pair, deadline_s), min(pair.probes, MAX_PROBES)
         return (over * samples + IGNORANCE.misses) / (samples + IGNORANCE.weight)
 
     def _from_probes(self, pair: PairExplanation, deadline_s: float) -> float:
         """Of a pair that carried no request: by round trips and computing times."""
-        lost = pair.rtt.lost / pair.rtt.total
-        return lost + (1.0 - lost) * sum_exceeds(_faded(pair.rtt), _faded(pair.compute), deadline_s - self._overhead_s)
+        round_trip = _distribution(pair.rtt)
+        if round_trip is None:
+            return IGNORANCE.mean
+        return round_trip.sum_exceeds(_distribution(pair.compute), deadline_s - self._overhead_s)
 
 
 def _overhead(pairs: Collection[PairExplanation]) -> float:
-    """How much slower, in seconds, requests are than probes and computing together, in the median."""
+    """How much slower, in seconds, the network is with requests than with probes, in the median."""
     found = [
-        (pair.latency.total, _median(pair.latency) - _median(pair.rtt) - _median(pair.compute))
+        (pair.network.total, pair.network.quantile(0.5) - pair.rtt.quantile(0.5))
         for pair in pairs
-        if pair.latency.total >= MIN_REQUESTS * SAMPLE and pair.latency.answered and pair.rtt.answered
+        if pair.network.total >= MIN_REQUESTS * SAMPLE and pair.network.answered and pair.rtt.answered
     ]
+    found = [(weight, excess) for weight, excess in found if math.isfinite(excess)]
     total = sum(weight for weight, _ in found)
     return sum(weight * max(0.0, excess) for weight, excess in found) / total if total else 0.0
 
 
-def _median(histogram: Histogram) -> float:
-    """Of the answered samples; 0 without any."""
-    return _faded(histogram).median() if histogram.answered else 0.0
-
-
-def _faded(histogram: Histogram) -> FadedHistogram:
-    faded = FadedHistogram(1.0, 0.0)
-    faded.add(histogram, 0.0)
-    return faded
+def _distribution(histogram: Histogram) -> Distribution | None:
+    """None of an empty one."""
+    total = histogram.total
+    return Distribution.of(histogram.counts / total, histogram.lost / total) if total else None
 
 
 def _choices(block: Block) -> NDArray[np.intp]:

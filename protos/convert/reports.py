@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from protos.convert.fields import MAX_EVENTS, MAX_LATENCIES, MAX_OUTCOMES, MAX_PATHS, at_most, each
+from protos.convert.fields import MAX_EVENTS, MAX_OUTCOMES, MAX_PATHS, at_most, each
 from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
 from protos.errors import DecodeError
-from protos.model import MAX_JOINTS, JointReport, LatencyReport, OutcomeReport, PathReport, Report
+from protos.model import MAX_JOINTS, MAX_LATENCIES, JointReport, LatencyReport, OutcomeReport, PathReport, Report
 from protos.names import interface_name, node_name, service_name
 from protos.plr.v1 import control_pb2
+from protos.size_class import SIZE_CLASSES
 
 
 def report_from_proto(message: control_pb2.Report) -> Report:
@@ -37,7 +38,9 @@ def _latency_from_proto(message: control_pb2.LatencyReport) -> LatencyReport:
         interface=interface_name(message.interface, "interface"),
         server=node_name(message.server, "server"),
         service=service_name(message.service, "service"),
-        latency=histogram_from_proto(message.latency),
+        size_class=at_most(message.size_class, SIZE_CLASSES - 1, "size_class"),
+        network=histogram_from_proto(message.network),
+        called_off=histogram_from_proto(message.called_off),
         processing=histogram_from_proto(message.processing),
         requests=requests,
         missed=at_most(message.missed, requests, "missed"),
@@ -49,7 +52,9 @@ def _latency_to_proto(latency: LatencyReport) -> control_pb2.LatencyReport:
         interface=latency.interface,
         server=latency.server,
         service=latency.service,
-        latency=histogram_to_proto(latency.latency),
+        size_class=latency.size_class,
+        network=histogram_to_proto(latency.network),
+        called_off=histogram_to_proto(latency.called_off),
         processing=histogram_to_proto(latency.processing),
         requests=latency.requests,
         missed=latency.missed,

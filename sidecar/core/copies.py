@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, ServiceName
+    from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.events import RequestId
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_id import PathId
@@ -21,6 +21,15 @@ where its estimate stands on real requests alone; seven eighths of what losers w
 
 HEDGE_AT = 0.5
 """At this part of the deadline, a server that has the request alone and is silent makes another one worth asking."""
+
+
+class Carried(NamedTuple):
+    """Copies that are measured together."""
+
+    interface: InterfaceName
+    server: NodeName
+    service: ServiceName
+    size_class: int
 
 
 class CopyState(enum.Enum):
@@ -58,6 +67,8 @@ class Request:
     rule: ServiceRule
     payload: bytes | None
     submitted_at: float
+    size_class: int = 0
+    """Settled when it was submitted (`protos.size_class`)."""
     copies: list[Copy] = field(default_factory=list)
     observed: bool = True
     """All its copies are measured, and none is called off before the deadline."""
@@ -89,6 +100,10 @@ class Request:
     def asked(self) -> set[NodeName]:
         """The servers of all copies but those that explore."""
         return {copy.path.peer for copy in self.copies if not copy.explores}
+
+    def carried(self, copy: Copy) -> Carried:
+        """What a measurement of the copy is one of."""
+        return Carried(copy.path.interface, copy.path.peer, self.service, self.size_class)
 
     def waits_for_one_server(self) -> bool:
         """Whether a single server was asked, holds the request, and has not answered."""

@@ -20,10 +20,9 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName
     from sidecar.core.copies import Copy, Request
     from sidecar.core.measurements import Measurements
-    from sidecar.core.stats import EngineStats
 
 
-def measure_outcomes(request: Request, measurements: Measurements, stats: EngineStats) -> None:
+def measure_outcomes(request: Request, measurements: Measurements) -> None:
     """Count, once, what missed: when the deadline is over or every copy has ended."""
     if request.outcomes_measured:
         return
@@ -32,7 +31,7 @@ def measure_outcomes(request: Request, measurements: Measurements, stats: Engine
     accepted = [copy for copy in copies if copy.state is not CopyState.REJECTED]
     if request.observed:
         for copy in accepted:
-            measurements.judged(copy.path, request.service, missed=not copy.in_time)
+            measurements.judged(request.carried(copy), missed=not copy.in_time)
     elif len(copies) != 2 or copies[0].path.peer == copies[1].path.peer:
         return
     if len(accepted) < len(copies):
@@ -42,10 +41,7 @@ def measure_outcomes(request: Request, measurements: Measurements, stats: Engine
         if first == second:
             continue
         both_missed = not (one.in_time or other.in_time)
-        if not measurements.judged_together(
-            request.service, Assignment(*first), Assignment(*second), both_missed=both_missed
-        ):
-            stats.dropped["joint_outcomes_full"] += 1
+        measurements.judged_together(request.service, Assignment(*first), Assignment(*second), both_missed=both_missed)
 
 
 def _assignment(copy: Copy) -> tuple[InterfaceName, NodeName]:

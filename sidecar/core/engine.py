@@ -92,7 +92,7 @@ class Engine:
         self.mapping = MappingTable(self.routes)
         self._offers = Offers(config.rules)
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
-        self._measurements = Measurements()
+        self._measurements = Measurements(self.stats.dropped)
         self._serving = Serving(
             ServingParts(config.rules, self.routes, self._outbox, self.stats, self._events.append, self.peers.may_call)
         )

@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, NamedTuple
+from operator import itemgetter
+from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
-from protos.model import MAX_JOINTS, JointReport, LatencyReport, OutcomeReport, PathReport, Report
+from protos.model import MAX_JOINTS, MAX_LATENCIES, JointReport, LatencyReport, OutcomeReport, PathReport, Report
+from protos.size_class import size_class
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
     from protos.model import Assignment, InterfaceName, NodeName, ServiceName
+    from sidecar.core.copies import Carried
     from sidecar.core.link_events import PathMeasured
+    from sidecar.core.messages import ResponseMessage
     from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
 
+MAX_ANSWER_SIZES = 1024
+"""Services whose usual size of an answer is kept: as many as a robot can carry."""
 
-class _Pair(NamedTuple):
-    interface: InterfaceName
-    server: NodeName
-    service: ServiceName
+
+class _Counts:
+    __slots__ = ("called_off", "missed", "network", "processing", "requests")
+
+    def __init__(self) -> None:
+        self.network = Histogram()
+        self.called_off = Histogram()
+        self.processing = Histogram()
+        self.requests = 0
+        self.missed = 0
 
 
 class _PathCounts:
@@ -32,32 +44,62 @@ class _PathCounts:
 
 
 class Measurements:
-    """Latencies per (interface, server, service), round-trip times per path, outcomes per service and, joint ones, per
-    pair of paths."""
+    """Times and missed deadlines per (interface, server, service, size class), round-trip times per path, outcomes per
+    service and, joint ones, per pair of paths."""
 
-    def __init__(self) -> None:
+    def __init__(self, dropped: Counter[str]) -> None:
+        self._dropped = dropped
+        """Counts what a report has no room for."""
+        self._answer_bytes: dict[ServiceName, int] = {}
         self._clear()
 
     def _clear(self) -> None:
-        self._latency: dict[_Pair, Histogram] = {}
-        self._processing: dict[_Pair, Histogram] = {}
+        self._carried: dict[Carried, _Counts] = {}
         self._paths: dict[PathId, _PathCounts] = {}
         self._outcomes: Counter[tuple[ServiceName, str]] = Counter()
-        self._judged: Counter[_Pair] = Counter()
-        self._missed: Counter[_Pair] = Counter()
         self._compared: Counter[tuple[ServiceName, Assignment, Assignment]] = Counter()
         self._both_missed: Counter[tuple[ServiceName, Assignment, Assignment]] = Counter()
 
-    def answered(self, path: PathId, service: ServiceName, latency_s: float, processing_s: float) -> None:
-        """One copy was answered `latency_s` after it was sent."""
-        pair = _Pair(path.interface, path.peer, service)
-        self._latency.setdefault(pair, Histogram()).record(latency_s)
-        self._processing.setdefault(pair, Histogram()).record(processing_s)
+    def size_class(self, service: ServiceName, request_bytes: int) -> int:
+        """The class of a request before its answer is known: the service's latest one stands for it."""
+        return size_class(request_bytes + self._answer_bytes.get(service, 0))
 
-    def lost(self, path: PathId, service: ServiceName) -> None:
-        """One copy was never answered, or was called off after its deadline."""
-        pair = _Pair(path.interface, path.peer, service)
-        self._latency.setdefault(pair, Histogram()).record_lost()
+    def answered(self, carried: Carried, latency_s: float, response: ResponseMessage) -> None:
+        """One copy was answered `latency_s` after it was sent."""
+        if carried.service in self._answer_bytes or len(self._answer_bytes) < MAX_ANSWER_SIZES:
+            self._answer_bytes[carried.service] = len(response.payload)
+        counts = self._of(carried)
+        if counts is not None:
+            counts.network.record(latency_s - response.processing_s)
+            counts.processing.record(response.processing_s)
+
+    def called_off(self, carried: Carried, after_s: float) -> None:
+        """One copy that its server did not have yet was called off `after_s` after it was sent."""
+        counts = self._of(carried)
+        if counts is not None:
+            counts.called_off.record(after_s)
+
+    def lost(self, carried: Carried, *, delivered: bool) -> None:
+        """One copy was never answered: by the server, if it was `delivered`, else for the network's sake."""
+        counts = self._of(carried)
+        if counts is not None:
+            (counts.processing if delivered else counts.network).record_lost()
+
+    def judged(self, carried: Carried, *, missed: bool) -> None:
+        """Whether a copy missed the deadline is known."""
+        counts = self._of(carried)
+        if counts is not None:
+            counts.requests += 1
+            counts.missed += missed
+
+    def _of(self, carried: Carried) -> _Counts | None:
+        counts = self._carried.get(carried)
+        if counts is None:
+            if len(self._carried) >= MAX_LATENCIES:
+                self._dropped["latencies_full"] += 1
+                return None
+            counts = self._carried[carried] = _Counts()
+        return counts
 
     def path(self, event: PathMeasured) -> None:
         """A link measured a path."""
@@ -71,34 +113,22 @@ class Measurements:
         """A request ended."""
         self._outcomes[service, outcome] += 1
 
-    def judged(self, path: PathId, service: ServiceName, *, missed: bool) -> None:
-        """Whether a copy missed the deadline is known."""
-        pair = _Pair(path.interface, path.peer, service)
-        self._judged[pair] += 1
-        self._missed[pair] += missed
-
     def judged_together(
         self, service: ServiceName, first: Assignment, second: Assignment, *, both_missed: bool
-    ) -> bool:
-        """Whether two copies of a request both missed is known; False if the report is full of other pairs of paths."""
+    ) -> None:
+        """Whether two copies of a request both missed is known."""
         key = (service, first, second)
         if key not in self._compared and len(self._compared) >= MAX_JOINTS:
-            return False
+            self._dropped["joint_outcomes_full"] += 1
+            return
         self._compared[key] += 1
         self._both_missed[key] += both_missed
-        return True
 
     def take(self, routes: Routes, servers: list[NodeName]) -> Report:
         """Return everything since the last call, and the state of every path to these servers."""
         latencies = tuple(
-            LatencyReport(
-                *pair,
-                self._latency.get(pair, Histogram()),
-                self._processing.get(pair, Histogram()),
-                self._judged[pair],
-                self._missed[pair],
-            )
-            for pair in sorted(self._latency.keys() | self._judged.keys())
+            LatencyReport(*carried, of.network, of.called_off, of.processing, of.requests, of.missed)
+            for carried, of in sorted(self._carried.items(), key=itemgetter(0))
         )
         paths = tuple(
             self._path_report(interface, server, routes)

@@ -5,8 +5,8 @@ A copy is one sending of a request to one server. When the first answer wins, th
 is unsent of them stays here, and their servers are told. What a called-off copy would have taken, nobody knows, and to
 measure only those that were not called off would flatter every path. So one request in `OBSERVED_ONE_IN` is a full
 race whose copies are all measured, and the others are not measured at all (docs/architecture.md, "What is measured").
-In a race, once the deadline is over and another copy has won, a copy that has not arrived is called off and counts as
-lost: its latency is known to be beyond the deadline, which is all that the prediction needs.
+In a race, once the deadline is over and another copy has won, a copy that has not arrived is called off: its time in
+the network is known to be longer than that, and is reported so.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ class RequestTable:
         now: float,
     ) -> None:
         """Send a request; ends in exactly one ResponseArrived or RequestFailed."""
-        request = Request(request_id, service, kind, rule, payload, now)
+        size_class = self._parts.measurements.size_class(service, len(payload))
+        request = Request(request_id, service, kind, rule, payload, now, size_class)
         problem = self._problem(request)
         if problem:
             self._parts.stats.requests[service, "rejected"] += 1
@@ -164,7 +165,7 @@ class RequestTable:
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
         self._parts.outbox.on_answered(copy.message)
         if measure:
-            self._parts.measurements.answered(copy.path, request.service, now - copy.sent_at, response.processing_s)
+            self._parts.measurements.answered(request.carried(copy), now - copy.sent_at, response)
         if request.done:
             self._parts.stats.duplicate_responses += 1
         else:
@@ -237,7 +238,7 @@ class RequestTable:
             hit = [copy for copy in request.pending() if copy.path.peer == peer]
             for copy in hit:
                 copy.state = CopyState.DEAD
-                self._lost(request, copy)
+                self._lost(request, copy, delivered=True)
             if hit and not request.done:
                 self._rescue(request, now)
                 if not request.pending() and not request.rule.idempotent:
@@ -298,7 +299,7 @@ class RequestTable:
                 self._hedge(request, now)
                 continue
             heapq.heappush(self._timers, (request.expires_at, request_id))
-            measure_outcomes(request, self._parts.measurements, self._parts.stats)
+            measure_outcomes(request, self._parts.measurements)
             if request.done:
                 self._settle(request, now)
             elif not request.missed:
@@ -319,15 +320,15 @@ class RequestTable:
         copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
 
-    def _lost(self, request: Request, copy: Copy) -> None:
+    def _lost(self, request: Request, copy: Copy, *, delivered: bool) -> None:
         if request.observed:
-            self._parts.measurements.lost(copy.path, request.service)
+            self._parts.measurements.lost(request.carried(copy), delivered=delivered)
 
     def _expire(self, request: Request, now: float) -> None:
         for copy in request.pending():
             copy.state = CopyState.DEAD
+            self._lost(request, copy, delivered=copy.message.newest.over)
             self._parts.outbox.drop(copy.message)
-            self._lost(request, copy)
         if not request.done:
             why = "no answer" if request.copies else "no path to any server"
             self._fail(request, "failed", f"{why} within {request.rule.lifetime_s:g} s", now)
@@ -350,9 +351,9 @@ class RequestTable:
         """Forget a request whose copies have all come to an end."""
         if request.done and request.deadline_at <= now:
             undelivered = [copy for copy in request.pending() if not copy.message.newest.over]
-            for copy in undelivered:
-                self._lost(request, copy)
+            for copy in undelivered if request.observed else ():
+                self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
             self._requests.pop(request.id, None)
-            measure_outcomes(request, self._parts.measurements, self._parts.stats)
+            measure_outcomes(request, self._parts.measurements)

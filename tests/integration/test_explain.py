@@ -41,7 +41,7 @@ def test_a_mapping_is_explained(plane: ControlPlaneProcess, capsys: pytest.Captu
         shown = json.loads(capsys.readouterr().out)
         tried = next(p for p in shown["pairs"] if p["path"] == {"interface": "wlan0", "server": "cloud-a"})
         assert tried["requests"] == pytest.approx(100, rel=0.5)
-        assert tried["latency"]["lost"]
+        assert tried["network"]["lost"]
         assert tried["miss"]["low"] < tried["miss"]["mean"] < tried["miss"]["high"]
         assert explain(plane, "robo", "/plan") == 1
         assert capsys.readouterr().err == "plr: no robot robo is registered; did you mean robot?\n"

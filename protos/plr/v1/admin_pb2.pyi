@@ -293,7 +293,7 @@ class ExplainedPair(_message.Message):
     REQUESTS_FIELD_NUMBER: _builtins.int
     PROBES_FIELD_NUMBER: _builtins.int
     RTT_FIELD_NUMBER: _builtins.int
-    LATENCY_FIELD_NUMBER: _builtins.int
+    NETWORK_FIELD_NUMBER: _builtins.int
     COMPUTE_FIELD_NUMBER: _builtins.int
     CARRIER_FIELD_NUMBER: _builtins.int
     REGION_FIELD_NUMBER: _builtins.int
@@ -317,8 +317,8 @@ class ExplainedPair(_message.Message):
     @_builtins.property
     def rtt(self) -> _types_pb2.Histogram: ...
     @_builtins.property
-    def latency(self) -> _types_pb2.Histogram:
-        """Of requests, from submit to this copy's response."""
+    def network(self) -> _types_pb2.Histogram:
+        """What the network took of requests of the service's sizes, whichever service they were for."""
 
     @_builtins.property
     def compute(self) -> _types_pb2.Histogram:
@@ -334,15 +334,15 @@ class ExplainedPair(_message.Message):
         requests: _builtins.float = ...,
         probes: _builtins.float = ...,
         rtt: _types_pb2.Histogram | None = ...,
-        latency: _types_pb2.Histogram | None = ...,
+        network: _types_pb2.Histogram | None = ...,
         compute: _types_pb2.Histogram | None = ...,
         carrier: _builtins.str = ...,
         region: _builtins.str = ...,
         barred: _builtins.bool = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "rtt", b"rtt"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["compute", b"compute", "miss", b"miss", "network", b"network", "path", b"path", "rtt", b"rtt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["barred", b"barred", "carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "latency", b"latency", "miss", b"miss", "path", b"path", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["barred", b"barred", "carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "miss", b"miss", "network", b"network", "path", b"path", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

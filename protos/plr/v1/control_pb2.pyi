@@ -230,30 +230,42 @@ Global___Services: _TypeAlias = Services  # noqa: Y015
 
 @_typing.final
 class LatencyReport(_message.Message):
-    """Latency of one robot interface to one server for one service, from submit to that copy's response."""
+    """What copies of one service's requests took over one robot interface to one server, the network's share and the
+    server's apart. Counts only requests that were chosen to be measured before anything of their outcome was known.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
     INTERFACE_FIELD_NUMBER: _builtins.int
     SERVER_FIELD_NUMBER: _builtins.int
     SERVICE_FIELD_NUMBER: _builtins.int
-    LATENCY_FIELD_NUMBER: _builtins.int
+    SIZE_CLASS_FIELD_NUMBER: _builtins.int
+    NETWORK_FIELD_NUMBER: _builtins.int
+    CALLED_OFF_FIELD_NUMBER: _builtins.int
     PROCESSING_FIELD_NUMBER: _builtins.int
     REQUESTS_FIELD_NUMBER: _builtins.int
     MISSED_FIELD_NUMBER: _builtins.int
     interface: _builtins.str
     server: _builtins.str
     service: _builtins.str
+    size_class: _builtins.int
+    """Class of their sizes; see protos/size_class.py."""
     requests: _builtins.int
     """Requests whose outcome by the service's deadline is known since the last report, and those of them that missed it.
-    The latency of a late one comes in a later report, or as lost at the end of its lifetime.
+    The times of a late one come in a later report.
     """
     missed: _builtins.int
     @_builtins.property
-    def latency(self) -> _types_pb2.Histogram: ...
+    def network(self) -> _types_pb2.Histogram:
+        """From sending to the answer, without the processing. Lost: the server never had the whole request."""
+
+    @_builtins.property
+    def called_off(self) -> _types_pb2.Histogram:
+        """When copies were called off that the server did not have yet: the network takes longer than that."""
+
     @_builtins.property
     def processing(self) -> _types_pb2.Histogram:
-        """The server's own share of it."""
+        """The server's share. Lost: it had the request, and gave no answer."""
 
     def __init__(
         self,
@@ -261,14 +273,16 @@ class LatencyReport(_message.Message):
         interface: _builtins.str = ...,
         server: _builtins.str = ...,
         service: _builtins.str = ...,
-        latency: _types_pb2.Histogram | None = ...,
+        size_class: _builtins.int = ...,
+        network: _types_pb2.Histogram | None = ...,
+        called_off: _types_pb2.Histogram | None = ...,
         processing: _types_pb2.Histogram | None = ...,
         requests: _builtins.int = ...,
         missed: _builtins.int = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["latency", b"latency", "processing", b"processing"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["called_off", b"called_off", "network", b"network", "processing", b"processing"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["interface", b"interface", "latency", b"latency", "missed", b"missed", "processing", b"processing", "requests", b"requests", "server", b"server", "service", b"service"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["called_off", b"called_off", "interface", b"interface", "missed", b"missed", "network", b"network", "processing", b"processing", "requests", b"requests", "server", b"server", "service", b"service", "size_class", b"size_class"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

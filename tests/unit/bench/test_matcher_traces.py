@@ -31,17 +31,18 @@ def race(a: float, b: float) -> Race:
 def test_a_miss_is_told_at_the_deadline_and_its_latency_when_it_is_known() -> None:
     reporter = Reporter(0.1, Full(full=True))
     reporter.raced(race(0.05, math.inf))
-    assert reporter.take(0.06).latencies[0].latency.total == 1
+    assert reporter.take(0.06).latencies[0].network.total == 1
     told = reporter.take(0.1)
     assert {report.interface: (report.requests, report.missed) for report in told.latencies} == {
         "a": (1, 0),
         "b": (1, 1),
     }
+    assert [report.called_off.total for report in told.latencies] == [0, 1]
     assert [(joint.requests, joint.both_missed) for joint in told.joints] == [(1, 0)]
     reporter.raced(race(math.inf, 0.3))
     assert [(joint.requests, joint.both_missed) for joint in reporter.take(0.1).joints] == [(1, 1)]
     late = reporter.take(LIFETIME_S)
-    assert [(report.latency.answered, report.latency.lost) for report in late.latencies] == [(0, 1), (1, 0)]
+    assert [(report.network.answered, report.network.lost) for report in late.latencies] == [(0, 1), (1, 0)]
 
 
 def test_of_a_request_that_is_no_full_race_only_the_pair_is_told() -> None:

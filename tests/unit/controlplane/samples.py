@@ -95,14 +95,17 @@ def latency(
     *,
     processing: Histogram | None = None,
     service: str = PLAN,
+    size_class: int = 0,
     deadline_s: float = 0.1,
 ) -> LatencyReport:
-    """Of requests whose latency and outcome by the deadline became known at once."""
+    """Of requests whose outcome by the deadline became known with what the network took; processing matters little."""
     return LatencyReport(
         InterfaceName(interface),
         NodeName(server),
         ServiceName(service),
+        size_class,
         measured,
+        Histogram(),
         processing if processing is not None else Histogram(),
         requests=measured.total,
         missed=round(measured.count_over(deadline_s)),

@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from controlplane.core import compute as compute_module
 from controlplane.core import estimator as estimator_module
+from controlplane.core import network as network_module
 from controlplane.core.estimator import Estimator
 from protos.model import (
     Assignment,
@@ -40,8 +42,7 @@ def miss(estimator: Estimator, server: NodeName = A, now: float = 0.0, interface
 
 
 def believe(estimator: Estimator, server: NodeName = A, now: float = 0.0, interface: InterfaceName = WLAN) -> Estimate:
-    overhead = estimator.overhead(ROBOT, PLAN, now)
-    return estimator.estimate(ROBOT, interface, server, PLAN, DEADLINE_S, now, overhead_s=overhead)
+    return estimator.estimate(ROBOT, interface, server, PLAN, DEADLINE_S, now)
 
 
 def test_a_pair_never_heard_of_is_a_coin_toss(estimator: Estimator) -> None:
@@ -70,13 +71,18 @@ def test_no_requests_let_round_trips_and_processing_decide(estimator: Estimator)
     estimator.merge(ROBOT, quick, 0.0)
     # 40 ms there and back: 20 ms of processing makes it, 80 ms does not, so every other request misses.
     assert miss(estimator) == pytest.approx(0.5, abs=0.02)
-    estimator.merge(ROBOT, Report(paths=(path("wlan0", "cloud-b", rtt=histogram(0.04, times=200)),)), 0.0)
+    quicker = Report(
+        latencies=(latency("wwan0", "cloud-b", histogram(), processing=histogram(0.02, times=100)),),
+        paths=(path("wlan0", "cloud-b", rtt=histogram(0.04, times=200)),),
+    )
+    estimator.merge(ROBOT, quicker, 0.0)
     assert miss(estimator, B) < 0.01
 
 
 def test_few_requests_are_blended_with_the_round_trips(estimator: Estimator) -> None:
     rtt = path("wlan0", "cloud-a", rtt=histogram(0.01, times=1000))
-    estimator.merge(ROBOT, Report(paths=(rtt,)), 0.0)
+    elsewhere = latency("wwan0", "cloud-a", histogram(), processing=histogram(0.001, times=50))
+    estimator.merge(ROBOT, Report((elsewhere,), (rtt,)), 0.0)
     unused = miss(estimator)
     estimator.merge(ROBOT, Report(latencies=(latency("wlan0", "cloud-a", histogram(0.2, times=10)),)), 0.0)
     few = miss(estimator)
@@ -96,21 +102,6 @@ def test_loss_costs_a_round_trip(estimator: Estimator) -> None:
     assert miss(estimator, B) == pytest.approx(0.25, abs=0.01)
 
 
-def test_a_pair_never_tried_is_charged_the_overhead_of_those_that_were(estimator: Estimator) -> None:
-    # Requests take 90 ms where probes take 20 ms and processing 30 ms: 40 ms go to the size of the request.
-    report = Report(
-        latencies=(latency("wlan0", "cloud-a", histogram(0.09, times=100), processing=histogram(0.03, times=100)),),
-        paths=(
-            path("wlan0", "cloud-a", rtt=histogram(0.02, times=100)),
-            path("wlan0", "cloud-b", rtt=histogram(0.07, times=100)),
-        ),
-    )
-    estimator.merge(ROBOT, report, 0.0)
-    assert estimator.overhead(ROBOT, PLAN, 0.0) == pytest.approx(0.04, abs=0.003)
-    assert miss(estimator, B) > 0.95
-    assert estimator.overhead(ROBOT, ServiceName("/other"), 0.0) == 0.0
-
-
 def test_old_evidence_fades_back_to_doubt(estimator: Estimator) -> None:
     estimator.merge(ROBOT, Report(latencies=(latency("wlan0", "cloud-a", histogram(0.01, times=600)),)), 0.0)
     fresh, hour_later = miss(estimator), miss(estimator, now=3600.0)
@@ -121,7 +112,7 @@ def test_old_evidence_fades_back_to_doubt(estimator: Estimator) -> None:
 
 
 def test_misses_count_when_the_deadline_is_over_though_the_latency_is_not_known_yet(estimator: Estimator) -> None:
-    judged = LatencyReport(WLAN, A, PLAN, histogram(), histogram(), requests=95, missed=50)
+    judged = LatencyReport(WLAN, A, PLAN, 0, histogram(), histogram(), histogram(), requests=95, missed=50)
     estimator.merge(ROBOT, Report(latencies=(judged,)), 0.0)
     assert miss(estimator) == pytest.approx(50.5 / 96, rel=0.01)
 
@@ -165,9 +156,10 @@ def test_observed_misses(estimator: Estimator) -> None:
 
 def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimator_module, "MAX_PAIRS_PER_ROBOT", 4)
-    monkeypatch.setattr(estimator_module, "MAX_PATHS_PER_ROBOT", 4)
+    monkeypatch.setattr(network_module, "MAX_PATHS", 4)
+    monkeypatch.setattr(network_module, "MAX_CELLS", 4)
     monkeypatch.setattr(estimator_module, "MAX_OUTCOMES_PER_ROBOT", 4)
-    monkeypatch.setattr(estimator_module, "MAX_PROCESSING", 4)
+    monkeypatch.setattr(compute_module, "MAX_PROCESSING", 4)
     monkeypatch.setattr(estimator_module, "MAX_JOINTS_PER_ROBOT", 4)
     for number in range(6):
         measured = histogram(0.01)
@@ -181,7 +173,7 @@ def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypa
             ),
             float(number),
         )
-    assert estimator.dropped == 5 * 2
+    assert estimator.dropped == 6 * 2
     assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-1")) is None
     assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-5")) is True
 

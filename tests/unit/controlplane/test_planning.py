@@ -101,7 +101,7 @@ def explanation(*, idempotent: bool = True) -> Explanation:
             requests=100.0,
             probes=50.0,
             rtt=scaled(0.02, times=5),
-            latency=scaled(*[0.04] * 9, 0.3, times=1),
+            network=scaled(*[0.03] * 9, 0.3, times=1),
             compute=scaled(0.01, times=5),
         )
         for path, mean in epsilon.items()

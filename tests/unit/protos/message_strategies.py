@@ -66,6 +66,7 @@ from protos.model import (
     Welcome,
 )
 from protos.preferences import Copies, InterfaceLabel
+from protos.size_class import SIZE_CLASSES
 
 T = TypeVar("T")
 
@@ -181,12 +182,14 @@ def candidate_sets(draw: st.DrawFn) -> CandidateSet:
 
 counts_of = events.flatmap(lambda total: st.tuples(st.just(total), st.integers(0, total)))
 latencies = st.builds(
-    lambda interface, server, service, latency, processing, counts: LatencyReport(
-        interface, server, service, latency, processing, *counts
+    lambda interface, server, service, size_class, network, called_off, processing, counts: LatencyReport(
+        interface, server, service, size_class, network, called_off, processing, *counts
     ),
     interface_names,
     node_names,
     service_names,
+    st.integers(0, SIZE_CLASSES - 1),
+    histograms(),
     histograms(),
     histograms(),
     counts_of,

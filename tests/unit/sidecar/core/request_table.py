@@ -35,7 +35,8 @@ class Table:
 
     def __init__(self, *, idempotent: bool = True, drop_late: bool = False, exploration: float = 0.0) -> None:
         self.rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=idempotent, drop_late=drop_late, exploration=exploration)
-        self.routes, self.stats, self.measurements = Routes(), EngineStats(), Measurements()
+        self.routes, self.stats = Routes(), EngineStats()
+        self.measurements = Measurements(self.stats.dropped)
         self.commands: list[LinkCommand] = []
         self.events: list[ApplicationEvent] = []
         self.sought: list[frozenset[NodeName]] = []
@@ -81,9 +82,15 @@ class Table:
         return found
 
     def latencies(self) -> dict[str, tuple[int, int]]:
-        """(answered, lost) by server."""
+        """(answered, not answered: called off or lost) by server."""
         reports = self.measurements.take(self.routes, []).latencies
-        return {report.server: (sum(report.latency.counts), report.latency.lost) for report in reports}
+        return {
+            report.server: (
+                report.network.answered,
+                report.network.lost + report.called_off.total + report.processing.lost,
+            )
+            for report in reports
+        }
 
     def respond(self, server: str = A, copy: int = 0, number: int = 1, now: float = 0.1, size: int = 0) -> None:
         response = ResponseMessage(request_id(number), copy, 0.01, (b"from " + server.encode()).ljust(size))

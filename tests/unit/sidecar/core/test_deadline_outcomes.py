@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,7 +12,6 @@ from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.measurements import Measurements
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
-from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:
@@ -29,10 +29,10 @@ def copy_on(on: PathId, *, in_time: bool, sent_at: float = 0.0, state: CopyState
 
 def report_of(*copies: Copy, observed: bool) -> Report:
     rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=True)
-    request = Request(request_id(1), ECHO, TYPE, rule, None, 0.0, list(copies), observed=observed)
-    measurements = Measurements()
+    request = Request(request_id(1), ECHO, TYPE, rule, None, 0.0, copies=list(copies), observed=observed)
+    measurements = Measurements(Counter())
     for _ in range(2):
-        measure_outcomes(request, measurements, EngineStats())
+        measure_outcomes(request, measurements)
     return measurements.take(Routes(), [])
 
 

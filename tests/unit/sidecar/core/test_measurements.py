@@ -1,42 +1,76 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections import Counter
 
-from protos.model import Assignment, JointReport, OutcomeReport
+import pytest
+
+from protos.model import Assignment, JointReport, OutcomeReport, ServiceName
 from sidecar.core import measurements as measurements_module
+from sidecar.core.copies import Carried
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.measurements import Measurements
+from sidecar.core.messages import ResponseMessage
 from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
+from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path, request_id
 
-if TYPE_CHECKING:
-    import pytest
+ON_WLAN, ON_WWAN = Carried(WLAN, A, ECHO, 0), Carried(WWAN, A, ECHO, 3)
 
 
-def test_latencies_are_kept_by_interface_server_and_service_with_what_was_lost() -> None:
-    measurements = Measurements()
-    measurements.answered(path(WLAN), ECHO, 0.050, 0.010)
-    measurements.answered(path(WLAN), ECHO, 0.060, 0.010)
-    measurements.lost(path(WLAN), ECHO)
-    measurements.lost(path(WWAN), ECHO)
+def response(processing_s: float, size: int = 0) -> ResponseMessage:
+    return ResponseMessage(request_id(1), 0, processing_s, bytes(size))
+
+
+@pytest.fixture
+def measurements() -> Measurements:
+    return Measurements(Counter())
+
+
+def test_the_networks_share_is_kept_apart_from_the_servers(measurements: Measurements) -> None:
+    measurements.answered(ON_WLAN, 0.050, response(0.010))
+    measurements.answered(ON_WLAN, 0.030, response(0.040))
+    measurements.called_off(ON_WLAN, 0.1)
+    measurements.lost(ON_WWAN, delivered=False)
+    measurements.lost(ON_WWAN, delivered=True)
     wlan, wwan = measurements.take(Routes(), []).latencies
-    assert (wlan.interface, wlan.server, wlan.service) == (WLAN, A, ECHO)
-    assert (sum(wlan.latency.counts), wlan.latency.lost, sum(wlan.processing.counts)) == (2, 1, 2)
-    assert (sum(wwan.latency.counts), wwan.latency.lost, sum(wwan.processing.counts)) == (0, 1, 0)
+    assert (wlan.interface, wlan.server, wlan.service, wlan.size_class) == (WLAN, A, ECHO, 0)
+    assert wlan.network.quantile(1.0) == pytest.approx(0.040, rel=0.02)
+    assert wlan.network.quantile(0.5) < 1e-4, "a server that claims more than all of it"
+    assert wlan.processing.mean() == pytest.approx(0.025, rel=0.02)
+    assert (wlan.called_off.answered, wlan.network.lost) == (1, 0)
+    assert (wwan.network.lost, wwan.processing.lost, wwan.network.answered, wwan.size_class) == (1, 1, 0, 3)
 
 
-def test_a_report_is_taken_once() -> None:
-    measurements = Measurements()
-    measurements.answered(path(), ECHO, 0.1, 0.1)
+def test_the_size_of_the_last_answer_counts_as_well(measurements: Measurements) -> None:
+    assert measurements.size_class(ECHO, 1000) == 0
+    measurements.answered(ON_WLAN, 0.1, response(0.0, size=50_000))
+    assert measurements.size_class(ECHO, 1000) == 3
+    measurements.take(Routes(), [])
+    assert measurements.size_class(ECHO, 1000) == 3
+    assert measurements.size_class(ServiceName("/other"), 1000) == 0
+
+
+def test_what_a_report_has_no_room_for_is_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurements_module, "MAX_LATENCIES", 1)
+    dropped: Counter[str] = Counter()
+    measurements = Measurements(dropped)
+    measurements.judged(ON_WLAN, missed=True)
+    measurements.judged(ON_WWAN, missed=True)
+    measurements.judged(ON_WLAN, missed=True)
+    assert [report.requests for report in measurements.take(Routes(), []).latencies] == [2]
+    assert dropped == {"latencies_full": 1}
+
+
+def test_a_report_is_taken_once(measurements: Measurements) -> None:
+    measurements.judged(ON_WLAN, missed=False)
     measurements.outcome(ECHO, "ok")
     assert measurements.take(Routes(), []).latencies
     empty = measurements.take(Routes(), [])
     assert (empty.latencies, empty.paths, empty.outcomes) == ((), (), ())
 
 
-def test_paths_between_the_same_two_are_one_report_and_the_unmeasured_are_told_too() -> None:
-    routes, measurements = Routes(), Measurements()
+def test_paths_between_the_same_two_are_one_report_and_the_unmeasured_are_told_too(measurements: Measurements) -> None:
+    routes = Routes()
     for known, state in (
         (path(WLAN), PathState.DOWN),
         (path(WLAN, A, 1), PathState.UP),
@@ -52,8 +86,7 @@ def test_paths_between_the_same_two_are_one_report_and_the_unmeasured_are_told_t
     assert (wwan.interface, wwan.up, wwan.datagrams_sent) == (WWAN, False, 0)
 
 
-def test_outcomes_are_counted_and_a_rejection_is_a_failure() -> None:
-    measurements = Measurements()
+def test_outcomes_are_counted_and_a_rejection_is_a_failure(measurements: Measurements) -> None:
     for outcome in ("ok", "ok", "deadline_missed", "failed", "rejected"):
         measurements.outcome(ECHO, outcome)
     assert measurements.take(Routes(), []).outcomes == (OutcomeReport(ECHO, ok=2, deadline_missed=1, failed=2),)
@@ -61,21 +94,23 @@ def test_outcomes_are_counted_and_a_rejection_is_a_failure() -> None:
 
 def test_joint_outcomes_are_counted_by_pair_of_paths_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurements_module, "MAX_JOINTS", 1)
-    measurements = Measurements()
+    dropped: Counter[str] = Counter()
+    measurements = Measurements(dropped)
     first, second = Assignment(WLAN, A), Assignment(WWAN, B)
     for missed in (True, False, False):
-        assert measurements.judged_together(ECHO, first, second, both_missed=missed)
-    assert not measurements.judged_together(ECHO, first, Assignment(WWAN, A), both_missed=True)
+        measurements.judged_together(ECHO, first, second, both_missed=missed)
+    assert not dropped
+    measurements.judged_together(ECHO, first, Assignment(WWAN, A), both_missed=True)
+    assert dropped == {"joint_outcomes_full": 1}
     assert measurements.take(Routes(), []).joints == (JointReport(ECHO, first, second, 3, 1),)
     assert measurements.take(Routes(), []).joints == ()
 
 
-def test_what_is_judged_at_the_deadline_is_told_before_its_latency_is_known() -> None:
-    measurements = Measurements()
-    measurements.judged(path(WLAN), ECHO, missed=True)
-    measurements.judged(path(WLAN), ECHO, missed=False)
+def test_what_is_judged_at_the_deadline_is_told_before_its_times_are_known(measurements: Measurements) -> None:
+    measurements.judged(ON_WLAN, missed=True)
+    measurements.judged(ON_WLAN, missed=False)
     (early,) = measurements.take(Routes(), []).latencies
-    assert (early.requests, early.missed, early.latency.total) == (2, 1, 0)
-    measurements.lost(path(WLAN), ECHO)
+    assert (early.requests, early.missed, early.network.total) == (2, 1, 0)
+    measurements.lost(ON_WLAN, delivered=False)
     (late,) = measurements.take(Routes(), []).latencies
-    assert (late.requests, late.missed, late.latency.lost) == (0, 0, 1)
+    assert (late.requests, late.missed, late.network.lost) == (0, 0, 1)

@@ -1,0 +1,263 @@
+"""What the network costs one robot's requests: from each of its interfaces to each server, by size class.
+
+A path's own requests of the class tell best, whichever service they were for. For a path that carried few or none,
+others stand in: requests over the same interface to other servers, moved by the difference of round trips (the access
+network is where size costs time), and the path's own probes, slower by what the size costs elsewhere. A path that was
+not even probed gets its round trip from its two ends: how its interface and its server compare with others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+from itertools import islice
+from statistics import median
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+from controlplane.core.fading import FadedCount, FadedHistogram
+from protos.histogram import Histogram
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from controlplane.core.distribution import Distribution
+    from protos.model import InterfaceName, LatencyReport, NodeName, PathReport
+
+    PathKey = tuple[InterfaceName, NodeName]
+    CellKey = tuple[InterfaceName, NodeName, int]
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+MAX_PATHS = 1024
+"""Paths kept of one robot, the least recently reported goes."""
+
+MAX_CELLS = 1024
+"""Network histograms kept of one robot, one for each path and size class; the least recently reported goes."""
+
+NEIGHBOURS = 2
+"""Other servers over the same interface that are asked what its requests take, those with the most of them."""
+
+NEIGHBOUR_REQUESTS = 20.0
+"""What a neighbour's requests are worth at most, in requests of the path itself: the servers' own networks differ."""
+
+PROBES_REQUESTS = 5.0
+"""What the path's probes are worth at most: they are small, so how large requests spread they do not know."""
+
+ENDS_REQUESTS = 1.0
+"""What a round trip that was put together from the two ends is worth."""
+
+SIZE_COST_REQUESTS = 20.0
+"""Requests a path must have carried before its median tells what their size costs."""
+
+
+class Witness(NamedTuple):
+    """Something that tells of a path's times in the network, for requests of one class."""
+
+    requests: float
+    """What it is worth in requests of the path itself ..."""
+    samples: float
+    """... and how many samples it rests on."""
+    times: Distribution
+    later_s: float
+    """Add this to all of its times."""
+    resent: float = 0.0
+    """Probability that, beyond its times, something is lost and sent again ..."""
+    resend_s: float = 0.0
+    """... which takes so much longer."""
+    itself: bool = False
+    """These are requests on the very path."""
+
+    def exceeds(self, processing: Distribution | None, seconds: float) -> float:
+        """P(network + processing > seconds)."""
+        left = seconds - self.later_s
+        prompt = self.times.sum_exceeds(processing, left)
+        if not self.resent:
+            return prompt
+        return (1.0 - self.resent) * prompt + self.resent * self.times.sum_exceeds(processing, left - self.resend_s)
+
+
+@dataclass(slots=True)
+class PathState:
+    """What is known of one path but its requests."""
+
+    up: bool
+    rtt: FadedHistogram
+    datagrams: FadedCount
+    last: PathReport
+
+    def loss(self) -> float:
+        """Share of what was sent that got lost, as datagrams or as probes, whichever is worse."""
+        found = [ratio for ratio in (self.datagrams.ratio(), self.rtt.lost_share()) if not math.isnan(ratio)]
+        return max(found, default=0.0)
+
+
+class RobotNetwork:
+    """The paths of one robot. Times are seconds."""
+
+    def __init__(self, half_life_s: float) -> None:
+        self._half_life_s = half_life_s
+        self.paths: OrderedDict[PathKey, PathState] = OrderedDict()
+        self._cells: OrderedDict[CellKey, FadedHistogram] = OrderedDict()
+        self._round_trips: dict[PathKey, float] = {}
+        """Median of each path that was probed."""
+        self._rows: dict[tuple[InterfaceName, int], list[CellKey]] = {}
+        """The cells of each interface and size class, those with most requests first."""
+        self._size_costs: dict[tuple[InterfaceName, int], float] = {}
+        self._fresh = False
+        """Whether these three follow from what was merged."""
+        self.dropped = 0
+        """Entries evicted because a table was full."""
+
+    def __len__(self) -> int:
+        """Histograms kept."""
+        return len(self.paths) + len(self._cells)
+
+    def merge_path(self, path: PathReport, now: float) -> bool:
+        """Add a path's report; True if it went up or down, or is new."""
+        self._fresh = False
+        key = (path.interface, path.server)
+        known = self.paths.get(key)
+        state = known or PathState(
+            path.up, FadedHistogram(self._half_life_s, now), FadedCount(self._half_life_s, now), path
+        )
+        self._keep(self.paths, key, state, MAX_PATHS)
+        changed = known is None or known.up != path.up
+        state.up = path.up
+        state.last = path
+        state.rtt.add(path.rtt, now)
+        # What was sent before the last report may be found lost only now: no more is lost than is sent.
+        state.datagrams.add(path.datagrams_sent, min(path.datagrams_lost, path.datagrams_sent), now)
+        return changed
+
+    def merge_requests(self, report: LatencyReport, now: float) -> None:
+        """Add what requests took."""
+        if not (report.network.total or report.called_off.total):
+            return
+        self._fresh = False
+        key = (report.interface, report.server, report.size_class)
+        cell = self._cells.get(key) or FadedHistogram(self._half_life_s, now)
+        self._keep(self._cells, key, cell, MAX_CELLS)
+        cell.add(report.network, now, report.called_off)
+
+    def _keep(self, table: OrderedDict[K, V], key: K, value: V, limit: int) -> None:
+        table[key] = value
+        table.move_to_end(key)
+        if len(table) > limit:
+            table.popitem(last=False)
+            self.dropped += 1
+
+    def forget_paths(self) -> None:
+        """Whether paths are up is not known any more, nor what they take by now; requests still tell."""
+        self.paths.clear()
+        self._fresh = False
+
+    def requests(
+        self, interface: InterfaceName, server: NodeName, size_class: int, now: float, *, sample: int
+    ) -> Histogram:
+        """What requests of the class took on this path; a sample that has not faded counts `sample`."""
+        cell = self._cells.get((interface, server, size_class))
+        return cell.scaled(now, sample) if cell is not None else Histogram()
+
+    def witnesses(
+        self, interface: InterfaceName, server: NodeName, size_class: int, now: float, *, counted: float = 0.0
+    ) -> Iterator[Witness]:
+        """All that tells what requests of the class would take from the interface to the server.
+
+        `counted` of the path's own requests count for nothing here, as their outcomes are known.
+        """
+        self._refresh(now)
+        key = (interface, server)
+        own = self._cells.get((*key, size_class))
+        requests = own.weight(now) - counted if own is not None else 0.0
+        if own is not None and requests > 0.0 and (times := own.distribution()) is not None:
+            yield Witness(requests, requests, times, 0.0, itself=True)
+        round_trip, measured = self._round_trip(key)
+        path = self.paths.get(key)
+        loss = path.loss() if path is not None else 0.0
+        others = (of for of in self._rows.get((interface, size_class), ()) if of[1] != server)
+        for neighbour in islice(others, NEIGHBOURS):
+            times = self._cells[neighbour].distribution()
+            if times is None:
+                continue
+            there, there_measured = self._round_trip(neighbour[:2])
+            later_s = round_trip - there
+            if math.isnan(later_s):
+                later_s = 0.0
+            beside = self.paths.get(neighbour[:2])
+            more_lost = max(0.0, loss - beside.loss()) if beside is not None else loss
+            samples = self._cells[neighbour].weight(now)
+            if not (measured and there_measured):
+                samples = min(samples, ENDS_REQUESTS)
+            resend_s = 0.0 if math.isnan(round_trip) else round_trip
+            yield Witness(min(samples, NEIGHBOUR_REQUESTS), samples, times, later_s, more_lost, resend_s)
+        yield from self._probed(key, round_trip, loss, size_class, now)
+
+    def _probed(self, key: PathKey, round_trip: float, loss: float, size_class: int, now: float) -> Iterator[Witness]:
+        """The path's probes, or those of one that looks like it, slower by what the size costs."""
+        if math.isnan(round_trip):
+            return
+        path = self.paths.get(key)
+        later_s = self._size_cost(key[0], size_class, now)
+        samples = path.rtt.weight(now) if path is not None else 0.0
+        if path is None or (answered := path.rtt.answered()) is None:
+            samples = ENDS_REQUESTS
+            alike = min(self._round_trips, key=lambda other: (other[0] != key[0], other[1] != key[1], other))
+            path = self.paths[alike]
+            answered = path.rtt.answered()
+            later_s += round_trip - self._round_trips[alike]
+        if answered is not None:
+            yield Witness(min(samples, PROBES_REQUESTS), samples, answered, later_s, loss, round_trip)
+
+    def _round_trip(self, key: PathKey) -> tuple[float, bool]:
+        """Median round trip of a path, and whether it was measured; NaN if its ends tell nothing either.
+
+        If it was not: i to j takes what i to l takes, and what k to j takes longer than k to l; in the median over all
+        k and l. Without such a square, the median over the interface's paths, or else over the server's.
+        """
+        known = self._round_trips
+        if key in known:
+            return known[key], True
+        interface, server = key
+        over = {j: took for (i, j), took in known.items() if i == interface}
+        to = {i: took for (i, j), took in known.items() if j == server}
+        squares = [over[j] + to[i] - took for (i, j), took in known.items() if j in over and i in to]
+        for found in (squares, over.values(), to.values()):
+            if found:
+                return max(0.0, median(found)), False
+        return math.nan, False
+
+    def _size_cost(self, interface: InterfaceName, size_class: int, now: float) -> float:
+        """How much slower than probes requests of the class are, in seconds: over this interface, or else over any."""
+        key = (interface, size_class)
+        if key not in self._size_costs:
+            found = self._costs(self._rows.get(key, ()), now)
+            if not found:
+                of_class = [row for (_, of), row in self._rows.items() if of == size_class]
+                found = [cost for row in of_class for cost in self._costs(row, now)]
+            self._size_costs[key] = median(found) if found else 0.0
+        return self._size_costs[key]
+
+    def _costs(self, cells: Iterable[CellKey], now: float) -> list[float]:
+        costs = []
+        for of in cells:
+            there = self._round_trips.get(of[:2])
+            times = self._cells[of].distribution()
+            if there is None or times is None or self._cells[of].weight(now) < SIZE_COST_REQUESTS:
+                continue
+            took = times.median()
+            if math.isfinite(took):
+                costs.append(max(0.0, took - there))
+        return costs
+
+    def _refresh(self, now: float) -> None:
+        if self._fresh:
+            return
+        self._fresh = True
+        medians = {key: path.rtt.median() for key, path in self.paths.items()}
+        self._round_trips = {key: took for key, took in medians.items() if not math.isnan(took)}
+        self._size_costs.clear()
+        self._rows.clear()
+        for of in sorted(self._cells, key=lambda of: self._cells[of].weight(now), reverse=True):
+            self._rows.setdefault((of[0], of[2]), []).append(of)
