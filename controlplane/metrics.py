@@ -210,6 +210,19 @@ def _plan(core: ControlCore, now: float) -> Iterable[Metric]:
         [],
         {(): core.plan.gap},
     )
+    blocks = core.plan.blocks.values()
+    yield _gauge(
+        "plr_plan_targets_missed",
+        "Services of robots whose mapping is predicted to miss more often than their target_miss.",
+        [],
+        {(): sum(bool(block.shortfall) for block in blocks)},
+    )
+    yield _gauge(
+        "plr_plan_shared_domains",
+        "Regions and carriers that copies of a request share, over the mappings of all robots' services.",
+        [],
+        {(): sum(len(block.shared) for block in blocks)},
+    )
     yield _counter(
         "plr_relaxations_total",
         "Plans taken that exceed capacities by another number of interfaces than the one before.",

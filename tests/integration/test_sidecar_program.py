@@ -19,6 +19,7 @@ import yaml
 
 from protos.model import (
     Assignment,
+    CandidateSet,
     InterfaceName,
     MappingSet,
     NodeName,
@@ -32,6 +33,7 @@ from protos.model import (
     Version,
     Welcome,
 )
+from protos.preferences import InterfaceLabel
 from sidecar.state_store import StateStore
 from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane
@@ -229,10 +231,13 @@ def test_a_mapping_on_disk_that_no_longer_fits_is_asked_for_again(program: Progr
     remember(program, PEERS, mapping("wlan99"))
     with ScriptedControlPlane(welcome=Welcome(3.0, 0.5)) as control_plane:
         program.config["control_plane"] = control_plane.target
+        program.config["networks"] = [{"interface": "l*", "carrier": "own", "cost_per_request": 2}]
         program.path.write_text(yaml.safe_dump(program.config))
         program.start()
         registration = control_plane.expect(Registration)
         assert (registration.peers_version, registration.mapping_version) == (11, 0)
+        told = control_plane.expect(CandidateSet)
+        assert told.labels == (InterfaceLabel(InterfaceName("lo"), "own", 2.0),)
         program.process.send_signal(signal.SIGTERM)
         assert program.end() == 0
     assert "the mapping kept on disk no longer fits" in program.log
