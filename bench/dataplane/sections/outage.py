@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from bench.dataplane.ours import SERVICE, Ours
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import MS, Calls, Row, median, ratio, worst
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, emulated
+from bench.dataplane.topology import CARRIERS, emulated
 from bench.netlab import Lab, LinkProfile
 
 if TYPE_CHECKING:
@@ -46,15 +46,7 @@ def measure(context: Context) -> Findings:
     line: list[tuple[float, float]] = []
     with (
         Lab(emulated(LINK, LINK)) as lab,
-        Ours(
-            context.folder,
-            robot=lab.host(ROBOT),
-            clouds={CLOUD: lab.host(CLOUD)},
-            interfaces=CARRIERS,
-            cloud_interface=CLOUD_INTERFACE,
-            mapping=[(carrier, CLOUD) for carrier in CARRIERS],
-            service=SERVICE_OF_OUTAGE,
-        ) as ours,
+        Ours.in_lab(lab, context.folder, service=SERVICE_OF_OUTAGE) as ours,
     ):
         ours.call(size=SIZE, count=WARM_UP, rate_hz=RATE_HZ)
         for repeat in range(context.repeats):
