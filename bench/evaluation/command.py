@@ -34,6 +34,7 @@ RUNS = "evaluation"
 """Folder of the records, within that of the reports."""
 QUICK_SCENARIO = "drive-1"
 QUICK_SECONDS = 20.0
+USUAL = (*IDEALS, *(name for name, contender in CONTENDERS.items() if not contender.ablation))
 _COLUMNS = ("", "missed", "never answered", "mean ms", "P50 ms", "P99 ms", "kB/request", "void")
 
 
@@ -41,7 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m bench evaluate`."""
     names = (*CONTENDERS, *IDEALS)
     parser.add_argument("--scenario", action="append", metavar="GLOB", help="these only; `python -m bench scenarios`")
-    parser.add_argument("--contender", action="append", choices=names, help="this one only; may be repeated")
+    parser.add_argument(
+        "--contender",
+        action="append",
+        choices=names,
+        help="this one; may be repeated (default: all but those like plr-1x1)",
+    )
     parser.add_argument("--traces", type=Path, help="folder of recorded traces; default: made-up scenarios alone")
     parser.add_argument("--seconds", type=float, help="shorten every window to so much")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_SECONDS:g} s of {QUICK_SCENARIO}: does it work?")
@@ -63,8 +69,9 @@ def run(options: argparse.Namespace) -> int:
     void = False
     for scenario in scenarios:
         console.print(f"{scenario.name} (case {scenario.case}): {scenario.about}, {scenario.duration_s:g} s")
-        for contender in options.contender or (*IDEALS, *CONTENDERS):
-            with console.status(f"{scenario.name}: {contender}"):
+        for contender in options.contender or USUAL:
+            about = CONTENDERS[contender].about if contender in CONTENDERS else "computed"
+            with console.status(f"{scenario.name}, {contender}: {about}"):
                 try:
                     outcome = _run(scenario, contender, options.keep_logs)
                 except LabConfigError as error:

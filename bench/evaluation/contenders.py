@@ -75,6 +75,8 @@ class Contender:
     start: Callable[[World], AbstractContextManager[Clients]]
     carriers: tuple[str, ...] = CARRIERS
     """Interfaces that the robot has."""
+    ablation: bool = False
+    """Ours with less of something: run when asked for by name alone."""
 
     def lab(self) -> LabConfig:
         """The lab that it needs."""
@@ -123,15 +125,15 @@ def _zenoh(world: World) -> Iterator[Clients]:
         yield tuple(clients)
 
 
-def _plr(world: World) -> Iterator[Clients]:
+def _plr(world: World, *, clouds: Sequence[str] = CLOUDS, carriers: Sequence[str] = CARRIERS) -> Iterator[Clients]:
     service = {"name": "/echo", "deadline_ms": world.traffic.deadline_ms, "idempotent": True}
     system = System(world.lab, world.folder)
     try:
         system.start_control_plane()
-        for cloud in CLOUDS:
+        for cloud in clouds:
             system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
             system.start_cloud(cloud, [{"name": "/echo"}])
-        system.wait_for_offer(system.start_robot([service]))
+        system.wait_for_offer(system.start_robot([service], interfaces=carriers))
         with world.remote("ros", world.robot) as client:
             client.ask("connect", **world.service)
             yield (client,)
@@ -139,22 +141,32 @@ def _plr(world: World) -> Iterator[Clients]:
         system.close()
 
 
+def _direct_over(name: str, carrier: str) -> Contender:
+    return Contender(
+        f"direct-{name}",
+        f"ROS 2 straight over carrier {name}",
+        contextlib.contextmanager(partial(_direct, carrier=carrier)),
+        (carrier,),
+    )
+
+
+def _plr_of(interfaces: int, servers: int) -> Contender:
+    carriers = CARRIERS[:interfaces]
+    return Contender(
+        f"plr-{interfaces}x{servers}",
+        f"ours with the first {interfaces} of the carriers and {servers} of the servers",
+        contextlib.contextmanager(partial(_plr, clouds=CLOUDS[:servers], carriers=carriers)),
+        carriers,
+        ablation=True,
+    )
+
+
 _ALL = (
-    Contender(
-        "direct-a",
-        "ROS 2 straight over carrier a",
-        contextlib.contextmanager(partial(_direct, carrier=CARRIERS[0])),
-        CARRIERS[:1],
-    ),
-    Contender(
-        "direct-b",
-        "ROS 2 straight over carrier b",
-        contextlib.contextmanager(partial(_direct, carrier=CARRIERS[1])),
-        CARRIERS[1:],
-    ),
+    *(_direct_over(name, carrier) for carrier, name in PATHS.items()),
     Contender("mptcp", "one connection of the kernel's multipath TCP", contextlib.contextmanager(_mptcp)),
     Contender("zenoh", "a zenoh session over each carrier, first reply", contextlib.contextmanager(_zenoh)),
     Contender("plr-replicate", "every request over both carriers, first answer", contextlib.contextmanager(_plr)),
+    *(_plr_of(interfaces, servers) for interfaces, servers in ((1, 1), (1, 2), (2, 1))),
 )
 CONTENDERS = {contender.name: contender for contender in _ALL}
 """By name; the ideals (`bench.evaluation.ideal`) stand beside them."""
