@@ -77,6 +77,29 @@ class CallLog:
         return {"sent_s": self.sent_s, "latency_s": self.latency_s}
 
 
+class Compute:
+    """What a server does with a request: it takes its time, and for every so-manieth request much longer."""
+
+    def __init__(self, compute_s: float = 0.0, *, stall_s: float = 0.0, stall_every: int = 0) -> None:
+        """`stall_every` 0: it never stalls."""
+        self._compute_s = compute_s
+        self._stall_s = stall_s
+        self._stall_every = stall_every
+        self._served = 0
+
+    def next_s(self) -> float:
+        """Seconds that the next request takes."""
+        self._served += 1
+        stalls = self._stall_every and self._served % self._stall_every == 0
+        return self._compute_s + self._stall_s if stalls else self._compute_s
+
+    def serve(self) -> None:
+        """Take the time that the next request takes."""
+        seconds = self.next_s()
+        if seconds:
+            time.sleep(seconds)
+
+
 class Caller:
     """Sends plans of requests through `send` and collects the answers; numbers go on from plan to plan."""
 

@@ -10,7 +10,7 @@ import contextlib
 import sys
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bench.dataplane.remote import Remote
 from bench.dataplane.topology import CARRIERS, CLOUDS, ROBOT, allow_multipath
@@ -56,10 +56,24 @@ class World:
         """Where servers run."""
         return tuple(self.lab.host(name) for name in CLOUDS)
 
-    @property
-    def service(self) -> dict[str, float]:
-        """How a server answers, as the programs are told."""
-        return {"answer_bytes": self.traffic.answer_bytes, "compute_s": self.traffic.compute_ms / 1e3}
+    def service(self, cloud: str) -> dict[str, Any]:
+        """How a cloud's server answers, as the programs are told."""
+        return {"answer_bytes": self.traffic.answer_bytes, "compute": self.traffic.compute(first=cloud == CLOUDS[0])}
+
+    def start_ros_server(self, host: Host, **environment: str) -> None:
+        """Start a ROS server; how long it computes it is told with each request."""
+        stall = self.traffic.compute(first=host.name == CLOUDS[0])
+        argv = [sys.executable, "-m", "bench.echo", "serve"]
+        if stall["stall_every"]:
+            argv += ["--delay-ms", f"{stall['stall_s'] * 1e3:g}", "--delay-every", str(stall["stall_every"])]
+        host.popen(argv, env=environment, log_path=self.folder / f"{host.name}.echo.log")
+
+    @contextlib.contextmanager
+    def ros_client(self, **environment: str) -> Iterator[Remote]:
+        """A ROS client that has found a server."""
+        with self.remote("ros", self.robot, **environment) as client:
+            client.ask("connect", answer_bytes=self.traffic.answer_bytes, compute_s=self.traffic.compute_ms / 1e3)
+            yield client
 
     def remote(self, program: str, host: Host, **environment: str) -> Remote:
         """Start a measurement program."""
@@ -91,10 +105,8 @@ def _direct(world: World, *, carrier: str) -> Iterator[Clients]:
     # Multicast does not cross routers: each is told where the other is.
     there = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": cloud.address()}
     here = {**there, "ROS_STATIC_PEERS": world.robot.address(carrier)}
-    argv = [sys.executable, "-m", "bench.echo", "serve"]
-    cloud.popen(argv, env=here, log_path=world.folder / "direct.server.log")
-    with world.remote("ros", world.robot, **there) as client:
-        client.ask("connect", **world.service)
+    world.start_ros_server(cloud, **here)
+    with world.ros_client(**there) as client:
         yield (client,)
 
 
@@ -102,7 +114,7 @@ def _mptcp(world: World) -> Iterator[Clients]:
     cloud = world.clouds[0]
     allow_multipath(world.robot, cloud)
     with world.remote("tcp", cloud) as listener, world.remote("tcp", world.robot) as client:
-        port = listener.ask("listen", multipath=True, **world.service)
+        port = listener.ask("listen", multipath=True, **world.service(cloud.name))
         client.ask("connect", host=cloud.address(), port=port, multipath=True)
         client.ask("call", size=1000, count=5, rate_hz=20.0)
         if client.ask("subflows") != 1:
@@ -115,7 +127,7 @@ def _zenoh(world: World) -> Iterator[Clients]:
     with contextlib.ExitStack() as stack:
         for cloud in world.clouds:
             listener = stack.enter_context(world.remote("zenoh", cloud))
-            listener.ask("listen", ports=[ZENOH_PORT], **common, **world.service)
+            listener.ask("listen", ports=[ZENOH_PORT], **common, **world.service(cloud.name))
         # A process for each session: one that blocks, its link being full, holds up no other.
         clients = []
         for cloud, carrier in zip(world.clouds, CARRIERS, strict=True):
@@ -131,11 +143,10 @@ def _plr(world: World, *, clouds: Sequence[str] = CLOUDS, carriers: Sequence[str
     try:
         system.start_control_plane()
         for cloud in clouds:
-            system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
+            world.start_ros_server(world.lab.host(cloud))
             system.start_cloud(cloud, [{"name": "/echo"}])
         system.wait_for_offer(system.start_robot([service], interfaces=carriers))
-        with world.remote("ros", world.robot) as client:
-            client.ask("connect", **world.service)
+        with world.ros_client() as client:
             yield (client,)
     finally:
         system.close()

@@ -12,6 +12,7 @@ import random
 import zlib
 from typing import TYPE_CHECKING
 
+from bench.dataplane.calling import Compute
 from bench.evaluation.outcome import Outcome, Request
 from controlplane.planning.fifo import FifoPath
 
@@ -27,13 +28,16 @@ def compute(scenario: Scenario, contender: str) -> Outcome:
     rng = random.Random(zlib.crc32(scenario.name.encode()))
     traffic = scenario.traffic
     trace = scenario.trace()
-    paths = [FifoPath(trace.path(name)) for name in IDEALS[contender]]
+    paths = [
+        (FifoPath(trace.path(name)), Compute(**traffic.compute(first=name == "a" or len(IDEALS[contender]) == 1)))
+        for name in IDEALS[contender]
+    ]
     requests = []
     for number in range(scenario.count):
         due_s = number / traffic.rate_hz
         latency_s = min(
-            path.request(due_s, traffic.request_bytes, traffic.answer_bytes, traffic.compute_ms / 1e3, rng)
-            for path in paths
+            path.request(due_s, traffic.request_bytes, traffic.answer_bytes, server.next_s(), rng)
+            for path, server in paths
         )
         requests.append(Request(due_s, due_s, None if math.isinf(latency_s) else due_s + latency_s))
     return Outcome(scenario.name, scenario.case, contender, traffic.deadline_ms, tuple(requests))

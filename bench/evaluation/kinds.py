@@ -54,6 +54,7 @@ class Kind:
 
 KINDS = {
     "drive": Kind(ATT, VERIZON, common=0.2, dead_every_s=200.0, dead_s=15.0),
+    "good_drive": Kind(EVEN_ATT, EVEN_VERIZON, common=0.1),
     "blind_spot": Kind(
         EVEN_ATT, EVEN_VERIZON, common=0.1, blackouts=(Blackout("a", 0.3, 0.4), Blackout("a", 0.65, 0.8))
     ),

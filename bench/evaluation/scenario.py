@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -52,6 +52,15 @@ class Traffic(_Section):
     deadline_ms: Annotated[float, Field(gt=0, le=10_000)]
     compute_ms: Annotated[float, Field(ge=0, le=10_000)]
     """How long a server takes for each request, one at a time."""
+    stall_ms: Annotated[float, Field(ge=0, le=60_000)] = 0.0
+    """How much longer the first server, that of carrier a where each has its own, takes now and then ..."""
+    stall_every: Annotated[int, Field(ge=0)] = 0
+    """... namely for every so-manieth request; 0: never."""
+
+    def compute(self, *, first: bool) -> dict[str, Any]:
+        """Arguments of `bench.dataplane.calling.Compute`, for the first or any other server."""
+        stall_s, every = (self.stall_ms / 1e3, self.stall_every) if first else (0.0, 0)
+        return {"compute_s": self.compute_ms / 1e3, "stall_s": stall_s, "stall_every": every}
 
 
 class _Network(_Section):

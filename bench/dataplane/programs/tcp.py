@@ -9,7 +9,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
-from bench.dataplane.calling import HEADER, Caller, Plan, usage
+from bench.dataplane.calling import HEADER, Caller, Compute, Plan, usage
 from bench.dataplane.remote import serve
 
 if TYPE_CHECKING:
@@ -31,12 +31,12 @@ class TcpProgram:
         self._connection: socket.socket | None = None
         self._caller = Caller(self._send)
         self._answer_bytes = HEADER.size
-        self._compute_s = 0.0
+        self._compute = Compute()
 
-    def listen(self, *, multipath: bool, answer_bytes: int = HEADER.size, compute_s: float = 0.0) -> int:
-        """Serve on a free port of all addresses, each request for `compute_s`; returns the port."""
+    def listen(self, *, multipath: bool, answer_bytes: int = HEADER.size, compute: dict[str, Any] | None = None) -> int:
+        """Serve on a free port of all addresses, as `compute` (the arguments of `Compute`) says; returns the port."""
         self._answer_bytes = answer_bytes
-        self._compute_s = compute_s
+        self._compute = Compute(**(compute or {}))
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, _IPPROTO_MPTCP if multipath else 0)
         listener.bind(("0.0.0.0", 0))
         listener.listen()
@@ -75,8 +75,7 @@ class TcpProgram:
             self._start(sock, self._on_request)
 
     def _on_request(self, sock: socket.socket, message: bytes, _now: float) -> None:
-        if self._compute_s:
-            time.sleep(self._compute_s)
+        self._compute.serve()
         answer = message[: self._answer_bytes]
         sock.sendall(_LENGTH.pack(len(answer)) + answer)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import zenoh
 
-from bench.dataplane.calling import HEADER, Caller, Plan, usage
+from bench.dataplane.calling import HEADER, Caller, Compute, Plan, usage
 from bench.dataplane.remote import serve
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class ZenohProgram:
         self._sessions: list[zenoh.Session] = []
         self._caller = Caller(self._send)
         self._answer_bytes = HEADER.size
-        self._compute_s = 0.0
+        self._compute = Compute()
 
     def listen(
         self,
@@ -35,11 +35,11 @@ class ZenohProgram:
         max_links: int,
         lease_ms: int,
         answer_bytes: int = HEADER.size,
-        compute_s: float = 0.0,
+        compute: dict[str, Any] | None = None,
     ) -> None:
-        """Serve on these TCP ports of all addresses, a session for each, each request for `compute_s`."""
+        """Serve on these TCP ports of all addresses, a session for each, as `compute` (see `Compute`) says."""
         self._answer_bytes = answer_bytes
-        self._compute_s = compute_s
+        self._compute = Compute(**(compute or {}))
         for port in ports:
             session = _open(max_links, lease_ms, listen=[f"tcp/0.0.0.0:{port}"])
             session.declare_queryable(KEY, self._on_query, complete=True)
@@ -72,8 +72,7 @@ class ZenohProgram:
 
     def _on_query(self, query: zenoh.Query) -> None:
         assert query.payload is not None
-        if self._compute_s:
-            time.sleep(self._compute_s)
+        self._compute.serve()
         query.reply(KEY, query.payload.to_bytes()[: self._answer_bytes])
 
     def _send(self, _number: int, data: bytes) -> None:

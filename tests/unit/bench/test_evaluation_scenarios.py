@@ -100,6 +100,19 @@ def test_the_ideal_takes_the_faster_path_of_each_request(tmp_path: Path, monkeyp
     assert scenario.shortened(30.0) == scenario
 
 
+def test_the_first_server_stalls_for_one_request_of_so_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some.yaml").write_text(
+        TEXT.replace("compute_ms: 20", "compute_ms: 20, stall_ms: 2000, stall_every: 10")
+    )
+    scenario = read_scenarios([], tmp_path)[0]
+    monkeypatch.setattr(type(scenario), "trace", lambda _: Trace("t", {"a": flat(50_000.0), "b": flat(40_000.0)}))
+    assert compute(scenario, "ideal").figures().miss_ratio == 0.0
+    # Answers keep their order: what follows the one that stalled waits with it.
+    late = [n for n, request in enumerate(compute(scenario, "ideal-a").requests) if request.latency_s > 1.5]
+    assert late[:3] == [9, 10, 11]
+    assert compute(scenario, "ideal-b").figures().miss_ratio > 0.05, "alone, it is the first server's"
+
+
 def test_whoever_has_no_answer_counts_as_ten_seconds_and_the_sender_s_delay_counts() -> None:
     requests = (
         Request(0.0, 0.0, 0.1),
