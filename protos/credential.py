@@ -137,8 +137,9 @@ def verify(credential: SessionCredential, check: Callable[[bytes], Identity]) ->
         raise CertificateError(WRONG_ROLE, f"a certificate of {identity.role.value} {identity.name} signs for another")
     try:
         key = load_der_x509_certificate(credential.certificate).public_key()
-    except ValueError as error:
-        raise CertificateError(MALFORMED, f"the credential's certificate: {error}") from None
+    except Exception as error:
+        # As in identity.py: what is wrong inside DER shows as a dozen kinds of errors.
+        raise CertificateError(MALFORMED, f"the credential's certificate: {type(error).__name__}") from error
     if not isinstance(key, ec.EllipticCurvePublicKey):
         raise CertificateError(MALFORMED, "the credential's certificate holds no key on P-256")
     try:

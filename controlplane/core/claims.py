@@ -35,10 +35,12 @@ def _is_own(registration: Registration, certificate: bytes = b"", identity: Iden
     """The peers check it themselves; here it is about a clear answer to a sidecar that presents another's."""
     try:
         credential = decode_credential(registration.credential)
+        said = (credential.name, credential.role, credential.session, credential.incarnation, credential.certificate)
+        known = (registration.name, registration.role, registration.session, registration.incarnation, certificate)
+        if said != known:
+            return False
         if identity is not None:
             verify(credential, lambda _: identity)
     except DecodeError:
         return False
-    said = (credential.name, credential.role, credential.session, credential.incarnation, credential.certificate)
-    known = (registration.name, registration.role, registration.session, registration.incarnation, certificate)
-    return said == known
+    return True

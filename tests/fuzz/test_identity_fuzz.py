@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from controlplane.ca import Authority
+from protos.credential import Aead, SessionCredential, verify
 from protos.identity import CertificateError, IdentityRole, Trust
+from protos.model import NodeName, Role, SessionId
 from tests.unit.protos.forged import NOW, Recipe, uri
 
 CA = Authority.create(clock=lambda: NOW)
@@ -16,6 +19,9 @@ GOOD = CA.issue("robot-1", IdentityRole.ROBOT).certificate_der
 CA.revoke("robot-1")
 CRL = CA.crl_pem()
 TRUST = Trust(CA.ca_pem)
+IDENTITY = TRUST.identify(GOOD)
+P_256 = bytes.fromhex("06082a8648ce3d030107")
+"""The curve's name in DER."""
 
 Edits = list[tuple[int, int]]
 edits: st.SearchStrategy[Edits] = st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 255)), min_size=1, max_size=4)
@@ -44,6 +50,17 @@ def test_a_certificate_changed_anywhere_is_not_believed(changes: Edits) -> None:
     with contextlib.suppress(CertificateError):
         TRUST.check(der, NOW)
         raise AssertionError("believed")
+
+
+@given(edits)
+@example([(GOOD.index(P_256) + len(P_256) - 1, 6)])
+def test_a_credential_whose_certificate_is_changed_anywhere_is_not_believed(changes: Edits) -> None:
+    """Also by one who asks nothing but whether the certificate's key signed it."""
+    own = SessionCredential(
+        NodeName("robot-1"), Role.ROBOT, SessionId(1), 1, bytes(32), Aead.AES_256_GCM, edited(GOOD, changes), bytes(70)
+    )
+    with pytest.raises(CertificateError):
+        verify(own, lambda _: IDENTITY)
 
 
 @given(st.integers(0, 5000), st.integers(0, 5000))
