@@ -5,11 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.ros_domains import leased_domain
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+# How long an example takes depends on what else the machine does.
+settings.register_profile("plr", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("plr")
 
 
 @pytest.fixture

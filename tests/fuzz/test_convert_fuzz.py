@@ -57,7 +57,7 @@ def test_arbitrary_bytes(data: bytes) -> None:
 
 
 @given(valid_bytes, st.randoms(use_true_random=False))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_damaged_messages(valid: bytes, rng: random.Random) -> None:
     data = bytearray(valid)
     for _ in range(rng.randint(1, 4)):

@@ -157,7 +157,7 @@ def arena(seed: int) -> tuple[Mesh, Node, Node, Node]:
 attacks = st.lists(st.tuples(st.sampled_from(sorted(ATTACKS)), st.integers(1, 60)), max_size=12)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32), attacks)
 def test_a_hostile_robot_does_not_stop_an_honest_one(seed: int, plan: list[tuple[str, int]]) -> None:
     mesh, honest, node, cloud = arena(seed)
@@ -172,7 +172,7 @@ def test_a_hostile_robot_does_not_stop_an_honest_one(seed: int, plan: list[tuple
     assert all(response.elapsed_s < 0.1 for response in honest.responses())
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32), attacks)
 def test_a_hostile_cloud_does_not_stop_the_robots_other_server(seed: int, plan: list[tuple[str, int]]) -> None:
     mesh, robot, _, _ = arena(seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.netlab import model as model_module
@@ -201,7 +201,6 @@ steps = st.one_of(
 scripts = st.lists(st.tuples(st.floats(0, 0.5), steps), max_size=60)
 
 
-@settings(deadline=None)
 @given(first=profiles, script=scripts, seed=st.integers(0, 1000))
 def test_whatever_happens_packets_are_accounted_for_and_stay_in_order(
     first: LinkProfile, script: list[tuple[float, tuple[str, object]]], seed: int
@@ -247,7 +246,6 @@ def test_whatever_happens_packets_are_accounted_for_and_stay_in_order(
         assert (stuck, link.queue_bytes, link.in_flight_packets) == (0, 0, 0)
 
 
-@settings(deadline=None)
 @given(
     rate_kbps=st.floats(8, 100_000),
     delay_ms=st.floats(0, 500),

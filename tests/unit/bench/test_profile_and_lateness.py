@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.netlab.errors import LabConfigError
@@ -42,7 +42,6 @@ def test_empty_histogram_reports_zeros() -> None:
     assert LatenessHistogram().to_json() == {"count": 0, "p50_s": 0.0, "p99_s": 0.0, "max_s": 0.0}
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(-0.001, 60.0), min_size=1, max_size=200), st.floats(0, 1))
 def test_quantile_is_within_a_bucket_of_the_truth(durations: list[float], q: float) -> None:
     histogram = LatenessHistogram()

@@ -8,7 +8,7 @@ from ipaddress import ip_address, ip_network
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.netlab.commands import Command, parse_command
@@ -132,7 +132,6 @@ def test_senseless_command_is_refused(line: str) -> None:
         parse_command(line)
 
 
-@settings(deadline=None)
 @given(st.one_of(st.text(), st.text(st.sampled_from("wlan0.:/,= updoss1e"), max_size=30)))
 def test_any_line_is_a_command_or_a_configuration_error(line: str) -> None:
     try:

@@ -6,7 +6,7 @@ import gzip
 from pathlib import Path  # noqa: TC003 - pytest reads the annotation of tmp_path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.netlab.errors import LabConfigError
@@ -79,7 +79,6 @@ def test_unknown_path_is_a_configuration_error() -> None:
 lines = st.lists(st.text(st.sampled_from('0123456789.,-einaf"\x00 \n'), max_size=60), max_size=5)
 
 
-@settings(deadline=None)
 @given(st.one_of(st.text(), lines.map(lambda rows: HEADER + "\n".join(rows))))
 def test_any_text_is_a_trace_or_a_configuration_error(text: str) -> None:
     try:

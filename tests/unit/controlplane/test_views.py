@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from controlplane.core.permits import Permits
@@ -111,7 +111,6 @@ def test_permits_follow_the_offers() -> None:
 
 
 @given(policies, st.tuples(*(st.sets(st.sampled_from(SERVICES)).map(tuple) for _ in CLOUDS)))
-@settings(deadline=None)
 def test_views_tell_what_is_allowed_and_nothing_else(policy: Policy, offered: tuple[tuple[str, ...], ...]) -> None:
     clouds = dict(zip(CLOUDS, offered, strict=True))
     members = registry(clouds, ROBOTS)

@@ -64,20 +64,19 @@ def test_sidecar_messages_round_trip(value: SidecarMessage) -> None:
 
 
 @given(some.control_messages)
-@settings(deadline=None)
 def test_control_messages_round_trip(value: ControlMessage) -> None:
     assert control_message_from_proto(control_message_to_proto(value)) == value
     assert parse_control_message(control_message_to_proto(value).SerializeToString()) == value
 
 
 @given(st.lists(some.statuses, max_size=3))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_statuses_round_trip(statuses: list[SidecarStatus]) -> None:
     assert status_from_proto(status_to_proto(statuses)) == tuple(statuses)
 
 
 @given(some.explanations)
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_explanations_round_trip(explanation: Explanation) -> None:
     assert explanation_from_proto(explanation_to_proto(explanation)) == explanation
 

@@ -28,7 +28,7 @@ def test_every_block_size_survives_losing_as_much_as_it_has_repairs(size: int) -
     assert decoded == [(place, sources[place]) for place in sorted(lost)]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(size=st.integers(1, fec.MAX_BLOCK), seed=st.integers(0, 2**32))
 def test_all_source_symbols_may_be_lost(size: int, seed: int) -> None:
     rng = random.Random(seed)
