@@ -49,7 +49,8 @@ def _mapping(found: Explanation) -> Iterator[str]:
     yield _paths(found.mapping.assignments)
     observed = f", observed lately {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
     charge = f", a request costs {found.charge:g}" if found.charge is not None else ""
-    yield f"predicted miss {_probability(found.mapping.predicted_miss)}{observed}{charge}"
+    predicted = found.mapping.predicted_miss if found.predicted_miss is None else found.predicted_miss
+    yield f"predicted miss {_probability(predicted)}{observed}{charge}"
     age = f", goes there for {_age(found.in_force_s)}" if found.in_force_s is not None else ""
     refused = f" ({found.sync.error})" if found.sync.error else ""
     yield f"version {found.sync.version_sent}, {found.sync.state.value}{refused}{age}"

@@ -131,6 +131,8 @@ class Explanation:
     """How far the robot follows its mapping, of all its services."""
     mapping: ServiceMapping | None = None
     """As last sent; None if nothing was."""
+    predicted_miss: float | None = None
+    """What is predicted now; `mapping` has what was predicted when it was sent. None if nothing is planned."""
     in_force_s: float | None = None
     """Since when requests go where they go; None if that is forgotten."""
     target_miss: float = 0.0

@@ -83,6 +83,7 @@ def explain(
     block = next((block for block in picture.problem.blocks if block.key == key), None)
     mapping = next((found for found in snapshots.mapping.sent or () if found.service == use.name), None)
     paths = _paths(robot, picture, key, mapping)
+    planned = plan.blocks.get(key)
     return Explanation(
         robot=robot.name,
         service=use.name,
@@ -91,10 +92,11 @@ def explain(
         objective=picture.problem.objective.value,
         mapping=mapping,
         sync=snapshots.mapping.status,
+        predicted_miss=planned.predicted_miss if planned is not None else None,
         in_force_s=now - history.since if history is not None else None,
         observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
         target_miss=use.target_miss,
-        charge=_charge(block, plan.blocks.get(key)),
+        charge=_charge(block, planned),
         pairs=_pairs(paths, picture.notes.get(key) or BlockNotes(), block, estimator, key, mapping, now),
         pairs_left_out=max(0, len(paths) - MAX_PAIRS),
         joints=_joints(block, estimator, now) if block is not None else (),

@@ -17,15 +17,17 @@ from controlplane.planning.prospects import Prospect
 from protos.convert import explanation_from_proto
 from protos.errors import DecodeError
 from protos.explanation import SAMPLE
+from protos.histogram import MIDS
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from controlplane.core.problem import Choice
+    from controlplane.core.problem import Path as PathIndex
     from protos.explanation import Explanation, PairExplanation
     from protos.histogram import Histogram
     from protos.model import Assignment
@@ -106,7 +108,7 @@ class RecordedService:
         epsilon: list[list[float | None]] = [[None] * len(servers) for _ in interfaces]
         for path, (i, j) in index.items():
             epsilon[i][j] = self._epsilon(path, deadline_s)
-        lifts = {}
+        lifts = self._lifts_through_servers(index, deadline_s)
         for joint in found.joints:
             if joint.first in index and joint.second in index and joint.first.interface != joint.second.interface:
                 one, other = index[joint.first], index[joint.second]
@@ -125,19 +127,43 @@ class RecordedService:
         pair = self._pairs[path]
         if deadline_s == self.deadline_s and pair.miss is not None:
             return pair.miss.mean
-        network = _distribution(pair.network)
-        if network is not None:
-            over, samples = network.sum_exceeds(_distribution(pair.compute), deadline_s), pair.network.total / SAMPLE
-        else:
-            over, samples = self._from_probes(pair, deadline_s), min(pair.probes, MAX_PROBES)
+        network, later_s = self._network(pair)
+        over = network.sum_exceeds(_distribution(pair.compute), deadline_s - later_s)
+        samples = pair.network.total / SAMPLE or min(pair.probes, MAX_PROBES)
         return (over * samples + IGNORANCE.misses) / (samples + IGNORANCE.weight)
 
-    def _from_probes(self, pair: PairExplanation, deadline_s: float) -> float:
-        """Of a pair that carried no request: by round trips and computing times."""
-        round_trip = _distribution(pair.rtt)
-        if round_trip is None:
-            return IGNORANCE.mean
-        return round_trip.sum_exceeds(_distribution(pair.compute), deadline_s - self._overhead_s)
+    def _network(self, pair: PairExplanation) -> tuple[Distribution, float]:
+        """What the network takes, and what to add to it: of a pair that carried no request by its round trips."""
+        of_requests = _distribution(pair.network)
+        if of_requests is not None:
+            return of_requests, 0.0
+        of_probes = _distribution(pair.rtt)
+        if of_probes is None:
+            raise ValueError("a pair without evidence")
+        return of_probes, self._overhead_s
+
+    def _lifts_through_servers(
+        self, index: Mapping[Assignment, PathIndex], deadline_s: float
+    ) -> dict[tuple[PathIndex, PathIndex], float]:
+        """How much more often than by chance two paths to one server miss together because it runs a request once.
+
+        P(both miss) is the mean, over what the server takes, of the product of what is left to miss over either.
+        """
+        lifts = {}
+        for first, second in itertools.combinations(self._pairs.values(), 2):
+            compute = _distribution(first.compute)
+            if first.path.server != second.path.server or compute is None:
+                continue
+            used = np.flatnonzero(compute.mass)
+            shares, took = compute.mass[used], np.array(MIDS)[used]
+            one, other = (
+                network.over(deadline_s - later_s - took) for network, later_s in map(self._network, (first, second))
+            )
+            product = float(shares @ one) * float(shares @ other)
+            if product > 0.0:
+                here, there = sorted((index[first.path], index[second.path]))
+                lifts[here, there] = float(shares @ (one * other)) / product
+        return lifts
 
 
 def _overhead(pairs: Collection[PairExplanation]) -> float:

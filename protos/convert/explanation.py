@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from protos.convert.admin import resource_from_proto, resource_to_proto
 from protos.convert.fields import (
@@ -91,8 +91,9 @@ def explanation_from_proto(message: admin_pb2.ExplainResponse) -> Explanation:
         objective=text(message.objective, "objective"),
         mapping=service_mapping_from_proto(message.mapping) if message.HasField("mapping") else None,
         sync=resource_from_proto(message.sync),
+        predicted_miss=_optional(message, "predicted_miss"),
         in_force_s=_age(message.in_force_us, "in_force_us") if message.HasField("in_force_us") else None,
-        observed_miss=_observed(message),
+        observed_miss=_optional(message, "observed_miss"),
         target_miss=probability(message.target_miss, "target_miss"),
         charge=_charge(message),
         pairs=each(message.pairs, MAX_PAIRS, "pairs", _pair_from_proto),
@@ -116,6 +117,7 @@ def explanation_to_proto(explanation: Explanation) -> admin_pb2.ExplainResponse:
         sync=resource_to_proto(found.sync),
         in_force_us=microseconds(found.in_force_s) if found.in_force_s is not None else None,
         observed_miss=found.observed_miss,
+        predicted_miss=found.predicted_miss,
         target_miss=found.target_miss,
         charge=found.charge,
         pairs=map(_pair_to_proto, found.pairs),
@@ -126,8 +128,8 @@ def explanation_to_proto(explanation: Explanation) -> admin_pb2.ExplainResponse:
     )
 
 
-def _observed(message: admin_pb2.ExplainResponse) -> float | None:
-    return probability(message.observed_miss, "observed_miss") if message.HasField("observed_miss") else None
+def _optional(message: admin_pb2.ExplainResponse, field: Literal["observed_miss", "predicted_miss"]) -> float | None:
+    return probability(getattr(message, field), field) if message.HasField(field) else None
 
 
 def _charge(message: admin_pb2.ExplainResponse | admin_pb2.Alternative) -> float | None:

@@ -9,6 +9,7 @@ import pytest
 from controlplane.core.control_events import Settings
 from controlplane.core.explanation import UnknownNameError
 from controlplane.core.path_rules import PathRule
+from controlplane.core.problem import BlockKey
 from controlplane.explanation_text import render
 from protos.explanation import AlternativeKind, Correlation, Explanation
 from protos.model import (
@@ -69,6 +70,7 @@ def test_it_tells_what_the_mapping_rests_on(world: World) -> None:
     measured(world, robot, seconds=60, misses={("wlan0", "a"): 0.1, ("wwan0", "b"): 0.1})
     found = asked(world)
     assert found.mapping == robot.services[0]
+    assert found.predicted_miss == world.core.plan.blocks[BlockKey(ROBOT, PLAN)].predicted_miss
     assert (found.sync.state, found.sync.version_acked) == (SyncState.SYNCED, robot.mapping_version)
     pairs = {pair.path: pair for pair in found.pairs}
     assert {path for path, pair in pairs.items() if pair.chosen} == set(robot.services[0].assignments)

@@ -485,6 +485,7 @@ class ExplainResponse(_message.Message):
     CHANGES_FIELD_NUMBER: _builtins.int
     TARGET_MISS_FIELD_NUMBER: _builtins.int
     CHARGE_FIELD_NUMBER: _builtins.int
+    PREDICTED_MISS_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     service: _builtins.str
     deadline_us: _builtins.int
@@ -501,6 +502,8 @@ class ExplainResponse(_message.Message):
     """Above 0: the service goes where it is cheapest as long as it misses no more often."""
     charge: _builtins.float
     """What a request costs with all its copies; absent unless the service is to be cheap."""
+    predicted_miss: _builtins.float
+    """What is predicted now; `mapping` has what was predicted when it was sent. Absent if nothing is planned."""
     @_builtins.property
     def mapping(self) -> _control_pb2.ServiceMapping:
         """As last sent; absent if nothing was."""
@@ -536,10 +539,11 @@ class ExplainResponse(_message.Message):
         changes: _abc.Iterable[Global___MappingChange] | None = ...,
         target_miss: _builtins.float = ...,
         charge: _builtins.float | None = ...,
+        predicted_miss: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "charge", b"charge", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "sync", b"sync"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "charge", b"charge", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "sync", b"sync"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "alternatives", b"alternatives", "changes", b"changes", "charge", b"charge", "deadline_us", b"deadline_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "alternatives", b"alternatives", "changes", b"changes", "charge", b"charge", "deadline_us", b"deadline_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__charge: _TypeAlias = _typing.Literal["charge"]  # noqa: Y015
     _WhichOneofArgType__charge: _TypeAlias = _typing.Literal["_charge", b"_charge"]  # noqa: Y015
@@ -547,11 +551,15 @@ class ExplainResponse(_message.Message):
     _WhichOneofArgType__in_force_us: _TypeAlias = _typing.Literal["_in_force_us", b"_in_force_us"]  # noqa: Y015
     _WhichOneofReturnType__observed_miss: _TypeAlias = _typing.Literal["observed_miss"]  # noqa: Y015
     _WhichOneofArgType__observed_miss: _TypeAlias = _typing.Literal["_observed_miss", b"_observed_miss"]  # noqa: Y015
+    _WhichOneofReturnType__predicted_miss: _TypeAlias = _typing.Literal["predicted_miss"]  # noqa: Y015
+    _WhichOneofArgType__predicted_miss: _TypeAlias = _typing.Literal["_predicted_miss", b"_predicted_miss"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__charge) -> _WhichOneofReturnType__charge | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__in_force_us) -> _WhichOneofReturnType__in_force_us | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__observed_miss) -> _WhichOneofReturnType__observed_miss | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__predicted_miss) -> _WhichOneofReturnType__predicted_miss | None: ...
 
 Global___ExplainResponse: _TypeAlias = ExplainResponse  # noqa: Y015

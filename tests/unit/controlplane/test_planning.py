@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -143,6 +144,18 @@ def test_a_measured_lift_counts() -> None:
     # The better two paths miss together 8 times as often as by chance: 0.08.
     assert best.paths == "wlan0 -> b, wwan0 -> a"
     assert best.joint == best.product == pytest.approx(0.04)
+
+
+def test_one_slow_server_spoils_both_interfaces() -> None:
+    found = explanation()
+    pairs = tuple(
+        replace(pair, miss=None, network=scaled(0.02, times=100), compute=scaled(*[0.01] * 9, 0.3, times=10))
+        for pair in found.pairs[:4]
+    )
+    sets = RecordedService(replace(found, pairs=pairs, joints=())).prospects(0.1)
+    assert [(found.interfaces, found.servers) for found in sets] == [(1, 1), (2, 1), (2, 2)]
+    assert [found.product for found in sets] == pytest.approx([0.1, 0.01, 0.01], rel=0.1)
+    assert [found.joint for found in sets] == pytest.approx([0.1, 0.1, 0.01], rel=0.1)
 
 
 def test_at_another_deadline_the_recorded_latencies_decide() -> None:

@@ -303,6 +303,7 @@ explanations = st.builds(
     texts,
     resource_statuses,
     st.none() | service_mappings(),
+    st.none() | probabilities,
     st.none() | durations,
     probabilities,
     st.none() | weights,
