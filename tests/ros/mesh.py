@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 WAIT_S = 30.0
+PATIENCE_AT_END_S = 10.0
 POLL_S = 0.01
 RULES = (ServiceRule("/*", deadline_s=0.1, lifetime_s=5.0),)
 
@@ -67,7 +68,8 @@ class Mesh:
     ) -> None:
         for program in self._programs:
             with program, contextlib.suppress(subprocess.TimeoutExpired):
-                program.stop(signal.SIGTERM)  # a killed one leaves its shared memory behind
+                # A killed one leaves its shared memory behind, but now and then rclpy does not end by itself.
+                program.stop(signal.SIGTERM, PATIENCE_AT_END_S)
         stopped = self.robot.stop(), self.cloud.stop()
         self.link.stop()
         if kind is None:

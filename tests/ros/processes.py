@@ -58,7 +58,7 @@ class Program:
         """Press Ctrl-C; its exit code."""
         return self.stop(signal.SIGINT)
 
-    def stop(self, by: signal.Signals) -> int:
+    def stop(self, by: signal.Signals, timeout_s: float = END_S) -> int:
         """Send a signal; its exit code (negative: the signal that ended it)."""
         self._process.send_signal(by)
-        return self.wait()
+        return self.wait(timeout_s)
