@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.copies import OBSERVED_ONE_IN
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
@@ -23,17 +22,48 @@ if TYPE_CHECKING:
     from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
 
-MIN_INTERVAL_S = 5.0
-"""Between two such copies for one service: 12 a minute at most, however many requests there are."""
+MAX_PER_S = 0.2
+"""Such copies of one service: 12 a minute at most, however many requests there are."""
+
+MAX_SAVED = 6.0
+"""Copies that may be saved up for when much is to be learnt at once: when a mapping got bad."""
+
+MIN_INTERVAL_S = 0.5
+"""Between two copies of one service, so that they do not all meet the same moment."""
 
 MAX_REQUEST_BYTES = 128 * 1024
-"""Larger requests are not worth it. With the interval above, a service costs at most 1.6 MB a minute more."""
+"""Larger requests are not worth it. A service costs at most 1.6 MB a minute more."""
 
 MAX_MAPPED_COPIES = 4
 """A request with more copies gets none besides: half of `requests.MAX_COPIES`, the rest is for trouble."""
 
 MAX_WAITING_MESSAGES = 4
 """An interface with more undelivered messages is busy: a copy that need not be would hold others up."""
+
+
+class ExplorationBudget:
+    """How many copies one service may still send to explore."""
+
+    __slots__ = ("_next_at", "_saved", "_seen_at")
+
+    def __init__(self, now: float) -> None:
+        self._saved = 1.0
+        self._seen_at = now
+        self._next_at = now
+
+    def earn(self, share: float, now: float) -> None:
+        """A request came, of a service that may explore with this share of its requests."""
+        self._saved = min(MAX_SAVED, self._saved + min(share, MAX_PER_S * (now - self._seen_at)))
+        self._seen_at = now
+
+    def suffices(self, now: float) -> bool:
+        """Whether a copy may be sent now."""
+        return self._saved >= 1.0 and now >= self._next_at
+
+    def spend(self, now: float) -> None:
+        """A copy is sent."""
+        self._saved -= 1.0
+        self._next_at = now + MIN_INTERVAL_S
 
 
 class Exploration:
@@ -43,8 +73,8 @@ class Exploration:
         self._mapping = mapping
         self._routes = routes
         self._outbox = outbox
-        self._next_at: dict[ServiceName, float] = {}
-        """When a service may explore again; only those that have to wait."""
+        self._budgets: dict[ServiceName, ExplorationBudget] = {}
+        """Of mapped services."""
 
     def path(self, request: Request, servers: Collection[NodeName], now: float) -> PathId | None:
         """The path for one more copy of this request, whose mapped copies have just been sent; mostly None.
@@ -52,10 +82,12 @@ class Exploration:
         `servers` are those that offer the service and have room for the request.
         """
         mapping = self._mapping.services.get(request.service)
-        pair = mapping.explore if mapping is not None else None
-        if pair is None or pair.server not in servers or not self._is_chosen(request):
+        if mapping is None or not request.rule.exploration or not request.rule.idempotent:
             return None
-        if self._next_at.get(request.service, now) > now:
+        budget = self._budget(request.service, now)
+        budget.earn(request.rule.exploration, now)
+        pair = mapping.explore
+        if pair is None or pair.server not in servers or not budget.suffices(now) or not _may_explore(request):
             return None
         route = self._routes.best_over(pair.interface, pair.server)
         if route is None or route.state is not PathState.UP:
@@ -64,14 +96,18 @@ class Exploration:
             return None
         if self._outbox.waiting_over(pair.interface) > MAX_WAITING_MESSAGES:
             return None
-        self._next_at = {service: at for service, at in self._next_at.items() if at > now}
-        self._next_at[request.service] = now + MIN_INTERVAL_S
+        budget.spend(now)
         return route.id
 
-    def _is_chosen(self, request: Request) -> bool:
-        rule = request.rule
-        if not rule.idempotent or len(request.payload or b"") > MAX_REQUEST_BYTES:
-            return False
-        if not 0 < len(request.copies) <= MAX_MAPPED_COPIES or not request.is_race():
-            return False
-        return int.from_bytes(request.id[:4], "big") / 2**32 < rule.exploration * OBSERVED_ONE_IN
+    def _budget(self, service: ServiceName, now: float) -> ExplorationBudget:
+        found = self._budgets.get(service)
+        if found is None:
+            mapped = self._mapping.services
+            self._budgets = {name: budget for name, budget in self._budgets.items() if name in mapped}
+            found = self._budgets[service] = ExplorationBudget(now)
+        return found
+
+
+def _may_explore(request: Request) -> bool:
+    small = len(request.payload or b"") <= MAX_REQUEST_BYTES
+    return small and 0 < len(request.copies) <= MAX_MAPPED_COPIES and request.is_race()

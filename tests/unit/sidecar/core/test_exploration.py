@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import itertools
 import random
+from dataclasses import replace
 
 import pytest
 
 from protos.model import Assignment, MappingSet, ServiceMapping, Version
-from sidecar.core.copies import OBSERVED_ONE_IN
 from sidecar.core.events import RejectReason, RequestId
-from sidecar.core.exploration import MAX_REQUEST_BYTES, MAX_WAITING_MESSAGES, MIN_INTERVAL_S
+from sidecar.core.exploration import (
+    MAX_PER_S,
+    MAX_REQUEST_BYTES,
+    MAX_SAVED,
+    MAX_WAITING_MESSAGES,
+    MIN_INTERVAL_S,
+    ExplorationBudget,
+)
 from sidecar.core.path_id import PathId, PathState
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
@@ -73,31 +80,53 @@ def test_a_busy_interface_is_spared() -> None:
     assert WLAN_B not in table.sent()
 
 
-def test_copies_that_explore_keep_their_distance() -> None:
-    table = exploring(share=0.1)
-    explored = []
-    for tenth in range(300):
-        now = tenth / 10
-        table.submit(RACE * (tenth + 1), now=now)
-        explored += [now] * table.sent().count(WLAN_B)
-        for copy, server in enumerate((A, B, B)):
-            table.respond(server, copy, RACE * (tenth + 1), now)
-    assert len(explored) > 2
-    assert all(later - earlier >= MIN_INTERVAL_S for earlier, later in itertools.pairwise(explored))
-
-
-def test_the_share_is_kept_over_random_ids() -> None:
-    table = exploring(share=0.05)
+def explored(table: Table, share: float, interval_s: float, requests: int) -> list[float]:
+    """When copies explored, of so many requests with random ids, each answered at once."""
+    table.rule = replace(table.rule, exploration=share)
     rng = random.Random(1)
-    for number in range(4000):
-        request_id = RequestId(rng.randbytes(16))
-        now = number * MIN_INTERVAL_S
-        table.table.submit(request_id, ECHO, TYPE, table.rule, b"", now)
-        table.table.handle_timer(now + 0.9 * MIN_INTERVAL_S)
+    times = []
+    for number in range(requests):
+        now = number * interval_s
+        table.table.submit(RequestId(rng.randbytes(16)), ECHO, TYPE, table.rule, b"", now)
+        times += [now] * table.sent().count(WLAN_B)
         for message in list(table.outbox._messages.values()):
             table.outbox.drop(message)
-    assert 0.04 < sum(table.stats.explored.values()) / 4000 < 0.06
-    assert OBSERVED_ONE_IN * table.rule.exploration < 1.0
+    return times
+
+
+def test_the_share_is_kept_and_so_is_the_distance() -> None:
+    times = explored(exploring(), 0.05, 1.0, 800)
+    assert 30 < len(times) <= 41
+    assert all(later - earlier >= MIN_INTERVAL_S for earlier, later in itertools.pairwise(times))
+
+
+def test_however_many_requests_there_are_only_so_many_explore() -> None:
+    times = explored(exploring(), 0.1, 0.02, 1000)
+    assert 2 < len(times) <= 20 * MAX_PER_S + 2
+
+
+def test_what_was_saved_up_is_spent_when_a_pair_is_named_a_moment_apart() -> None:
+    table = exploring()
+    named = table.mapping.services[ECHO]
+    table.mapping.apply(MappingSet(Version(2), 1, (replace(named, explore=None),)), {WLAN, WWAN}, {A, B})
+    assert explored(table, 0.1, 5.0, 100) == []
+    table.mapping.apply(MappingSet(Version(3), 1, (named,)), {WLAN, WWAN}, {A, B})
+    for number in range(100):
+        table.submit(RACE * (number + 1), now=500.0 + number / 100)
+        for message in list(table.outbox._messages.values()):
+            table.outbox.drop(message)
+    assert table.stats.explored[WLAN, B, ECHO] == 2
+
+
+def test_no_more_is_saved_up_than_the_limit() -> None:
+    budget = ExplorationBudget(0.0)
+    for second in range(1000):
+        budget.earn(0.1, float(second))
+    bought = 0
+    while budget.suffices(2000.0 + bought):
+        budget.spend(2000.0 + bought)
+        bought += 1
+    assert bought == int(MAX_SAVED)
 
 
 def after_submit(*mapped: Assignment, exploration: bool) -> Table:
