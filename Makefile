@@ -63,7 +63,7 @@ bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP,
 bench-churn: setup ## interfaces, servers, control plane come and go for ten minutes: nothing is lost, nothing grows
 	@$(PY) -m bench churn $(BENCH_ARGS)
 
-bench-matcher: setup ## the matcher's predictions against recorded networks, and its speed (a quarter of an hour, no lab)
+bench-matcher: setup ## the matcher's predictions against recorded networks, and its speed, and the real system while two servers swap load (half an hour)
 	@$(PY) -m bench matcher $(BENCH_ARGS)
 
 clean: ## remove caches and build output

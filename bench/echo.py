@@ -11,14 +11,12 @@ import random
 import sys
 import time
 import zlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from plr_demo_interfaces.srv import DetectPeople
 
 from examples import robot_client, service_server
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SERVICE = "/echo"
 
@@ -34,6 +32,18 @@ def answer(request: Any, response: Any) -> dict[str, Any]:
     response.image_width = zlib.crc32(data)
     response.image_height = len(data)
     return {"id": request.image.header.frame_id}
+
+
+class Burden:
+    """Makes a server as much slower as a file says, in milliseconds: others use it, more or fewer from time to time."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+
+    def answer(self, request: Any, response: Any) -> dict[str, Any]:
+        """Answer later."""
+        time.sleep(float(self._file.read_text(encoding="utf-8")) / 1e3)
+        return answer(request, response)
 
 
 class EchoRequests:
@@ -65,14 +75,17 @@ def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    service_server.add_arguments(commands.add_parser("serve"))
+    serve = commands.add_parser("serve")
+    service_server.add_arguments(serve)
+    serve.add_argument("--burden", type=Path, metavar="FILE", help="be as many ms slower as this file says")
     call = commands.add_parser("call")
     robot_client.add_arguments(call, rate_hz=50.0, deadline_ms=500.0)
     call.add_argument("--size", type=int, default=1000)
     call.add_argument("--ask-delay-ms", type=float, default=0.0, help="how long the server shall take")
     options = parser.parse_args()
     if options.command == "serve":
-        return service_server.run("echo", DetectPeople, SERVICE, answer, options)
+        serving = answer if options.burden is None else Burden(options.burden).answer
+        return service_server.run("echo", DetectPeople, SERVICE, serving, options)
     workload = EchoRequests(options.size, options.ask_delay_ms, random.Random(options.seed))
     return robot_client.run("caller", DetectPeople, SERVICE, workload, options)
 

@@ -21,8 +21,10 @@ from bench.pressure import CpuPressure
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Mapping, Sequence
 
     from bench.dataplane.section import Figure, Section, Table
+    from bench.dataplane.targets import Target
 
 DEFAULT_REPEATS = 3
 QUICK_REPEATS = 1
@@ -63,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
         _write(report, options.out)
     report.machine["cpu_pressure"] = pressure.share()
     _write(report, options.out)
-    _show_verdicts(console, report.figures)
+    show_verdicts(console, report.figures, TARGETS)
     console.print(f"written: {options.out / 'dataplane.json'} and {options.out / 'dataplane.html'}")
     missed = any(target.met(report.figures) is False for target in TARGETS)
     return 1 if failed or (missed and not options.quick) else 0
@@ -92,12 +94,13 @@ def rich_table(table: Table) -> RichTable:
     return shown
 
 
-def _show_verdicts(console: Console, figures: dict[str, Figure]) -> None:
+def show_verdicts(console: Console, figures: Mapping[str, Figure], targets: Sequence[Target]) -> None:
+    """Show what is met and what is missed."""
     table = RichTable(title="targets", title_justify="left")
     for column in ("figure", "value", "wanted", "verdict"):
         shape: dict[str, Any] = {"justify": "right"} if column == "value" else {"no_wrap": column != "wanted"}
         table.add_column(column, **shape)
-    for target in TARGETS:
+    for target in targets:
         verdict = page.VERDICTS[target.met(figures)]
         table.add_row(target.key, page.text_of(figures.get(target.key)), target.wanted, verdict)
     console.print(table)

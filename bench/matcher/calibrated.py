@@ -90,6 +90,8 @@ def _figures(cells: Sequence[Cell], traces: int) -> dict[str, Figure]:
         "calibration_log_error_product": fmean(one.log_error for one, _ in pairs) if pairs else None,
         "calibration_log_error_joint": fmean(other.log_error for _, other in pairs) if pairs else None,
     }
+    joint, product = figures["calibration_log_error_joint"], figures["calibration_log_error_product"]
+    figures["calibration_joint_over_product"] = joint / product if joint is not None and product else None
     for kind, names in (("single", ("a", "b")), ("product", ("product",)), ("joint", ("joint",))):
         figures[f"calibration_share_{kind}"] = share_calibrated([cell for cell in cells if cell.kind in names])
     return figures

@@ -9,38 +9,20 @@ from typing import TYPE_CHECKING
 from matplotlib.figure import Figure as Canvas
 from rich.console import Console
 
-from bench.dataplane.command import rich_table
+from bench.dataplane.command import rich_table, show_verdicts
 from bench.dataplane.report import machine
 from bench.dataplane.section import Findings
-from bench.matcher import calibrated, speed
+from bench.matcher import calibrated, live, speed
+from bench.matcher.targets import TARGETS
 from bench.netlab.errors import LabConfigError
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
-    from bench.dataplane.section import Figure, Plot
+    from bench.dataplane.section import Plot
 
-WANTED_SHARE = 0.9
-"""Cells whose observed ratio the prediction has to meet."""
-
-AT_MOST = {
-    "resolve_one_of_1000_median_ms": 20.0,
-    "solve_1000x2x20_s": 3.0,
-    "solve_1000x2x20_gap": 0.01,
-    "solve_5000x4x50_s": 60.0,
-    "solve_5000x4x50_gap": 0.03,
-    "choice_over_best_fixed": 1.15,
-    "choice_over_random": 1.0,
-    "choice_over_round_robin": 1.0,
-    "choice_over_lowest_mean_rtt": 1.0,
-}
-"""Speed and exactness of the matcher, on two cores; misses of its choice over those of others."""
-
-AT_LEAST = {"histogram_million_records_per_s": 1.0}
-"""Speed of what it rests on."""
-
-PARTS = ("calibration", "speed")
+PARTS = ("calibration", "speed", "live")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,13 +48,12 @@ def run(options: argparse.Namespace) -> int:
         console.print(rich_table(table))
     for note in findings.notes:
         console.print(note, soft_wrap=True)
-    verdicts = _verdicts(findings)
     for name, value in findings.figures.items():
         console.print(f"{name}: {value if value is None or isinstance(value, int) else round(value, 4)}")
-    for name, met in verdicts.items():
-        console.print(f"{name}: {'met' if met else 'missed'}")
-    _write(findings, verdicts, options)
-    return 0 if options.quick or all(verdicts.values()) else 1
+    show_verdicts(console, findings.figures, TARGETS)
+    _write(findings, options)
+    missed = any(target.met(findings.figures) is False for target in TARGETS)
+    return 1 if missed and not options.quick else 0
 
 
 def _measure(options: argparse.Namespace, say: Callable[[str], None]) -> Findings:
@@ -82,8 +63,10 @@ def _measure(options: argparse.Namespace, say: Callable[[str], None]) -> Finding
             continue
         if part == "calibration":
             findings = calibrated.measure(options.traces, say, quick=options.quick)
-        else:
+        elif part == "speed":
             findings = speed.measure(say, quick=options.quick)
+        else:
+            findings = live.measure(say)
         whole.figures |= findings.figures
         whole.tables += findings.tables
         whole.plots += findings.plots
@@ -91,31 +74,9 @@ def _measure(options: argparse.Namespace, say: Callable[[str], None]) -> Finding
     return whole
 
 
-def _verdicts(findings: Findings) -> dict[str, bool]:
-    figures = findings.figures
-    verdicts = {} if "calibration_share" not in figures else _calibration_verdicts(figures)
-    for name, most in AT_MOST.items():
-        value = figures.get(name)
-        if value is not None:
-            verdicts[f"{name} at most {most:g}"] = value <= most
-    for name, least in AT_LEAST.items():
-        value = figures.get(name)
-        if value is not None:
-            verdicts[f"{name} at least {least:g}"] = value >= least
-    return verdicts
-
-
-def _calibration_verdicts(figures: Mapping[str, Figure]) -> dict[str, bool]:
-    share = figures["calibration_share"]
-    joint, product = (figures[f"calibration_log_error_{kind}"] for kind in ("joint", "product"))
-    return {
-        f"calibration_share at least {WANTED_SHARE}": share is not None and share >= WANTED_SHARE,
-        "joint no worse calibrated than product": joint is not None and product is not None and joint <= product,
-    }
-
-
-def _write(findings: Findings, verdicts: dict[str, bool], options: argparse.Namespace) -> None:
+def _write(findings: Findings, options: argparse.Namespace) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
+    verdicts = {target.key: target.met(findings.figures) for target in TARGETS}
     report = {**findings.figures, "verdicts": verdicts, "machine": machine(), "quick": options.quick}
     (options.out / "matcher.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     for plot in findings.plots:

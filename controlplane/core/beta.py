@@ -38,7 +38,8 @@ def intervals(estimates: Sequence[Estimate], level: float) -> list[tuple[float, 
     misses = np.array([estimate.misses for estimate in estimates])
     hits = np.array([estimate.hits for estimate in estimates])
     low, high = (quantiles(misses, hits, share) for share in ((1.0 - level) / 2.0, (1.0 + level) / 2.0))
-    return list(zip(low.tolist(), high.tolist(), strict=True))
+    # Both may be 0 within rounding, and then in any order.
+    return list(zip(low.tolist(), np.maximum(low, high).tolist(), strict=True))
 
 
 def quantiles(a: Floats, b: Floats, share: float) -> Floats:

@@ -156,11 +156,12 @@ class ControlCore:
             self.counters.reports_ignored += 1
             return
         self.counters.reports += 1
-        changed = self.estimator.merge(name, report, now)
-        self._drawing.reported(name, report)
-        if changed:
+        change = Change.MISSES if self._drawing.reported(name, report) else Change.REPORT
+        if self.estimator.merge(name, report, now):
+            change = Change.PATH
+        if change is not Change.REPORT:
             self._drawing.robot_changed(name)
-        self._debounce.note(Change.PATH if changed else Change.REPORT, now)
+        self._debounce.note(change, now)
         if self._publisher.waits_for(name, (path.server for path in report.paths)):
             self._publish_soon(now)
 

@@ -23,6 +23,8 @@ class Change(enum.Enum):
     """New measurements."""
     PATH = "path"
     """A path went up or down."""
+    MISSES = "misses"
+    """A robot misses far more deadlines than was believed."""
     MEMBERS = "members"
     """A sidecar, its addresses or its services came, went or changed."""
 

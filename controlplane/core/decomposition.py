@@ -97,6 +97,7 @@ class Decomposition:
         self.start = np.array([*(prices.get(key, 0.0) for key in limits.keys), 0.0])
         free = [stack.best(stack.every, np.zeros((len(stack.blocks), stack.servers + 1))) for stack in self.stacks]
         self._forced = [best.excess for best in free]
+        self._wanted = sum(block.copies_wanted.least for block in problem.blocks)
         self._forced_all = sum(int(excess.sum()) for excess in self._forced)
         self._best: Standing = Standing.of_best(self.stacks, limits, np.zeros(len(limits) + 1), free)
         self._bound = -np.inf
@@ -195,5 +196,4 @@ class Decomposition:
             return False
         if any((stack.limit[:, :-1] == len(self.limits)).any() for stack in self.stacks):
             return False
-        wanted = sum(block.copies_wanted.least for stack in self.stacks for block in stack.blocks)
-        return extra <= wanted - int(self.limits.capacity.sum())
+        return extra <= self._wanted - int(self.limits.capacity.sum())

@@ -1,9 +1,9 @@
 """The picture, of which only what may have changed is drawn anew.
 
-A use of a robot is drawn again at once when a path of it goes up or down, or when who offers what to it changes. New
-reports alone make it wait for the next routine solving, those first whose robots missed more deadlines than was
-believed, then those drawn longest ago, and no more of them at a time than `ROUTINE_PAIRS`: so the work for a large
-fleet is bounded, and a robot whose network goes bad does not wait for its turn. A block that came out as before,
+A use of a robot is drawn again at once when a path of it goes up or down, when who offers what to it changes, or when
+the robot misses far more deadlines than was believed. Other reports make it wait for the next routine solving, those
+first that were drawn longest ago, and no more of them at a time than `ROUTINE_PAIRS`: so the work for a large fleet is
+bounded. A block that came out as before,
 within what a change of the mapping could be worth, stays the very same object, which the matcher need not solve again.
 """
 
@@ -35,7 +35,7 @@ ROUTINE_PAIRS = 4000
 """Pairs estimated between two routine solvings because of reports alone: a tenth of a processor."""
 
 SURPRISE_MISSES = 2.0
-"""Misses beyond those believed in that let a robot go before others."""
+"""Misses beyond those believed in since a robot was drawn that let it not wait for its turn."""
 
 STALE_S = 30.0
 """A robot that does not report is drawn again this often, as old measurements fade."""
@@ -114,8 +114,8 @@ class Drawing:
         """Draw this robot in the next picture whatever it costs."""
         self._urgent[robot] = None
 
-    def reported(self, robot: NodeName, report: Report) -> None:
-        """A robot's report was merged into the estimates."""
+    def reported(self, robot: NodeName, report: Report) -> bool:
+        """A robot's report was merged into the estimates; True if it misses far more deadlines than was believed."""
         surprise = self._surprise.get(robot, 0.0)
         for latency in report.latencies:
             if not latency.missed:
@@ -124,6 +124,7 @@ class Drawing:
             believed = _epsilon(drawn.block, latency.interface, latency.server) if drawn and drawn.block else 0.0
             surprise += max(0.0, latency.missed - latency.requests * believed)
         self._surprise[robot] = surprise
+        return surprise >= SURPRISE_MISSES
 
     # ── drawing ──
 
@@ -199,7 +200,7 @@ class Drawing:
     def _next_routine(self, frame: _Frame, now: float) -> list[NodeName]:
         """Robots to draw because of reports, those last that are drawn first."""
         routine = [name for name in frame.uses if name not in self._urgent and self._is_due(name, now)]
-        routine.sort(key=lambda name: (-self._surprised(name), self._at.get(name, 0.0)))
+        routine.sort(key=lambda name: self._at.get(name, 0.0))
         pairs, taken = 0, 0
         for name in routine:
             pairs += sum(inputs.pairs for _, inputs in frame.uses[name])
@@ -210,10 +211,6 @@ class Drawing:
 
     def _is_due(self, robot: NodeName, now: float) -> bool:
         return robot in self._surprise or now - self._at.get(robot, now) >= STALE_S
-
-    def _surprised(self, robot: NodeName) -> float:
-        surprise = self._surprise.get(robot, 0.0)
-        return surprise if surprise >= SURPRISE_MISSES else 0.0
 
     def _draw_robot(self, robot: NodeName, frame: _Frame, estimator: Estimator, now: float) -> int:
         """Returns the pairs that were estimated."""

@@ -27,3 +27,9 @@ def test_an_interval_holds_what_it_says() -> None:
 
 def test_of_none_there_are_none() -> None:
     assert intervals([], 0.9) == []
+
+
+@pytest.mark.parametrize("misses", [0.003, 0.01, 0.02, 0.03])
+def test_an_interval_next_to_0_is_none_upside_down(misses: float) -> None:
+    ((low, high),) = intervals([Estimate(misses, 60.0)], 0.9)
+    assert 0.0 <= low <= high
