@@ -25,19 +25,24 @@ IDEALS = {"ideal": ("a", "b"), "ideal-a": ("a",), "ideal-b": ("b",)}
 
 def compute(scenario: Scenario, contender: str) -> Outcome:
     """The outcome of one of `IDEALS`; always the same."""
-    rng = random.Random(zlib.crc32(scenario.name.encode()))
     traffic = scenario.traffic
     trace = scenario.trace()
+    names = IDEALS[contender]
     paths = [
-        (FifoPath(trace.path(name)), Compute(**traffic.compute(first=name == "a" or len(IDEALS[contender]) == 1)))
-        for name in IDEALS[contender]
+        (
+            FifoPath(trace.path(name)),
+            Compute(**traffic.compute(first=name == names[0])),
+            # What a path loses is the same with the other path and without.
+            random.Random(zlib.crc32(f"{scenario.name} {name}".encode())),
+        )
+        for name in names
     ]
     requests = []
     for number in range(scenario.count):
         due_s = number / traffic.rate_hz
         latency_s = min(
             path.request(due_s, traffic.request_bytes, traffic.answer_bytes, server.next_s(), rng)
-            for path, server in paths
+            for path, server, rng in paths
         )
         requests.append(Request(due_s, due_s, None if math.isinf(latency_s) else due_s + latency_s))
     return Outcome(scenario.name, scenario.case, contender, traffic.deadline_ms, tuple(requests))

@@ -100,6 +100,15 @@ def test_the_ideal_takes_the_faster_path_of_each_request(tmp_path: Path, monkeyp
     assert scenario.shortened(30.0) == scenario
 
 
+def test_no_request_is_slower_with_both_paths_than_with_one() -> None:
+    (scenario,) = (one for one in read_scenarios([]) if one.name == "satellite-1")
+    both, a, b = (compute(scenario, name).requests for name in ("ideal", "ideal-a", "ideal-b"))
+    slower = [max(one.latency_s, other.latency_s) for one, other in zip(a, b, strict=True)]
+    faster = [min(one.latency_s, other.latency_s) for one, other in zip(a, b, strict=True)]
+    assert [request.latency_s for request in both] == pytest.approx(faster)
+    assert faster != slower
+
+
 def test_the_first_server_stalls_for_one_request_of_so_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "some.yaml").write_text(
         TEXT.replace("compute_ms: 20", "compute_ms: 20, stall_ms: 2000, stall_every: 10")
