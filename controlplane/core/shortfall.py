@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from controlplane.core.problem import Block, Choice
 
 MAX_CARRIERS = 8
-"""Carriers more than this are no advice."""
+"""More carriers than this are no advice."""
 
 _STEPS = (1, 2, 5, 10)
 
@@ -25,32 +25,49 @@ def shortfall(block: Block, choice: Choice) -> str:
     miss = joint_miss(block, choice)
     if block.target is None or meets(block.target, math.log(miss)):
         return ""
-    times = _rounded_up(miss / block.target.miss)
-    remedy = _remedy(block, choice, miss, block.target.miss)
-    return f"misses the target of {block.target.miss:g} up to {times:g} times too often; {remedy}"
+    target = block.target.miss
+    remedy = _another_server(block, choice, target) or _more_carriers(block, choice, target / miss)
+    return f"misses the target of {target:g} up to {_rounded_up(miss / target):g} times too often; {remedy}"
 
 
-def _remedy(block: Block, choice: Choice, miss: float, target: float) -> str:
-    """The first that would do: another server, another carrier, several."""
-    best = [
-        min((max(epsilon, PROBABILITY_FLOOR), j) for j, epsilon in enumerate(row) if epsilon is not None)
-        for row in block.epsilon
-    ]
+def _another_server(block: Block, choice: Choice, target: float) -> str:
+    """If one more server, for one of the interfaces that carry a copy, would do. All copies of what is not idempotent
+    go to one server, so one more would take the place of that."""
+    if not block.idempotent:
+        return ""
     found = []
-    for i, (epsilon, j) in enumerate(best):
-        others = tuple(None if k == i else server for k, server in enumerate(choice))
-        if any(server is not None for server in others) or choice[i] is not None:
-            found.append((joint_miss(block, others) * epsilon, i, j))
-    with_server, i, j = min(found)
-    if with_server <= target:
-        name = block.interfaces[i]
-        return f"a server of its own for {name}, as good as {block.servers[j]} and failing independently, would meet it"
-    epsilon, i = min((epsilon, i) for i, (epsilon, _) in enumerate(best))
-    more = math.ceil(math.log(target / miss) / math.log(epsilon) - 1e-9) if epsilon < 1.0 else math.inf
+    for i, server in enumerate(choice):
+        if server is not None:
+            epsilon, best = _best_server(block, i)
+            others = tuple(None if k == i else other for k, other in enumerate(choice))
+            found.append((joint_miss(block, others) * epsilon, i, best))
+    miss, i, best = min(found)
+    if miss > target:
+        return ""
+    name = block.interfaces[i]
+    return f"a server of its own for {name}, as good as {block.servers[best]} and failing independently, would meet it"
+
+
+def _more_carriers(block: Block, choice: Choice, factor: float) -> str:
+    """How many more, to make the miss probability so many times what it is."""
+    if block.idempotent:
+        epsilon, i = min((_best_server(block, i)[0], i) for i in range(len(block.interfaces)))
+    else:
+        used = [(i, server) for i, server in enumerate(choice) if server is not None]
+        epsilon, i = min((max(block.epsilon[i][server] or 0.0, PROBABILITY_FLOOR), i) for i, server in used)
+    more = math.ceil(math.log(factor) / math.log(epsilon) - 1e-9) if epsilon < 1.0 else math.inf
+    as_good = f"as good as {block.interfaces[i]}"
     if more > MAX_CARRIERS:
-        return f"not even {MAX_CARRIERS} more carriers as good as {block.interfaces[i]} would meet it"
+        return f"not even {MAX_CARRIERS} more carriers {as_good} would meet it"
     carriers = "one more carrier" if more == 1 else f"{more} more carriers"
-    return f"{carriers} as good as {block.interfaces[i]}, failing independently, would meet it"
+    copies = " and with as many more copies" if block.copies.most else ""
+    return f"{carriers} {as_good}, failing independently{copies}, would meet it"
+
+
+def _best_server(block: Block, interface: int) -> tuple[float, int]:
+    """Its epsilon and its index."""
+    row = block.epsilon[interface]
+    return min((max(epsilon, PROBABILITY_FLOOR), j) for j, epsilon in enumerate(row) if epsilon is not None)
 
 
 def _rounded_up(times: float) -> float:
