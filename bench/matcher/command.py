@@ -12,7 +12,7 @@ from rich.console import Console
 from bench.dataplane.command import rich_table, show_verdicts
 from bench.dataplane.report import machine
 from bench.dataplane.section import Findings
-from bench.matcher import calibrated, live, speed
+from bench.matcher import calibrated, live, speed, useful
 from bench.matcher.targets import TARGETS
 from bench.netlab.errors import LabConfigError
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from bench.dataplane.section import Plot
 
-PARTS = ("calibration", "speed", "live")
+PARTS = ("calibration", "useful", "speed", "live")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +63,8 @@ def _measure(options: argparse.Namespace, say: Callable[[str], None]) -> Finding
             continue
         if part == "calibration":
             findings = calibrated.measure(options.traces, say, quick=options.quick)
+        elif part == "useful":
+            findings = useful.measure(options.traces, say, quick=options.quick)
         elif part == "speed":
             findings = speed.measure(say, quick=options.quick)
         else:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import enum
 import heapq
+import itertools
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,6 +25,7 @@ from sidecar.core.copies import OBSERVED_ONE_IN
 
 if TYPE_CHECKING:
     import random
+    from collections.abc import Sequence
 
     from bench.matcher.races import Probe, Race
 
@@ -55,29 +58,43 @@ class _News:
 
 
 class Reporter:
-    """Turns races into reports, no sooner than a sidecar could know of each outcome."""
+    """Turns races into reports, no sooner than a sidecar could know of each outcome. Paths are numbered as `pairs`."""
 
-    def __init__(self, deadline_s: float, rng: random.Random, *, size: int = 0) -> None:
+    def __init__(
+        self, deadline_s: float, rng: random.Random, *, size: int = 0, pairs: tuple[Assignment, ...] = PAIRS
+    ) -> None:
         self._deadline_s = deadline_s
         self._size_class = size_class(size)
         self._rng = rng
+        self._pairs = pairs
         self._news: list[_News] = []
         """Latencies and when they are known."""
-        self._judged: list[tuple[float, tuple[bool, bool], bool]] = []
-        """When it is known which path has missed, which has, and whether the race is a full one."""
+        self._judged: list[tuple[float, int, tuple[tuple[int, bool], ...], bool]] = []
+        """When it is known which path has missed, a number to tell them apart, each path and whether it missed, and
+        whether the race is a full one."""
+        self._raced = 0
         self._probes: list[tuple[float, int, float]] = []
 
-    def raced(self, race: Race) -> None:
-        """A request went out over both paths."""
-        missed = (race.latency_s[0] > self._deadline_s, race.latency_s[1] > self._deadline_s)
-        full = not self._rng.randrange(OBSERVED_ONE_IN)
-        over = max(race.latency_s) if full else min(race.latency_s)
-        heapq.heappush(self._judged, (race.at_s + min(over, self._deadline_s), missed, full))
-        if not full:
-            return
-        for path, (latency, processing) in enumerate(zip(race.latency_s, race.processing_s, strict=True)):
+    def raced(self, race: Race, carried: Sequence[int] | None = None, *, full: bool | None = None) -> None:
+        """A request went out over these paths (by default all of them).
+
+        `full`: none of its copies is called off before the deadline; by default that is left to chance, as in a
+        sidecar. A single copy is always measured.
+        """
+        paths = range(len(self._pairs)) if carried is None else carried
+        if full is None:
+            full = not self._rng.randrange(OBSERVED_ONE_IN)
+        full = full or len(paths) < 2
+        latencies = [race.latency_s[path] for path in paths]
+        missed = tuple((path, race.latency_s[path] > self._deadline_s) for path in paths)
+        over = max(latencies) if full else min(latencies)
+        self._raced += 1
+        heapq.heappush(self._judged, (race.at_s + min(over, self._deadline_s), self._raced, missed, full))
+        won = any(not late for _, late in missed)
+        for path, late in missed if full else ():
+            latency, processing = race.latency_s[path], race.processing_s[path]
             # The answer is small: what is on its way for so long has not arrived at its server yet.
-            if latency - processing > self._deadline_s and not missed[1 - path]:
+            if late and won and latency - processing > self._deadline_s:
                 known, ended = self._deadline_s, _Ended.CALLED_OFF
             elif latency > LIFETIME_S:
                 known, ended = LIFETIME_S, _Ended.LOST
@@ -85,22 +102,24 @@ class Reporter:
                 known, ended = latency, _Ended.ANSWERED
             heapq.heappush(self._news, _News(race.at_s + known, path, ended, known, processing))
 
+    def rescued(self, race: Race, path: int) -> None:
+        """The request had no answer by its deadline, so a copy went over this path: started late, it is not judged.
+
+        What it takes is taken for what the request itself would have taken there.
+        """
+        latency = race.latency_s[path]
+        if latency <= LIFETIME_S - self._deadline_s:
+            known_at = race.at_s + self._deadline_s + latency
+            heapq.heappush(self._news, _News(known_at, path, _Ended.ANSWERED, latency, race.processing_s[path]))
+
     def probed(self, probe: Probe) -> None:
         """A probe went out."""
         heapq.heappush(self._probes, (probe.at_s + min(probe.rtt_s, PROBE_TIMEOUT_S), probe.path, probe.rtt_s))
 
     def take(self, now: float) -> Report:
         """The report of what is known by `now` and was not reported yet."""
-        network, called_off, processing, rtts = ([Histogram(), Histogram()] for _ in range(4))
-        judged, missed = [0, 0], [0, 0]
-        together = both_missed = 0
-        while self._judged and self._judged[0][0] <= now:
-            _, misses, full = heapq.heappop(self._judged)
-            together += 1
-            both_missed += all(misses)
-            for path in (0, 1) if full else ():
-                judged[path] += 1
-                missed[path] += misses[path]
+        network, called_off, processing, rtts = ([Histogram() for _ in self._pairs] for _ in range(4))
+        judged, missed, joints = self._outcomes(now)
         while self._news and self._news[0].at_s <= now:
             news = heapq.heappop(self._news)
             if news.ended is _Ended.CALLED_OFF:
@@ -129,9 +148,30 @@ class Reporter:
                     judged[path],
                     missed[path],
                 )
-                for path, pair in enumerate(PAIRS)
+                for path, pair in enumerate(self._pairs)
                 if network[path].total or called_off[path].total or judged[path]
             ),
-            tuple(PathReport(pair.interface, pair.server, True, rtts[path]) for path, pair in enumerate(PAIRS)),
-            joints=(JointReport(SERVICE, *PAIRS, together, both_missed),) if together else (),
+            tuple(PathReport(pair.interface, pair.server, True, rtts[path]) for path, pair in enumerate(self._pairs)),
+            joints=joints,
         )
+
+    def _outcomes(self, now: float) -> tuple[Counter[int], Counter[int], tuple[JointReport, ...]]:
+        """By path, requests and misses among them; and by pair of paths."""
+        judged: Counter[int] = Counter()
+        missed: Counter[int] = Counter()
+        together: Counter[tuple[int, int]] = Counter()
+        both_missed: Counter[tuple[int, int]] = Counter()
+        while self._judged and self._judged[0][0] <= now:
+            _, _, outcomes, full = heapq.heappop(self._judged)
+            for path, late in outcomes if full else ():
+                judged[path] += 1
+                missed[path] += late
+            for (one, one_late), (other, other_late) in itertools.combinations(sorted(outcomes), 2):
+                if full or len(outcomes) == 2:
+                    together[one, other] += 1
+                    both_missed[one, other] += one_late and other_late
+        joints = tuple(
+            JointReport(SERVICE, self._pairs[one], self._pairs[other], count, both_missed[one, other])
+            for (one, other), count in together.items()
+        )
+        return judged, missed, joints

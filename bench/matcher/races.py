@@ -38,11 +38,11 @@ IMAGES = (Workload("20 kB 10/s", 20_000, 10.0), Workload("120 kB 5/s", 120_000, 
 
 @dataclass(frozen=True, slots=True)
 class Race:
-    """One request on both paths: seconds until each answer, inf if lost, and each server's share of it."""
+    """One request on every path: seconds until each answer, inf if lost, and each server's share of it."""
 
     at_s: float
-    latency_s: tuple[float, float]
-    processing_s: tuple[float, float]
+    latency_s: tuple[float, ...]
+    processing_s: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)

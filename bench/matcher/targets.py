@@ -15,6 +15,11 @@ TARGETS = (
     Target("choice_over_random", "over those of random choices", at_most=1),
     Target("choice_over_round_robin", "over those of turns", at_most=1),
     Target("choice_over_lowest_mean_rtt", "over those of the lowest mean round trip", at_most=1),
+    Target("mapping_over_best_fixed", "several servers: misses of mappings over those of the best fixed", at_most=1.15),
+    Target("mapping_over_best_fixed_held_out", "the same on traces by which nothing was chosen", at_most=1.15),
+    Target("mapping_over_random", "over those of random mappings", at_most=1),
+    Target("mapping_over_round_robin", "over those of turns", at_most=1),
+    Target("mapping_over_lowest_mean_rtt", "over those of the lowest mean round trip", at_most=1),
     Target("resolve_one_of_1000_median_ms", "from a robot's report to its new mapping, CPU time in ms", at_most=20),
     *(
         target

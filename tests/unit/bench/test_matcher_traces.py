@@ -8,7 +8,9 @@ import random
 from bench.evaluation.generator import generate
 from bench.matcher.calibration import DEADLINES_S, Cell, cells_of, paired, predict, share_calibrated
 from bench.matcher.choosing import choose
+from bench.matcher.crossed import cross
 from bench.matcher.feed import LIFETIME_S, Reporter
+from bench.matcher.online import follow
 from bench.matcher.races import Probe, Race, Workload, replay
 from protos.convert import report_from_proto, report_to_proto
 
@@ -85,3 +87,14 @@ def test_the_judge_counts_what_is_near_or_inside() -> None:
     assert share_calibrated([cell(160, half=60.0)]) == 1.0
     assert share_calibrated([cell(5, expected=20.0)]) is None
     assert cell(100).log_error == 0.0
+
+
+def test_the_control_plane_maps_better_than_lots_where_one_of_three_servers_is_busy() -> None:
+    drive = generate("drive", 3, 300.0)
+    races = cross(drive, Workload("20 kB", 20_000, 10.0), 3)
+    assert races == cross(drive, Workload("20 kB", 20_000, 10.0), 3), "the same every time"
+    online = follow(races, 0.25, 3)
+    assert online.misses["matcher"] <= 1.15 * online.misses["best fixed"]
+    assert online.misses["matcher"] < min(online.misses["random"], online.misses["round robin"])
+    assert 0 < online.switches < races.duration_s / 10
+    assert 0 < online.explored <= 0.011 * online.requests
