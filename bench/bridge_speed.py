@@ -34,8 +34,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_for_type_support
 from std_srvs.srv import Empty
 
+from protos import interpreter
 from protos.model import NodeName, Role, ServiceName, SessionId
-from sidecar import interpreter
 from sidecar.core.events import ExecuteRequest, ExecutionId, OfferService, RequestFailed, ResponseArrived
 from sidecar.core.priority import Priority
 from sidecar.core.rules import ServiceRule

@@ -25,6 +25,7 @@ import sdnotify
 from controlplane import version
 from controlplane.certificates import load_own_files
 from controlplane.config import load_config, refuse_exposed
+from protos import interpreter
 from protos.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -114,6 +115,7 @@ async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None)
     from controlplane.policy_reload import PolicyReload
     from controlplane.server import serve
 
+    interpreter.share()
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -135,6 +137,7 @@ async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None)
                 "stun_servers is empty: sidecars are told no STUN server, and robots behind a NAT stay unreachable "
                 "unless their own configuration names one"
             )
+        interpreter.settle()
         systemd.notify("READY=1")
 
     def stopping() -> None:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import sdnotify
 
+from protos import interpreter
 from protos.config_fields import split_host_port
 from protos.errors import ConfigError
 from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, Version
 from protos.tls_files import TlsWatch, load_tls_files
-from sidecar import interpreter
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.core.engine import EngineConfig

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
 from bench.null_cipher import install
+from protos import interpreter
 from protos.model import (
     ALL_CALLS,
     Assignment,
@@ -36,7 +37,6 @@ from protos.model import (
     SessionId,
     Version,
 )
-from sidecar import interpreter
 from sidecar.config import SidecarConfig
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, RequestId, ResponseArrived

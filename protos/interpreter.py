@@ -1,4 +1,4 @@
-"""How the interpreter is shared: what may hold it, and for how long, is what all interfaces wait for."""
+"""How a program's threads share the interpreter: who holds it, and for how long, is what all others wait for."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import gc
 import sys
 
 SWITCH_INTERVAL_S = 0.0005
-"""A computing thread gives the interpreter up after this (CPython's default is 5 ms): what another interface waits."""
+"""A computing thread gives the interpreter up after this (CPython's default is 5 ms): what another interface waits, or
+a stream while the control plane solves."""
 
 YOUNG_OBJECTS = 10_000
 """New objects alive that make a collection of the youngest worth while. The cores leave no cycles behind, so a
-collection finds next to nothing; with Python's 700, one request in eighteen (50 a second) waited for one."""
+collection finds next to nothing; with Python's 700, one request in eighteen (50 a second) waited for one, and reports
+of a fleet took the control plane a tenth longer on average, and now and then much longer."""
 
 
 def share() -> None:
