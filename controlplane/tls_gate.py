@@ -184,6 +184,8 @@ class TlsGate:
             raise
         except (OSError, ssl.SSLError) as error:
             self._refused(address, *why_failed(error))
+            # In a cycle with asyncio's TLS buffers: without this, strangers take 100 MB before they are collected.
+            error.__traceback__ = None
             return
         try:
             certificate = transport.get_extra_info("ssl_object").getpeercert(binary_form=True)

@@ -40,6 +40,7 @@ CLIENT_HELLO = bytes.fromhex("1603010200010001fc0303")
 REFUSALS = {
     grpc.StatusCode.OK,
     grpc.StatusCode.ABORTED,
+    grpc.StatusCode.ALREADY_EXISTS,
     grpc.StatusCode.CANCELLED,
     grpc.StatusCode.DEADLINE_EXCEEDED,
     grpc.StatusCode.FAILED_PRECONDITION,
