@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from protos.identity import Identity
     from protos.model import InterfaceName
+    from sidecar.core.budgets import Budget
 
 DEFAULT_CLOUD_UDP_PORT = 24700
 """Fixed, since a firewall rule has to name it; below Linux' ephemeral ports (32768 and up)."""
@@ -134,6 +135,10 @@ class SidecarConfig(Section):
     def service_rules(self) -> tuple[ServiceRule, ...]:
         """The services as the cores want them, in order."""
         return tuple(service.rule(self.role) for service in self.services)
+
+    def budgets(self) -> tuple[Budget, ...]:
+        """What extra copies may cost, by interface, in order."""
+        return tuple(network.budget() for network in self.networks)
 
     def labels(self, interfaces: Iterable[InterfaceName]) -> tuple[InterfaceLabel, ...]:
         """What is known of these interfaces; those that no entry of `networks` matches are left out."""

@@ -145,6 +145,24 @@ def _requests(stats: EngineStats) -> Iterator[Metric]:
         stats.explored,
     )
     yield counter(
+        "plr_copies_hedged",
+        "Copies sent since the answer to another one took long.",
+        ("interface", "peer", "service"),
+        stats.hedged,
+    )
+    yield counter(
+        "plr_copy_bytes",
+        "Bytes of requests sent, without headers and repairs: each request's first copy, and extra ones.",
+        ("interface", "service", "copy"),
+        stats.copy_bytes,
+    )
+    yield counter(
+        "plr_copies_refused",
+        "Extra copies not sent, since the interface's budget forbade them.",
+        ("interface", "service", "limit"),
+        stats.copies_refused,
+    )
+    yield counter(
         "plr_late_responses_dropped",
         "Responses after the deadline that drop_late kept from the application.",
         ("service",),

@@ -57,7 +57,7 @@ class Sidecar:
         rules = config.service_rules()
         self._bridge = RosBridge(name=config.node_name, role=config.role, rules=rules)
         self._data_plane = ThreadedDataPlane(
-            EngineConfig(config.role, rules),
+            EngineConfig(config.role, rules, config.budgets()),
             own,
             DataPlaneHooks(self._bridge, self._on_stun, self._on_services_changed),
         )

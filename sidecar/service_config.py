@@ -19,7 +19,9 @@ from sidecar.config_fields import (
     ServicePattern,
     converted,
 )
+from sidecar.core.budgets import Budget
 from sidecar.core.priority import Priority
+from sidecar.core.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule
 
 if TYPE_CHECKING:
@@ -43,12 +45,31 @@ MAX_EXPLORATION = 0.1
 DEFAULT_EXPLORATION = 0.01
 """What it costs is bounded besides, see `sidecar.core.exploration`."""
 
+MIN_HEDGE_QUANTILE, MAX_HEDGE_QUANTILE = 0.5, 0.99
+"""Below, most requests would be sent twice, which replicate does sooner; above, too few latencies are known."""
+
+MAX_EXTRA_LOAD = 16.0
+"""More than a request's copies can be."""
+MAX_EXTRA_MB_PER_DAY = 1e9
+
 _UNLIMITED = 0
+_BYTES_PER_MB = 1_000_000
 _MS_PER_S = 1000.0
 _MAX_LIFETIME_MS = MAX_LIFETIME_S * _MS_PER_S
 
 
-_ROBOTS_KEYS = ("deadline_ms", "idempotent", "drop_late", "priority", "exploration", "copies", "mode", "target_miss")
+_ROBOTS_KEYS = (
+    "deadline_ms",
+    "idempotent",
+    "drop_late",
+    "priority",
+    "exploration",
+    "redundancy",
+    "hedge_quantile",
+    "copies",
+    "mode",
+    "target_miss",
+)
 
 
 class PriorityWord(enum.Enum):
@@ -75,6 +96,15 @@ class NetworkConfig(Section):
     """Whose network it is: interfaces with the same carrier are taken to fail together."""
     cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] = DEFAULT_CHARGE
     """What a copy of a request over it costs, in any one currency; for services with mode cheapest."""
+    extra_load: Annotated[float, Field(ge=0, le=MAX_EXTRA_LOAD)] | None = None
+    """Bytes of extra copies over it for each byte of requests answered in time; none: no limit."""
+    extra_mb_per_day: Annotated[float, Field(ge=0, le=MAX_EXTRA_MB_PER_DAY)] | None = None
+    """Megabytes (10^6 bytes) of extra copies over it in 24 hours; none: no limit."""
+
+    def budget(self) -> Budget:
+        """As the cores want it."""
+        day = self.extra_mb_per_day
+        return Budget(self.interface, self.extra_load, None if day is None else int(day * _BYTES_PER_MB))
 
 
 class ServiceConfig(Section):
@@ -98,6 +128,12 @@ class ServiceConfig(Section):
     fec: RepairShare | None = None
     """Repair symbols for each symbol of what is sent from here (robot: requests, cloud: answers), 0 to 1, or off, or
     auto: as many as the loss measured on the path asks for. Default auto."""
+    redundancy: Annotated[RedundancyMode | None, converted] = None
+    """Robot: which of the mapped pairs carry a copy: single (the best), backup (the next one too, when the best is in
+    trouble), hedge (the next one too, when the answer takes long) or replicate (all). Default replicate."""
+    hedge_quantile: Annotated[float, Field(ge=MIN_HEDGE_QUANTILE, le=MAX_HEDGE_QUANTILE)] | None = None
+    """Robot, with redundancy hedge: the next copy is sent when the answer takes longer than this share of the answers
+    did. Default 0.95."""
     copies: CopiesWanted | None = None
     """Robot: over how many interfaces copies of a request are sent: each, at_most (each, but rather none than one too
     many for a server or into a failure domain already used), or a number. Default each; with mode cheapest at_most."""
@@ -132,6 +168,8 @@ class ServiceConfig(Section):
             fec=_redundancy(self.fec),
             exploration=DEFAULT_EXPLORATION if self.exploration is None else self.exploration,
             capacity=self.capacity_interfaces or _UNLIMITED,
+            redundancy=self.redundancy or RedundancyMode.REPLICATE,
+            hedge_quantile=self.hedge_quantile or DEFAULT_HEDGE_QUANTILE,
             copies=self.copies or (AT_MOST_EVERY_INTERFACE if self.target_miss else EVERY_INTERFACE),
             target_miss=self.target_miss or 0.0,
             charge=self.cost_per_request or 0.0,
@@ -152,6 +190,10 @@ class ServiceConfig(Section):
             yield "target_miss", "expected a probability beside mode: cheapest, but missing"
         if self.mode is not ModeWord.CHEAPEST and self.target_miss is not None:
             yield "target_miss", "expected only beside mode: cheapest"
+        if self.redundancy is RedundancyMode.HEDGE and not self.idempotent:
+            yield "redundancy", "expected hedge beside idempotent: true only, as copies run on several servers"
+        if self.redundancy is not RedundancyMode.HEDGE and self.hedge_quantile is not None:
+            yield "hedge_quantile", "expected only beside redundancy: hedge"
         if self.exploration and not self.idempotent:
             yield "exploration", "expected beside idempotent: true, as copies would run on several servers"
         if self.deadline_ms is None:

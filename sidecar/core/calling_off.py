@@ -49,6 +49,7 @@ class CallingOff:
         or another copy is still awaited."""
         for copy in copies:
             copy.state = CopyState.DEAD
+            copy.ended_at = now
             self._outbox.drop(copy.message)
             self._stats.called_off[copy.path.interface, copy.path.peer, request.service] += 1
         servers = {copy.path.peer for copy in copies if copy.message.begun}

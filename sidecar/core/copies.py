@@ -6,6 +6,8 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
+from sidecar.core.redundancy_mode import RedundancyMode
+
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.events import RequestId
@@ -53,8 +55,12 @@ class Copy:
     certainly_not_run: bool = False
     in_time: bool = False
     """It was answered before the deadline."""
+    ended_at: float | None = None
+    """When it was answered or called off."""
     explores: bool = False
-    """It was sent to learn, over a path that the mapping does not use: nothing relies on it."""
+    """It was sent to learn, over a path that is not used otherwise: nothing relies on it."""
+    hedges: bool = False
+    """It was sent since another one took long. It says of its path how it is then only, and is not measured."""
 
 
 @dataclass(slots=True)
@@ -70,6 +76,8 @@ class Request:
     size_class: int = 0
     """Settled when it was submitted (`protos.size_class`)."""
     copies: list[Copy] = field(default_factory=list)
+    withheld: tuple[PathId, ...] = ()
+    """Further paths that its mapping names, the best first: for trouble, or to learn of them."""
     observed: bool = True
     """All its copies are measured, and none is called off before the deadline."""
     done: bool = False
@@ -81,10 +89,6 @@ class Request:
     @property
     def deadline_at(self) -> float:
         return self.submitted_at + self.rule.deadline_s
-
-    @property
-    def hedge_at(self) -> float:
-        return self.submitted_at + HEDGE_AT * self.rule.deadline_s
 
     @property
     def expires_at(self) -> float:
@@ -130,9 +134,14 @@ class Request:
     def choose_observation(self) -> None:
         """Decide, when the first copies go out, whether this request is a full race.
 
-        A single copy has nobody to lose against.
+        A single copy has nobody to lose against, unless it may be hedged.
         """
-        self.observed = len(self.copies) < 2 or self.is_race()
+        hedged = self.rule.redundancy is RedundancyMode.HEDGE
+        self.observed = (len(self.copies) < 2 and not hedged) or self.is_race()
+
+    def started_together(self) -> list[Copy]:
+        """The copies sent when the request came, or when there was a path at last."""
+        return [copy for copy in self.copies if copy.sent_at == self.copies[0].sent_at and not copy.hedges]
 
     def is_race(self) -> bool:
         """Whether all its copies are to be measured.

@@ -27,7 +27,7 @@ def measure_outcomes(request: Request, measurements: Measurements) -> None:
     if request.outcomes_measured:
         return
     request.outcomes_measured = True
-    copies = [copy for copy in request.copies if copy.sent_at == request.copies[0].sent_at]
+    copies = request.started_together()
     accepted = [copy for copy in copies if copy.state is not CopyState.REJECTED]
     if request.observed:
         for copy in accepted:

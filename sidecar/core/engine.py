@@ -11,13 +11,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, Report, Role, ServiceUse
-from sidecar.core.events import (
-    ApplicationEvent,
-    ExecutionId,
-    RejectReason,
-    RequestFailed,
-    RequestId,
-)
+from sidecar.core.events import ApplicationEvent, ExecutionId, RejectReason, RequestFailed, RequestId
 from sidecar.core.inbound import Decoding, Inbound
 from sidecar.core.link_events import (
     FinishedLost,
@@ -40,12 +34,7 @@ from sidecar.core.link_events import (
 )
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
-from sidecar.core.messages import (
-    CancelMessage,
-    RequestMessage,
-    ResponseMessage,
-    decode_message,
-)
+from sidecar.core.messages import CancelMessage, RequestMessage, ResponseMessage, decode_message
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
@@ -61,6 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceOffer, SessionId
+    from sidecar.core.budgets import Budget
     from sidecar.core.session import OwnSession
 
 SWEEP_EVERY_S = 1.0
@@ -73,6 +63,8 @@ class EngineConfig:
 
     role: Role
     rules: tuple[ServiceRule, ...]
+    budgets: tuple[Budget, ...] = ()
+    """Robot: the first that matches an interface's name decides."""
 
 
 class Engine:
@@ -106,6 +98,7 @@ class Engine:
                 self.stats,
                 self._events.append,
                 self._seek,
+                config.budgets,
             )
         )
 
@@ -267,6 +260,8 @@ class Engine:
             case FinishedLost(path, numbers) if path.peer in self.peers:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
             case FragmentsLost():
+                if event.timed_out and not event.message.over:
+                    self._requests.on_copy_lost(event.message, now)
                 self._outbox.on_lost(event, now)
             case PathMeasured() if self._knows(event.path):
                 self.routes.set_rtt(event.path, event.smoothed_rtt_s)

@@ -1,7 +1,8 @@
-"""Robot side: now and then, one more copy of a request over a path that the mapping does not use.
+"""Robot side: now and then, one more copy of a request over a path that is not used otherwise.
 
 The control plane says which pair of an interface and a server would teach it most (`ServiceMapping.explore`); what it
-learns there is of real requests, which probes are no match for. The copy is never in place of a mapped one, and goes
+learns there is of real requests, which probes are no match for. Where a service's `RedundancyMode` or a budget leaves
+out mapped pairs, these take turns with it. The copy is never in place of a mapped one, and goes
 only beside requests whose copies are all measured anyway (`copies.OBSERVED_ONE_IN`), so that what is measured stays
 unbiased: which request that is depends on its id, nothing else.
 """
@@ -35,7 +36,7 @@ MAX_REQUEST_BYTES = 128 * 1024
 """Larger requests are not worth it. A service costs at most 1.6 MB a minute more."""
 
 MAX_MAPPED_COPIES = 4
-"""A request with more copies gets none besides: half of `requests.MAX_COPIES`, the rest is for trouble."""
+"""A request with more copies gets none besides: half of `dispatching.MAX_COPIES`, the rest is for trouble."""
 
 MAX_WAITING_MESSAGES = 4
 """An interface with more undelivered messages is busy: a copy that need not be would hold others up."""
@@ -75,29 +76,43 @@ class Exploration:
         self._outbox = outbox
         self._budgets: dict[ServiceName, ExplorationBudget] = {}
         """Of mapped services."""
+        self._turn = 0
 
     def path(self, request: Request, servers: Collection[NodeName], now: float) -> PathId | None:
         """The path for one more copy of this request, whose mapped copies have just been sent; mostly None.
 
         `servers` are those that offer the service and have room for the request.
         """
-        mapping = self._mapping.services.get(request.service)
-        if mapping is None or not request.rule.exploration or not request.rule.idempotent:
+        if not request.rule.exploration or request.service not in self._mapping.services:
             return None
         budget = self._budget(request.service, now)
         budget.earn(request.rule.exploration, now)
-        pair = mapping.explore
-        if pair is None or pair.server not in servers or not budget.suffices(now) or not _may_explore(request):
+        if not budget.suffices(now) or not _may_explore(request):
             return None
-        route = self._routes.best_over(pair.interface, pair.server)
-        if route is None or route.state is not PathState.UP:
-            return None
-        if any((copy.path.interface, copy.path.peer) == (pair.interface, pair.server) for copy in request.copies):
-            return None
-        if self._outbox.waiting_over(pair.interface) > MAX_WAITING_MESSAGES:
+        paths = [path for path in self._candidates(request, servers) if self._is_idle(path)]
+        if not paths:
             return None
         budget.spend(now)
-        return route.id
+        self._turn += 1
+        return paths[self._turn % len(paths)]
+
+    def _candidates(self, request: Request, servers: Collection[NodeName]) -> list[PathId]:
+        """The pair that the control plane names, and those mapped ones that carry no copy of this request."""
+        found = [path for path in request.withheld if path.peer in servers]
+        mapping = self._mapping.services.get(request.service)
+        pair = mapping.explore if mapping is not None else None
+        if pair is None or pair.server not in servers or not request.rule.idempotent:
+            return found
+        route = self._routes.best_over(pair.interface, pair.server)
+        used = {(copy.path.interface, copy.path.peer) for copy in request.copies}
+        if route is not None and route.id not in found and (pair.interface, pair.server) not in used:
+            found.append(route.id)
+        return found
+
+    def _is_idle(self, path: PathId) -> bool:
+        if self._routes.state(path) is not PathState.UP:
+            return False
+        return self._outbox.waiting_over(path.interface) <= MAX_WAITING_MESSAGES
 
     def _budget(self, service: ServiceName, now: float) -> ExplorationBudget:
         found = self._budgets.get(service)

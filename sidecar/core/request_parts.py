@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName
+    from sidecar.core.budgets import Budget
     from sidecar.core.events import ApplicationEvent
     from sidecar.core.mapping import MappingTable
     from sidecar.core.measurements import Measurements
@@ -31,3 +32,5 @@ class RequestParts:
     emit: Callable[[ApplicationEvent], None]
     seek: Callable[[frozenset[NodeName]], None]
     """Asks the links to look for a path to any of these peers."""
+    budgets: tuple[Budget, ...] = ()
+    """What extra copies may cost."""

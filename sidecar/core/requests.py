@@ -19,25 +19,25 @@ from protos.model import Assignment
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
+from sidecar.core.dispatching import Dispatching
 from sidecar.core.events import (
     DeadlineMissed,
     RequestFailed,
     RequestId,
     ResponseArrived,
 )
-from sidecar.core.exploration import Exploration
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
     MAX_PAYLOAD_BYTES,
     RejectionMessage,
-    RequestMessage,
     ResponseMessage,
-    encode_message,
 )
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
+    from sidecar.core.outbound import OutboundMessage
     from sidecar.core.request_parts import RequestParts
     from sidecar.core.rules import ServiceRule
 
@@ -45,8 +45,6 @@ MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
 """Payloads of those requests, which may wait for the first path to a server: as much as the outbox takes."""
-MAX_COPIES = 8
-"""Copies of one request, those sent in trouble included."""
 
 
 class RequestTable:
@@ -57,7 +55,7 @@ class RequestTable:
         self._requests: dict[RequestId, Request] = {}
         self._timers: list[tuple[float, RequestId]] = []
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
-        self._exploration = Exploration(parts.mapping, parts.routes, parts.outbox)
+        self._dispatching = Dispatching(parts)
         self.unanswered = 0
         self._held_bytes = 0
 
@@ -98,55 +96,16 @@ class RequestTable:
         if self._held_bytes + size > MAX_HELD_BYTES:
             return f"the requests in flight have {self._held_bytes} bytes already"
         servers = self._parts.offers.servers(request.service)
-        if servers and not self._with_room(servers, size):
+        if servers and not self._dispatching.with_room(servers, size):
             return "too much waits to be sent already"
         if request.id in self._requests:
             return "a request with this identity is in flight already"
         return None
 
-    def _with_room(self, servers: tuple[NodeName, ...], size: int) -> list[NodeName]:
-        has_room = self._parts.outbox.has_room
-        return [server for server in servers if has_room(server, size)]
-
     def _dispatch(self, request: Request, now: float) -> None:
-        servers = self._with_room(self._parts.offers.servers(request.service), len(request.payload or b""))
-        idempotent = request.rule.idempotent
-        for path in self._parts.mapping.choose(request.service, servers, idempotent=idempotent):
-            self._send_copy(request, path, now)
-        if servers and not request.copies:
-            self._parts.seek(frozenset(servers))
-        if idempotent and len(request.asked()) == 1:
-            heapq.heappush(self._timers, (request.hedge_at, request.id))
-        unmapped = self._exploration.path(request, servers, now)
-        if unmapped is not None:
-            self._send_copy(request, unmapped, now, explores=True)
-        request.choose_observation()
-
-    def _send_copy(self, request: Request, path: PathId, now: float, *, explores: bool = False) -> None:
-        if request.payload is None or len(request.copies) >= MAX_COPIES:
-            return
-        head = RequestMessage(
-            request.id,
-            len(request.copies),
-            request.rule.priority,
-            request.deadline_at - now,
-            request.expires_at - now,
-            request.service,
-            request.type,
-            request.payload,
-        )
-        message = self._parts.outbox.send(
-            path,
-            encode_message(head),
-            priority=request.rule.priority,
-            fec=request.rule.fec,
-            deadline=request.deadline_at,
-            expires=request.expires_at,
-        )
-        if message is not None:
-            request.copies.append(Copy(path, now, message, explores=explores))
-            if explores:
-                self._parts.stats.explored[path.interface, path.peer, request.service] += 1
+        hedge_at = self._dispatching.start(request, now)
+        if hedge_at is not None:
+            heapq.heappush(self._timers, (hedge_at, request.id))
 
     # -- the peers ------------------------------------------------------------------------------------------------
 
@@ -159,9 +118,10 @@ class RequestTable:
         if copy.state is CopyState.ANSWERED:
             self._parts.stats.duplicate_responses += 1
             return
-        measure = request.observed and copy.state is CopyState.PENDING
+        measure = request.observed and copy.state is CopyState.PENDING and not copy.hedges
         copy.in_time = copy.state is CopyState.PENDING and now <= request.deadline_at
         copy.state = CopyState.ANSWERED
+        copy.ended_at = now
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
         self._parts.outbox.on_answered(copy.message)
         if measure:
@@ -208,7 +168,7 @@ class RequestTable:
         self._parts.outbox.on_answered(copy.message)
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
         if not request.done:
-            self._rescue(request, now, rejected=True)
+            self._dispatching.rescue(request, now, rejected=True)
             if not request.pending():
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
                 self._fail(request, "rejected", reason, now)
@@ -240,7 +200,7 @@ class RequestTable:
                 copy.state = CopyState.DEAD
                 self._lost(request, copy, delivered=True)
             if hit and not request.done:
-                self._rescue(request, now)
+                self._dispatching.rescue(request, now)
                 if not request.pending() and not request.rule.idempotent:
                     self._fail(request, "failed", f"{peer} went away; it may have run the request", now)
             self._settle(request, now)
@@ -252,30 +212,20 @@ class RequestTable:
                 continue
             if state is not PathState.UP:
                 if any(copy.path == path for copy in request.pending()):
-                    self._rescue(request, now)
-            elif not request.pending():
-                self._redispatch(request, now)
+                    self._dispatching.rescue(request, now)
+            elif not request.copies:
+                self._dispatch(request, now)
+            elif request.withheld or not request.pending():
+                self._dispatching.rescue(request, now)
 
-    def _redispatch(self, request: Request, now: float) -> None:
-        if not request.copies:
-            self._dispatch(request, now)
-        else:
-            self._rescue(request, now)
-
-    def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
-        """Send one more copy when none that is relied on is on a path that is up (or when `insist`).
-
-        A request that is not idempotent may go to another server only when it is certain that none has run it.
-        """
-        routes = self._parts.routes
-        if not insist and any(routes.state(copy.path) is PathState.UP for copy in request.relied_on()):
-            return
-        if not request.rule.idempotent and not request.certainly_not_run():
-            return
-        servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=rejected)
-        path = self._parts.mapping.rescue(self._with_room(servers, len(request.payload or b"")))
-        if path is not None:
-            self._send_copy(request, path, now)
+    def on_copy_lost(self, message: OutboundMessage, now: float) -> None:
+        """Nothing is heard of a message: if it is a copy with a backup, that one is sent now."""
+        for request in list(self._requests.values()):
+            if request.done or request.rule.redundancy is not RedundancyMode.BACKUP:
+                continue
+            waiting = request.relied_on()
+            if len(waiting) == 1 and waiting[0].message.newest is message:
+                self._dispatching.rescue(request, now, insist=True)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
@@ -296,32 +246,30 @@ class RequestTable:
                 self._expire(request, now)
                 continue
             if now < request.deadline_at:
-                self._hedge(request, now)
+                self._dispatching.hedge(request, now)
                 continue
             heapq.heappush(self._timers, (request.expires_at, request_id))
-            measure_outcomes(request, self._parts.measurements)
+            self._measure(request, now)
             if request.done:
                 self._settle(request, now)
             elif not request.missed:
                 self._miss(request)
                 if request.rule.idempotent:
-                    self._rescue(request, now, insist=True)
-
-    def _hedge(self, request: Request, now: float) -> None:
-        """Ask another server when the only one asked has the request and is silent: it may have died unnoticed.
-
-        Not when the request has not arrived: then the path is slow, which another copy would only make worse.
-        """
-        if not request.done and request.waits_for_one_server():
-            self._rescue(request, now, insist=True)
+                    self._dispatching.rescue(request, now, insist=True)
 
     def _miss(self, request: Request) -> None:
         request.missed = True
         copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
 
+    def _measure(self, request: Request, now: float) -> None:
+        """Which copies missed the deadline is known: note it, once."""
+        if not request.outcomes_measured:
+            self._dispatching.ended(request, now)
+            measure_outcomes(request, self._parts.measurements)
+
     def _lost(self, request: Request, copy: Copy, *, delivered: bool) -> None:
-        if request.observed:
+        if request.observed and not copy.hedges:
             self._parts.measurements.lost(request.carried(copy), delivered=delivered)
 
     def _expire(self, request: Request, now: float) -> None:
@@ -351,9 +299,10 @@ class RequestTable:
         """Forget a request whose copies have all come to an end."""
         if request.done and request.deadline_at <= now:
             undelivered = [copy for copy in request.pending() if not copy.message.newest.over]
-            for copy in undelivered if request.observed else ():
-                self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
+            for copy in undelivered:
+                if request.observed and not copy.hedges:
+                    self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
             self._requests.pop(request.id, None)
-            measure_outcomes(request, self._parts.measurements)
+            self._measure(request, now)

@@ -57,6 +57,11 @@ class Routes:
         """Note a path's smoothed round-trip time."""
         self._get(path).smoothed_rtt_s = smoothed_rtt_s
 
+    def rtt(self, path: PathId) -> float:
+        """Return a path's smoothed round-trip time in seconds, 0 while none is known."""
+        route = self._routes.get(path)
+        return 0.0 if route is None else route.smoothed_rtt_s
+
     def note_fates(self, path: PathId, arrived: int, missed: int) -> None:
         """Note how many of a path's datagrams arrived and were missed since the last call."""
         self._get(path).estimate.add(arrived, missed)

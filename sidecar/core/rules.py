@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from protos.preferences import EVERY_INTERFACE, Copies
 from sidecar.core.priority import Priority
+from sidecar.core.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -58,6 +59,10 @@ class ServiceRule:
     """Whose messages and executions go first where something waits."""
     fec: Redundancy = None
     """Repair symbols for each source symbol of the messages that are sent from here; None: by the measured loss."""
+    redundancy: RedundancyMode = RedundancyMode.REPLICATE
+    """Robot: which of the mapped pairs carry a copy, and when."""
+    hedge_quantile: float = DEFAULT_HEDGE_QUANTILE
+    """Robot, with RedundancyMode.HEDGE: the share of first copies that is waited for."""
     copies: Copies = EVERY_INTERFACE
     """Robot: how many copies of a request the control plane may map."""
     target_miss: float = 0.0

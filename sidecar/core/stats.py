@@ -65,6 +65,12 @@ class EngineStats:
     """Copies no longer awaited since another won."""
     explored: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
     """Copies sent over paths that the mapping does not use, to learn of them."""
+    hedged: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
+    """Copies sent since another one took long."""
+    copy_bytes: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
+    """(interface, service, copy: first | extra); bytes of messages, see `sidecar.core.budgets`."""
+    copies_refused: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
+    """(interface, service, limit: load | day); copies that a budget forbade."""
     late_dropped: Counter[ServiceName] = field(default_factory=Counter)
     executions: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
     """Cloud: (service, result: run | coalesced | cached | cancelled | refused | abandoned)."""

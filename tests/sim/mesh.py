@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import Address
+    from sidecar.core.budgets import Budget
 
 SERVICE = ServiceName("/echo")
 TYPE = "plr_test/srv/Echo"
@@ -97,7 +98,7 @@ class Node:
         self.incarnation = int(now * 1e6) + 1
         aead = self.mesh.aeads.get(self.name, Aead.AES_256_GCM)
         self.own = session_of(self.name, self.role, self.session, self.incarnation, aead)
-        self.engine = Engine(EngineConfig(self.role, self.rules), self.own, now)
+        self.engine = Engine(EngineConfig(self.role, self.rules, self.mesh.budgets), self.own, now)
         self.links = {
             interface: Link(
                 LinkIdentity.of(self.own.credential, self.token, interface, InterfaceId(number)),
@@ -173,6 +174,8 @@ class Mesh:
         self.version = 0
         self.calls = 0
         self.key_limits = DEFAULT_LIMITS
+        self.budgets: tuple[Budget, ...] = ()
+        """Of robots; set it before they start."""
         self.aeads: dict[str, Aead] = {}
         """What nodes prefer other than AES; set it before they start."""
         self.tap: Callable[[Address, Address, bytes], None] | None = None

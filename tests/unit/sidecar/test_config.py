@@ -21,7 +21,9 @@ from sidecar.config import (
     parse_config,
     refuse_exposed,
 )
+from sidecar.core.budgets import Budget
 from sidecar.core.priority import Priority
+from sidecar.core.redundancy_mode import RedundancyMode
 
 SOURCE = "sidecar.yaml"
 ROBOT: dict[str, Any] = {
@@ -124,6 +126,19 @@ def test_copies_to_several_servers_only_when_asked_for() -> None:
     assert rule.priority is Priority.NORMAL
 
 
+def test_how_many_copies_are_sent_and_when() -> None:
+    (rule,) = parse(ROBOT).service_rules()
+    assert (rule.redundancy, rule.hedge_quantile) == (RedundancyMode.REPLICATE, 0.95)
+    changed = with_service(ROBOT, idempotent=True, redundancy="hedge", hedge_quantile=0.9)
+    (rule,) = parse(changed).service_rules()
+    assert (rule.redundancy, rule.hedge_quantile) == (RedundancyMode.HEDGE, 0.9)
+
+
+def test_what_extra_copies_may_cost() -> None:
+    networks = [{"interface": "wwan0", "extra_load": 0.1, "extra_mb_per_day": 0.5}, {"interface": "*"}]
+    assert parse(ROBOT, networks=networks).budgets() == (Budget("wwan0", 0.1, 500_000), Budget("*"))
+
+
 def test_what_is_wanted_of_the_mapping() -> None:
     (rule,) = parse(ROBOT).service_rules()
     assert (rule.copies, rule.target_miss) == (EVERY_INTERFACE, 0.0)
@@ -196,6 +211,13 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(ROBOT, target_miss=0.1), "services[0].target_miss", "only beside mode: cheapest"),
     (with_service(ROBOT, mode="cheapest", target_miss=0), "services[0].target_miss", "greater than 0"),
     (with_service(ROBOT, mode="cheapest", target_miss=1.0), "services[0].target_miss", "less than 1"),
+    (with_service(ROBOT, redundancy="all"), "services[0].redundancy", "'single', 'backup', 'hedge' or 'replicate'"),
+    (with_service(ROBOT, redundancy="hedge"), "services[0].redundancy", "beside idempotent: true only"),
+    (with_service(CLOUD, redundancy="single"), "services[0].redundancy", "on a robot only"),
+    (with_service(ROBOT, hedge_quantile=0.9), "services[0].hedge_quantile", "only beside redundancy: hedge"),
+    (with_service(ROBOT, hedge_quantile=1), "services[0].hedge_quantile", "0.99"),
+    (ROBOT | {"networks": [{"interface": "wlan0", "extra_load": -1}]}, "networks[0].extra_load", "equal to 0"),
+    (ROBOT | {"networks": [{"interface": "wlan0", "extra_mb_per_day": -1}]}, "networks[0].extra_mb_per_day", "to 0"),
     (with_service(ROBOT, cost_per_request=1), "services[0].cost_per_request", "on a cloud only"),
     (with_service(CLOUD, cost_per_request=-1), "services[0].cost_per_request", "greater than or equal to 0"),
     (ROBOT | {"region": "eu"}, "region", "on a cloud only"),

@@ -77,6 +77,9 @@ def busy() -> Counters:
     engine.duplicate_responses = 5
     engine.called_off[WLAN, CLOUD, PLAN] = 6
     engine.explored[WLAN, CLOUD, PLAN] = 2
+    engine.hedged[WLAN, CLOUD, PLAN] = 3
+    engine.copy_bytes[WLAN, PLAN, "extra"] = 800
+    engine.copies_refused[WLAN, PLAN, "day"] = 6
     engine.executions[PLAN, "run"] = 3
     engine.dropped["outbox_full"] = 1
     engine.late_dropped[PLAN] = 1
@@ -127,6 +130,9 @@ def test_counters_become_samples() -> None:
         "plr_duplicate_responses_total{}": 5,
         "plr_copies_called_off_total{interface=wlan0,peer=cloud-a,service=/plan}": 6,
         "plr_copies_explored_total{interface=wlan0,peer=cloud-a,service=/plan}": 2,
+        "plr_copies_hedged_total{interface=wlan0,peer=cloud-a,service=/plan}": 3,
+        "plr_copy_bytes_total{copy=extra,interface=wlan0,service=/plan}": 800,
+        "plr_copies_refused_total{interface=wlan0,limit=day,service=/plan}": 6,
         "plr_executions_total{result=run,service=/plan}": 3,
         "plr_messages_dropped_total{reason=outbox_full}": 1,
         "plr_late_responses_dropped_total{service=/plan}": 1,

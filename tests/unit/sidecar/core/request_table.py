@@ -23,6 +23,7 @@ from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path,
 
 if TYPE_CHECKING:
     from protos.model import NodeName
+    from sidecar.core.budgets import Budget
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
 SERVERS = {A: WLAN_A, B: WWAN_B}
@@ -33,7 +34,14 @@ RACE = OBSERVED_ONE_IN
 class Table:
     """A request table whose commands and events the test reads; wlan0 reaches cloud-a, wwan0 cloud-b."""
 
-    def __init__(self, *, idempotent: bool = True, drop_late: bool = False, exploration: float = 0.0) -> None:
+    def __init__(
+        self,
+        *,
+        idempotent: bool = True,
+        drop_late: bool = False,
+        exploration: float = 0.0,
+        budgets: tuple[Budget, ...] = (),
+    ) -> None:
         self.rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=idempotent, drop_late=drop_late, exploration=exploration)
         self.routes, self.stats = Routes(), EngineStats()
         self.measurements = Measurements(self.stats.dropped)
@@ -53,6 +61,7 @@ class Table:
             self.stats,
             self.events.append,
             self.sought.append,
+            budgets,
         )
         self.table = RequestTable(parts)
         for known in SERVERS.values():

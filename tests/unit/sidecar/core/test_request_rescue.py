@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from sidecar.core.dispatching import MAX_COPIES
 from sidecar.core.events import RejectReason, ResponseArrived
 from sidecar.core.path_id import PathState
-from sidecar.core.requests import MAX_COPIES
 from tests.unit.sidecar.core.builders import A, B
 from tests.unit.sidecar.core.request_table import SERVERS, WLAN_A, WWAN_B, Table
 

@@ -1,0 +1,98 @@
+"""Robot side: what extra copies of requests may cost on each interface.
+
+A bucket of tokens as in gRFC A6 (gRPC's retry throttling), in bytes: requests answered in time fill it, extra copies
+empty it, and without tokens none is sent. When nothing is answered, nothing is earned, so copies never make an overload
+worse. Each copy counts with the bytes of its message, without headers, repair symbols, what is lost and sent again, and
+answers.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from protos.model import InterfaceName, ServiceName
+    from sidecar.core.stats import EngineStats
+
+MAX_SAVED_BYTES = 32 * 1024 * 1024
+"""What a bucket holds: twice the largest request."""
+DAY_S = 86_400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """The limits of the interfaces whose name matches `pattern` (exact or glob); each has its own."""
+
+    pattern: str
+    extra_load: float | None = None
+    """Bytes of extra copies for each byte of requests answered in time; None: no such limit."""
+    extra_bytes_a_day: int | None = None
+    """Bytes of extra copies in 24 hours, counted from the first one; None: no such limit."""
+
+
+@dataclass(slots=True)
+class _Purse:
+    budget: Budget | None
+    saved: float = 0.0
+    day_began_at: float = -math.inf
+    spent_today: int = 0
+
+    def refusal(self, size: int, now: float) -> str | None:
+        """The limit that forbids to spend so much, if any does."""
+        budget = self.budget
+        if budget is None:
+            return None
+        if budget.extra_load is not None and self.saved < size:
+            return "load"
+        if budget.extra_bytes_a_day is not None:
+            if now >= self.day_began_at + DAY_S:
+                self.day_began_at, self.spent_today = now, 0
+            if self.spent_today + size > budget.extra_bytes_a_day:
+                return "day"
+        return None
+
+
+class Budgets:
+    """One purse for each interface."""
+
+    def __init__(self, budgets: Iterable[Budget], stats: EngineStats) -> None:
+        self._budgets = tuple(budgets)
+        self._stats = stats
+        self._purses: dict[InterfaceName, _Purse] = {}
+
+    def __bool__(self) -> bool:
+        """Whether anything is limited."""
+        return any(one.extra_load is not None or one.extra_bytes_a_day is not None for one in self._budgets)
+
+    def earn(self, size: int, interfaces: Iterable[InterfaceName]) -> None:
+        """A request of `size` bytes was answered in time; `interfaces` are those that its mapping names."""
+        for interface in interfaces:
+            self._purse(interface)
+        for purse in self._purses.values():
+            if purse.budget is not None and purse.budget.extra_load is not None:
+                purse.saved = min(purse.saved + purse.budget.extra_load * size, MAX_SAVED_BYTES)
+
+    def allows(self, interface: InterfaceName, service: ServiceName, size: int, now: float) -> bool:
+        """Whether an extra copy of `size` bytes may be sent now; if not, it is counted as refused."""
+        refusal = self._purse(interface).refusal(size, now)
+        if refusal is not None:
+            self._stats.copies_refused[interface, service, refusal] += 1
+        return refusal is None
+
+    def spend(self, interface: InterfaceName, size: int) -> None:
+        """An extra copy of `size` bytes was sent, which was allowed."""
+        purse = self._purse(interface)
+        purse.saved -= size
+        purse.spent_today += size
+
+    def _purse(self, interface: InterfaceName) -> _Purse:
+        purse = self._purses.get(interface)
+        if purse is None:
+            budget = next((one for one in self._budgets if fnmatch.fnmatchcase(interface, one.pattern)), None)
+            purse = self._purses[interface] = _Purse(budget)
+        return purse

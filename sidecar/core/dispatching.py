@@ -1,0 +1,193 @@
+"""Robot side: which copies of a request are sent, over which paths, and when.
+
+The mapping names the pairs of an interface and a server, the service's `RedundancyMode` says how many of them carry a
+copy at once. Every copy sent while another one is awaited is an extra one, which the interface's budget has to allow.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import TYPE_CHECKING
+
+from sidecar.core.budgets import Budgets
+from sidecar.core.copies import HEDGE_AT, Copy, CopyState, Request
+from sidecar.core.exploration import Exploration
+from sidecar.core.messages import RequestMessage, encode_message
+from sidecar.core.path_id import PathState
+from sidecar.core.path_records import PathRecords
+from sidecar.core.redundancy_mode import RedundancyMode
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from protos.model import NodeName
+    from sidecar.core.path_id import PathId
+    from sidecar.core.request_parts import RequestParts
+
+MAX_COPIES = 8
+"""Copies of one request, those sent in trouble included."""
+
+
+class _Why(enum.Enum):
+    MAPPED = enum.auto()
+    TROUBLE = enum.auto()
+    HEDGE = enum.auto()
+    EXPLORATION = enum.auto()
+
+
+class Dispatching:
+    """Sends copies."""
+
+    def __init__(self, parts: RequestParts) -> None:
+        self._parts = parts
+        self._exploration = Exploration(parts.mapping, parts.routes, parts.outbox)
+        self._records = PathRecords(parts.stats)
+        self._budgets = Budgets(parts.budgets, parts.stats)
+
+    def with_room(self, servers: tuple[NodeName, ...], size: int) -> list[NodeName]:
+        """Those of the servers to which a request of `size` bytes may be sent now."""
+        has_room = self._parts.outbox.has_room
+        return [server for server in servers if has_room(server, size)]
+
+    def start(self, request: Request, now: float) -> float | None:
+        """Send the first copies; returns when `hedge` is wanted, if at all."""
+        rule = request.rule
+        servers = self.with_room(self._parts.offers.servers(request.service), len(request.payload or b""))
+        chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
+        if rule.redundancy is RedundancyMode.REPLICATE:
+            paths = self._best_first(request, chosen, now) if self._budgets else chosen
+            request.withheld = tuple(path for path in paths if not self._send(request, path, now, _Why.MAPPED))
+        else:
+            self._send_best(request, self._best_first(request, chosen, now), now)
+        if servers and not request.copies:
+            self._parts.seek(frozenset(servers))
+        hedge_at = self._hedge_at(request, now)
+        unmapped = self._exploration.path(request, servers, now)
+        if unmapped is not None:
+            self._send(request, unmapped, now, _Why.EXPLORATION)
+        request.choose_observation()
+        return hedge_at
+
+    def _send_best(self, request: Request, paths: list[PathId], now: float) -> None:
+        while paths and not request.copies:
+            self._send(request, paths.pop(0), now, _Why.MAPPED)
+        request.withheld = tuple(paths)
+        if request.copies:
+            self.rescue(request, now)
+
+    def _best_first(self, request: Request, paths: Iterable[PathId], now: float) -> list[PathId]:
+        """Those that are up first; among them those that missed least lately, then the fastest."""
+
+        def order(path: PathId) -> tuple[bool, float, float]:
+            up = self._parts.routes.state(path) is PathState.UP
+            return not up, self._records.miss_share(request.service, path, now), self._parts.routes.rtt(path)
+
+        return sorted(paths, key=order)
+
+    def _hedge_at(self, request: Request, now: float) -> float | None:
+        if not request.copies or now >= request.deadline_at or not request.rule.redundancy.helps:
+            return None
+        half = request.submitted_at + HEDGE_AT * request.rule.deadline_s
+        if request.rule.redundancy is RedundancyMode.HEDGE:
+            path, quantile = request.copies[0].path, request.rule.hedge_quantile
+            delay_s = self._records.quantile_s(request.service, path, quantile, now)
+            return half if delay_s is None else min(now + delay_s, half)
+        return half if request.rule.idempotent and len(request.asked()) == 1 else None
+
+    def hedge(self, request: Request, now: float) -> None:
+        """The moment that `start` named has come: send another copy if that promises anything.
+
+        With RedundancyMode.HEDGE, over another interface. Else, and where there is none, to another server if the only
+        one asked has the request and is silent: it may have died unnoticed. Not over the same interface when the
+        request has not arrived: then the path is slow, which another copy would only make worse.
+        """
+        waiting = request.relied_on()
+        if request.done or not waiting:
+            return
+        if request.rule.redundancy is RedundancyMode.HEDGE:
+            path = self._next_withheld(request)
+            if path is not None and path.interface != waiting[0].path.interface:
+                if len(waiting) == 1:
+                    self._send(request, path, now, _Why.HEDGE)
+                return
+        if request.rule.idempotent and request.waits_for_one_server():
+            self.rescue(request, now, insist=True)
+
+    def rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
+        """Send one more copy when none that is relied on is on a path that is up (or when `insist`).
+
+        A request that is not idempotent may go to another server only when it is certain that none has run it.
+        """
+        routes = self._parts.routes
+        waiting = request.relied_on()
+        if waiting and not request.rule.redundancy.helps:
+            return
+        if not insist and any(routes.state(copy.path) is PathState.UP for copy in waiting):
+            return
+        path = self._next_withheld(request) or self._elsewhere(request, rejected=rejected)
+        if path is not None:
+            self._send(request, path, now, _Why.TROUBLE)
+
+    def _next_withheld(self, request: Request) -> PathId | None:
+        """The best path that is up of those its mapping names and that carry no copy, to a server that may run it."""
+        waiting = {copy.path.peer for copy in request.relied_on()}
+        refused = {copy.path.peer for copy in request.copies if copy.state is CopyState.REJECTED}
+        for path in request.withheld:
+            if self._parts.routes.state(path) is not PathState.UP or path.peer in refused:
+                continue
+            if request.rule.idempotent or path.peer in waiting:
+                return path
+        return None
+
+    def _elsewhere(self, request: Request, *, rejected: bool) -> PathId | None:
+        if not request.rule.idempotent and not request.certainly_not_run():
+            return None
+        servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=rejected)
+        return self._parts.mapping.rescue(self.with_room(servers, len(request.payload or b"")))
+
+    def ended(self, request: Request, now: float) -> None:
+        """What became of the copies is known, or the deadline is over. Called once for each request."""
+        self._records.note(request, now)
+        if self._budgets and any(copy.in_time for copy in request.copies):
+            paths = (*request.withheld, *(copy.path for copy in request.copies))
+            self._budgets.earn(request.copies[0].message.total, {path.interface for path in paths})
+
+    def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
+        if request.payload is None or len(request.copies) >= MAX_COPIES:
+            return False
+        rule, stats = request.rule, self._parts.stats
+        head = RequestMessage(
+            request.id,
+            len(request.copies),
+            rule.priority,
+            request.deadline_at - now,
+            request.expires_at - now,
+            request.service,
+            request.type,
+            request.payload,
+        )
+        content = encode_message(head)
+        extra = bool(request.relied_on())
+        if extra and not self._budgets.allows(path.interface, request.service, content.size, now):
+            return False
+        message = self._parts.outbox.send(
+            path,
+            content,
+            priority=rule.priority,
+            fec=rule.fec,
+            deadline=request.deadline_at,
+            expires=request.expires_at,
+        )
+        if message is None:
+            return False
+        explores = why is _Why.EXPLORATION
+        request.copies.append(Copy(path, now, message, explores=explores, hedges=why is _Why.HEDGE))
+        request.withheld = tuple(other for other in request.withheld if other != path)
+        if extra:
+            self._budgets.spend(path.interface, content.size)
+        stats.copy_bytes[path.interface, request.service, "extra" if extra else "first"] += content.size
+        if explores:
+            stats.explored[path.interface, path.peer, request.service] += 1
+        elif why is _Why.HEDGE:
+            stats.hedged[path.interface, path.peer, request.service] += 1
+        return True

@@ -1,0 +1,26 @@
+"""How many copies of a service's requests are sent, and when."""
+
+from __future__ import annotations
+
+import enum
+
+DEFAULT_HEDGE_QUANTILE = 0.95
+"""As in The Tail at Scale (Dean and Barroso 2013): about 5 % more load."""
+
+
+class RedundancyMode(enum.Enum):
+    """From the cheapest to the surest."""
+
+    SINGLE = "single"
+    """Over the best mapped pair; another copy only in place of one that a server refused or took down with it."""
+    BACKUP = "backup"
+    """The same, and the next pair as soon as the best one's path is unstable or down, or loses the request."""
+    HEDGE = "hedge"
+    """The same, and the next pair when the answer takes longer than it mostly does (a hedged request)."""
+    REPLICATE = "replicate"
+    """Over every mapped pair at once (paper, section IV)."""
+
+    @property
+    def helps(self) -> bool:
+        """Whether another copy may go out while one is awaited."""
+        return self is not RedundancyMode.SINGLE

@@ -1,0 +1,183 @@
+"""Which copies go out when, by mode."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from sidecar.core.budgets import Budget
+from sidecar.core.copies import HEDGE_AT
+from sidecar.core.events import RejectReason
+from sidecar.core.path_id import PathId, PathState
+from sidecar.core.redundancy_mode import RedundancyMode
+from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
+from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
+
+WWAN_A = path(WWAN, A)
+
+
+def table_with(mode: RedundancyMode, *, idempotent: bool = True, budgets: tuple[Budget, ...] = ()) -> Table:
+    """By round-trip time wlan0 to cloud-a is the first choice."""
+    table = Table(idempotent=idempotent, budgets=budgets)
+    table.rule = dataclasses.replace(table.rule, redundancy=mode)
+    table.routes.set_rtt(WLAN_A, 0.01)
+    table.routes.set_rtt(WWAN_B, 0.02)
+    return table
+
+
+def learn(table: Table, latency_s: float, requests: int = 19) -> None:
+    """The first choice answers so many requests."""
+    for number in range(1001, 1001 + requests):
+        table.submit(number)
+        table.respond(number=number, now=latency_s)
+    table.sent()
+
+
+@pytest.mark.parametrize(
+    ("mode", "at_once", "in_trouble"),
+    [
+        (RedundancyMode.SINGLE, [WLAN_A], []),
+        (RedundancyMode.BACKUP, [WLAN_A], [WWAN_B]),
+        (RedundancyMode.HEDGE, [WLAN_A], [WWAN_B]),
+        (RedundancyMode.REPLICATE, [WLAN_A, WWAN_B], []),
+    ],
+)
+@pytest.mark.parametrize("state", [PathState.UNSTABLE, PathState.DOWN])
+def test_copies_at_once_and_when_the_path_fails(
+    mode: RedundancyMode, state: PathState, at_once: list[PathId], in_trouble: list[PathId]
+) -> None:
+    table = table_with(mode)
+    table.submit()
+    assert table.sent() == at_once
+    table.change(WLAN_A, state)
+    assert table.sent() == in_trouble
+
+
+@pytest.mark.parametrize("mode", RedundancyMode)
+def test_a_refusal_moves_the_request_on(mode: RedundancyMode) -> None:
+    table = table_with(mode)
+    table.submit()
+    table.reject(RejectReason.OVERLOADED)
+    assert table.sent() == [WLAN_A, WWAN_B]
+
+
+@pytest.mark.parametrize("mode", [RedundancyMode.BACKUP, RedundancyMode.HEDGE])
+def test_what_is_in_trouble_already_gets_the_first_path_that_comes_up(mode: RedundancyMode) -> None:
+    table = table_with(mode)
+    for known in (WLAN_A, WWAN_B):
+        table.routes.set_state(known, PathState.UNSTABLE)
+    table.submit()
+    assert table.sent() == [WLAN_A]
+    table.change(WWAN_B, PathState.UP)
+    assert table.sent() == [WWAN_B]
+
+
+@pytest.mark.parametrize("mode", RedundancyMode)
+def test_a_lost_request_is_sent_again_elsewhere_if_it_has_a_backup(mode: RedundancyMode) -> None:
+    table = table_with(mode)
+    table.submit()
+    first = next(message for message in table.outbox._messages.values() if message.path == WLAN_A)
+    table.sent()
+    for _ in range(2):
+        table.table.on_copy_lost(first, 0.1)
+    assert table.sent() == ([WWAN_B] if mode is RedundancyMode.BACKUP else [])
+
+
+@pytest.mark.parametrize("mode", [RedundancyMode.SINGLE, RedundancyMode.BACKUP])
+def test_one_server_only_unless_idempotent(mode: RedundancyMode) -> None:
+    table = table_with(mode, idempotent=False)
+    table.routes.set_state(WWAN_A, PathState.UP)
+    table.routes.set_rtt(WWAN_A, 0.03)
+    table.submit()
+    assert table.sent() == [WLAN_A]
+    table.change(WLAN_A, PathState.UNSTABLE)
+    assert table.sent() == ([WWAN_A] if mode is RedundancyMode.BACKUP else [])
+
+
+def test_a_server_that_left_is_not_asked_again_over_another_interface() -> None:
+    table = table_with(RedundancyMode.BACKUP, idempotent=False)
+    table.routes.set_state(WWAN_A, PathState.UP)
+    table.routes.set_rtt(WWAN_A, 0.03)
+    table.submit()
+    table.table.on_peer_gone(A, 0.1)
+    assert table.sent() == [WLAN_A]
+    assert "may have run" in table.only_failure().reason
+
+
+def test_the_hedge_waits_for_the_quantile_once_enough_is_known() -> None:
+    table = table_with(RedundancyMode.HEDGE)
+    learn(table, 0.04, 18)
+    table.submit()
+    assert table.table.next_timer() == HEDGE_AT * table.rule.deadline_s
+    table.respond()
+    learn(table, 0.04, 1)
+    table.submit(2)
+    table.sent()
+    table.table.handle_timer(0.039)
+    assert table.sent() == []
+    table.table.handle_timer(0.1)
+    assert table.sent() == [WWAN_B]
+    assert table.stats.hedged == {(WWAN, B, ECHO): 1}
+    table.respond(B, 1, 2)
+    assert table.stats.called_off == {(WLAN, A, ECHO): 1}
+    assert [path for path, _ in table.cancelled()] == [WLAN_A]
+    table.assert_empty()
+
+
+def test_a_hedge_is_not_measured_and_its_first_copy_in_races_only() -> None:
+    table = table_with(RedundancyMode.HEDGE)
+    for number, measured in ((1, {}), (RACE, {A: (1, 0)})):
+        table.submit(number)
+        table.table.handle_timer(0.5)
+        table.respond(B, 1, number, now=0.6)
+        table.respond(A, 0, number, now=0.7)
+        assert table.latencies() == measured
+
+
+def test_hedges_that_win_do_not_make_the_next_ones_sooner() -> None:
+    """Of a first copy that was called off is known that it took longer, so the quantile can only grow."""
+    table = table_with(RedundancyMode.HEDGE)
+    learn(table, 0.1, 60)
+    for number in range(1, 60):
+        table.submit(number)
+        table.table.handle_timer(0.3)
+        table.respond(B, 1, number, now=0.35)
+    table.submit(500)
+    timer = table.table.next_timer()
+    assert timer is not None
+    assert timer > 0.3
+
+
+def test_a_pair_that_misses_loses_its_place() -> None:
+    table = table_with(RedundancyMode.SINGLE)
+    learn(table, 0.1)
+    for number in range(1, 3):
+        table.submit(number)
+        assert table.sent() == [WLAN_A]
+        table.table.handle_timer(1.0)
+    table.submit(3)
+    assert table.sent() == [WWAN_B]
+
+
+def test_without_budget_there_are_no_extra_copies_but_always_a_first_one() -> None:
+    nothing = Budget("*", extra_load=0.0)
+    for mode in RedundancyMode:
+        table = table_with(mode, budgets=(nothing,))
+        table.submit()
+        assert table.sent() == [WLAN_A]
+        table.change(WLAN_A, PathState.UNSTABLE)
+        assert table.sent() == []
+        table.reject(RejectReason.OVERLOADED)
+        assert table.sent() == [WWAN_B], "in place of the first one"
+        assert sum(table.stats.copies_refused.values()) == (mode is not RedundancyMode.SINGLE) + (
+            mode is RedundancyMode.REPLICATE
+        )
+
+
+def test_extra_copies_and_their_bytes_are_counted() -> None:
+    table = table_with(RedundancyMode.REPLICATE)
+    table.submit(payload=bytes(1000))
+    first, extra = table.stats.copy_bytes[WLAN, ECHO, "first"], table.stats.copy_bytes[WWAN, ECHO, "extra"]
+    assert first == extra
+    assert 1000 < first < 1200
