@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import random
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,9 +26,6 @@ OWN_EXCESS_PRICE = 1e6
 
 MAX_LISTED = 4096
 """Choices looked at of one block: 2 interfaces with 64 servers, 3 with 16, 4 with 8."""
-
-DRAWN_SHARE = 0.5
-"""Of the servers listed of an interface, where not all are, those drawn by lot."""
 
 CHOICES_A_WAY = 4
 """Choices there should be room for, at least, for each set of interfaces that carries copies."""
@@ -114,8 +110,7 @@ def _ways(block: Block, epsilon: Floats, usable: Indices, at_most: int) -> tuple
 
 def _promising(block: Block, interface: int, servers: Indices, share: int) -> Indices:
     """So many of an interface's servers: in turn the one with the least epsilon, the one with the least in another
-    region, and, where charges count, the cheapest; a share of them drawn by the block's name, so that a fleet whose
-    blocks all find the same servers the best still knows of the others."""
+    region, and, where charges count, the cheapest."""
     if len(servers) <= share:
         return servers
     best_first = sorted(servers.tolist(), key=lambda server: block.epsilon[interface][server] or 0.0)
@@ -127,11 +122,7 @@ def _promising(block: Block, interface: int, servers: Indices, share: int) -> In
         charges = block.target.charges[interface]
         rankings.append(sorted(best_first, key=lambda server: charges[server]))
     turns = itertools.chain.from_iterable(itertools.zip_longest(*rankings))
-    ranked = list(dict.fromkeys(server for server in turns if server is not None))
-    promising = share - int(share * DRAWN_SHARE)
-    others = ranked[promising:]
-    random.Random(f"{block.key} {interface}").shuffle(others)  # noqa: S311 - no secret
-    return np.array(ranked[:promising] + others[: share - promising], dtype=np.intp)
+    return np.array(list(dict.fromkeys(server for server in turns if server is not None))[:share], dtype=np.intp)
 
 
 def _all_of(way: list[int], options: list[Indices]) -> Indices:
