@@ -82,13 +82,14 @@ def test_answers_that_nobody_asked_for(world: World) -> None:
     """They name the attacker's address, from the STUN server's own: the robot is told nothing, and moves nowhere."""
     tap, rng = world.tap("robot"), random.Random(1)
     world.tap(ATTACKER)
-    mine = (world.lab.host(ATTACKER).address(), ATTACKERS_PORT)
     with world.calls():
-        model = tap.wait_for(lambda one: one.outgoing and is_ours(one) and ":" not in one.destination[0])[0]
+        model = tap.wait_for(lambda one: one.outgoing and is_ours(one))[0]
+        family = 6 if ":" in model.destination[0] else 4
+        mine = (world.lab.host(ATTACKER).address(family=family), ATTACKERS_PORT)
         known, before = world.counter("cloud_a", "plr_peers_version"), stun_drops(world)
         forged = [
             model._replace(
-                source=(world.lab.host("control").address(), STUN_PORT),
+                source=(world.lab.host("control").address(family=family), STUN_PORT),
                 payload=encode(StunMessage(MessageClass.SUCCESS, rng.randbytes(12), xor_mapped_address=mine)),
             )
             for _ in range(ANSWERS)
