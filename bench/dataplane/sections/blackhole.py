@@ -2,7 +2,8 @@
 
 50 requests a second of 1 kB, answers of 1 kB, over plain kernel cables. The path that carried more of the warm-up is
 the one that is cut, in the middle of the network, both ways: for whoever uses one path at a time, that is the one in
-use. The clients are bare programs, ours a sidecar's engine with the application in its process.
+use. The clients are bare programs, ours a sidecar's engine with the application in its process. All of them run with
+real-time priority on processors that do not sleep: a few milliseconds are judged, not the machine's other business.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, Table
 from bench.dataplane.statistics import Calls, Row, median, ratio, worst
+from bench.dataplane.steady import awake, realtime
 from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, SilentCut, allow_multipath, cables
 from bench.netlab import Lab
 
@@ -57,14 +59,16 @@ class World:
 
     def remote(self, program: str, host: Host, side: str) -> Remote:
         """Start a program."""
-        return Remote.start(program, self.context.folder, host=host, name=f"{program}.{side}")
+        return Remote.start(program, self.context.folder, host=host, name=f"{program}.{side}", before=realtime())
 
 
 def measure(context: Context) -> Findings:
     """Measure."""
     runs: dict[str, list[tuple[Calls, float]]] = {}
     notes = []
-    with Lab(cables()) as lab:
+    with Lab(cables()) as lab, awake() as kept_awake:
+        if not kept_awake or not realtime():
+            notes.append("no real-time priority or no say in idle states here: the machine's other business counts too")
         world = World(lab, context, lab.host(ROBOT), lab.host(CLOUD))
         for repeat in range(context.repeats):
             for key, start in _CONTENDERS.items():
@@ -133,7 +137,7 @@ def _sent_bytes(host: Host) -> dict[str, int]:
 
 @contextlib.contextmanager
 def _ours(world: World) -> Iterator[Remote]:
-    with Ours.in_lab(world.lab, world.context.folder, answer_bytes=SIZE) as ours:
+    with Ours.in_lab(world.lab, world.context.folder, answer_bytes=SIZE, before=realtime()) as ours:
         yield ours.robot
 
 

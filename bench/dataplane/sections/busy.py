@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 from bench.dataplane.ours import Ours
 from bench.dataplane.section import Findings, Section, Table
 from bench.dataplane.statistics import Row, median, ratio
-from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, ROBOT, cables
+from bench.dataplane.steady import realtime
+from bench.dataplane.topology import cables
 from bench.netlab import Lab
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ SIZE = 1_000
 RATE_HZ = 50.0
 COUNT = 400
 WARM_UP = 50
-REALTIME = ("chrt", "--rr", "1")
 
 
 def measure(context: Context) -> Findings:
@@ -36,18 +36,9 @@ def measure(context: Context) -> Findings:
     count = context.scaled(COUNT)
     with Lab(cables()) as lab:
         for repeat in range(context.repeats):
-            for name, before in zip(rows, ((), REALTIME), strict=True):
+            for name, before in zip(rows, ((), realtime()), strict=True):
                 context.say(f"busy: {name}, {repeat + 1} of {context.repeats}")
-                with Ours(
-                    context.folder,
-                    robot=lab.host(ROBOT),
-                    clouds={CLOUD: lab.host(CLOUD)},
-                    interfaces=CARRIERS,
-                    cloud_interface=CLOUD_INTERFACE,
-                    mapping=[(carrier, CLOUD) for carrier in CARRIERS],
-                    answer_bytes=SIZE,
-                    before=before,
-                ) as ours:
+                with Ours.in_lab(lab, context.folder, answer_bytes=SIZE, before=before) as ours:
                     ours.call(size=SIZE, count=WARM_UP, rate_hz=RATE_HZ)
                     with _computing():
                         calls = ours.call(size=SIZE, count=count, rate_hz=RATE_HZ)
