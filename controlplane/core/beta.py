@@ -32,12 +32,19 @@ _log_gamma = np.vectorize(math.lgamma, otypes=[np.float64])
 
 
 def intervals(estimates: Sequence[Estimate], level: float) -> list[tuple[float, float]]:
-    """Of each estimate the interval that holds it with probability `level`, with as much left over each side."""
+    """Of each estimate the interval that holds it with probability `level`, with as much left over each side.
+
+    Where fewer than one miss, or hit, is behind an estimate, its Beta distribution is all but one point at 0, or 1. The
+    interval then goes as far as n trials leave open that brought none, to 3 / n for 90 % (the rule of three).
+    """
     if not estimates:
         return []
     misses = np.array([estimate.misses for estimate in estimates])
     hits = np.array([estimate.hits for estimate in estimates])
     low, high = (quantiles(misses, hits, share) for share in ((1.0 - level) / 2.0, (1.0 + level) / 2.0))
+    open_end = ((1.0 - level) / 2.0) ** (1.0 / (misses + hits))
+    low = np.where(hits < 1.0, np.minimum(low, open_end), low)
+    high = np.where(misses < 1.0, np.maximum(high, 1.0 - open_end), high)
     # Both may be 0 within rounding, and then in any order.
     return list(zip(low.tolist(), np.maximum(low, high).tolist(), strict=True))
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.distribution import Distribution
 from controlplane.core.fading import FadedHistogram
+from controlplane.core.silence import HeardClock
 from protos.histogram import Histogram
 
 if TYPE_CHECKING:
@@ -22,13 +23,20 @@ ENOUGH_REQUESTS = 50.0
 """Requests from which on a server's own times stand alone."""
 
 
+class _OfService(NamedTuple):
+    """What is known of a service whichever server."""
+
+    times: FadedHistogram
+    clock: HeardClock
+
+
 class ComputeTimes:
     """Processing times, fading, of every server and, for those not heard of, of all servers of a service together."""
 
     def __init__(self, half_life_s: float) -> None:
         self._half_life_s = half_life_s
         self._servers: OrderedDict[tuple[NodeName, ServiceName], FadedHistogram] = OrderedDict()
-        self._services: OrderedDict[ServiceName, FadedHistogram] = OrderedDict()
+        self._services: OrderedDict[ServiceName, _OfService] = OrderedDict()
         self.dropped = 0
         """Entries evicted because a table was full."""
 
@@ -36,18 +44,25 @@ class ComputeTimes:
         """Add what a server needed."""
         if not processing.total:
             return
-        of_server = self._servers.setdefault((server, service), FadedHistogram(self._half_life_s, now))
-        self._servers.move_to_end((server, service))
-        if len(self._servers) > MAX_PROCESSING:
-            self._servers.popitem(last=False)
-            self.dropped += 1
-        of_service = self._services.setdefault(service, FadedHistogram(self._half_life_s, now))
+        of_service = self._services.get(service)
+        if of_service is None:
+            clock = HeardClock(now)
+            of_service = self._services[service] = _OfService(FadedHistogram(self._half_life_s, now), clock)
         self._services.move_to_end(service)
         if len(self._services) > MAX_PROCESSING:
             self._services.popitem(last=False)
             self.dropped += 1
+        of_service.clock.hear(now)
+        of_server = self._servers.get((server, service))
+        if of_server is None:
+            of_server = FadedHistogram(self._half_life_s, now, of_service.clock)
+            self._servers[server, service] = of_server
+        self._servers.move_to_end((server, service))
+        if len(self._servers) > MAX_PROCESSING:
+            self._servers.popitem(last=False)
+            self.dropped += 1
         of_server.add(processing, now)
-        of_service.add(processing, now)
+        of_service.times.add(processing, now)
 
     def requests(self, server: NodeName, service: ServiceName, now: float, *, sample: int) -> Histogram:
         """What the server itself needed; a sample that has not faded counts `sample`."""
@@ -65,7 +80,7 @@ class ComputeTimes:
         if own is not None and requests >= ENOUGH_REQUESTS:
             return own, requests
         of_service = self._services.get(service)
-        all_servers = of_service.distribution() if of_service is not None else None
+        all_servers = of_service.times.distribution() if of_service is not None else None
         if own is None or all_servers is None:
             return own or all_servers, requests
         return Distribution.mixed(own, requests / (requests + OTHERS_REQUESTS), all_servers), requests

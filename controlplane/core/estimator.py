@@ -16,6 +16,7 @@ from controlplane.core.compute import ComputeTimes
 from controlplane.core.fading import FadedCount, FadedShares
 from controlplane.core.network import RobotNetwork
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
+from controlplane.core.silence import HeardClock
 from protos.explanation import SAMPLE
 from protos.histogram import Histogram
 from protos.size_class import SIZE_CLASSES
@@ -74,23 +75,33 @@ class Evidence:
     compute: Histogram
 
 
+class _Service:
+    """What one robot's requests of a service are like, and how long they have been heard of."""
+
+    __slots__ = ("clock", "sizes")
+
+    def __init__(self, half_life_s: float, now: float) -> None:
+        self.sizes = FadedShares(SIZE_CLASSES, half_life_s, now)
+        self.clock = HeardClock(now)
+
+
 class _Robot:
     """Tables fed by one robot."""
 
-    __slots__ = ("joints", "network", "outcomes", "sizes", "trials")
+    __slots__ = ("joints", "network", "outcomes", "services", "trials")
 
     def __init__(self, half_life_s: float) -> None:
         self.network = RobotNetwork(half_life_s)
         self.trials: OrderedDict[Pair, FadedTrials] = OrderedDict()
         self.joints: OrderedDict[JointKey, FadedTrials] = OrderedDict()
-        self.sizes: OrderedDict[ServiceName, FadedShares] = OrderedDict()
+        self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
 
 
 def _usual_sizes(tables: _Robot, service: ServiceName) -> tuple[tuple[int, float], ...]:
     """(size class, share) of the service's requests; the smallest class as long as there were none."""
-    sizes = tables.sizes.get(service)
-    return tuple(sizes.shares(USUAL_SIZE_SHARE)) if sizes is not None else ((0, 1.0),)
+    of_service = tables.services.get(service)
+    return tuple(of_service.sizes.shares(USUAL_SIZE_SHARE)) if of_service is not None else ((0, 1.0),)
 
 
 class Estimator:
@@ -121,7 +132,9 @@ class Estimator:
             self._merge_latency(tables, latency, now)
         for joint in report.joints:
             joint_key = (joint.service, joint.first, joint.second)
-            together = tables.joints.get(joint_key) or FadedTrials(self._half_life_s, now)
+            of_service = tables.services.get(joint.service)
+            clock = of_service.clock if of_service is not None else None
+            together = tables.joints.get(joint_key) or FadedTrials(self._half_life_s, now, clock)
             self._keep(tables.joints, joint_key, together, MAX_JOINTS_PER_ROBOT)
             together.add(joint.requests, joint.both_missed, now)
         changed = False
@@ -144,13 +157,14 @@ class Estimator:
         tables.network.merge_requests(latency, now)
         self._compute.merge(latency.server, latency.service, latency.processing, now)
         if latency.requests:
+            of_service = tables.services.get(latency.service) or _Service(self._half_life_s, now)
+            self._keep(tables.services, latency.service, of_service, MAX_OUTCOMES_PER_ROBOT)
+            of_service.sizes.add(latency.size_class, latency.requests, now)
+            of_service.clock.hear(now)
             pair = (latency.interface, latency.server, latency.service)
-            trials = tables.trials.get(pair) or FadedTrials(self._half_life_s, now)
+            trials = tables.trials.get(pair) or FadedTrials(self._half_life_s, now, of_service.clock)
             self._keep(tables.trials, pair, trials, MAX_PAIRS_PER_ROBOT)
             trials.add(latency.requests, latency.missed, now)
-            sizes = tables.sizes.get(latency.service) or FadedShares(SIZE_CLASSES, self._half_life_s, now)
-            self._keep(tables.sizes, latency.service, sizes, MAX_OUTCOMES_PER_ROBOT)
-            sizes.add(latency.size_class, latency.requests, now)
 
     def _keep(self, table: OrderedDict[K, V], key: K, value: V, limit: int) -> None:
         """Put it in, as used last, and evict the least recently used beyond `limit`."""

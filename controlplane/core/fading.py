@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.distribution import Distribution
+from controlplane.core.silence import Silence
 from protos.histogram import BUCKETS, Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
+
+    from controlplane.core.silence import HeardClock
 
 _FORGOTTEN = 1e-9
 """Samples that together weigh less are none: a few steps on, floats run out of range."""
@@ -74,12 +77,14 @@ class FadedShares:
 class FadedHistogram:
     """Weights by bucket of `protos.histogram`, and of the lost, fading with a half-life in seconds.
 
-    Samples that were called off count for as long as they lasted: `distribution` follows Kaplan and Meier.
+    Samples that were called off count for as long as they lasted: `distribution` follows Kaplan and Meier. With the
+    clock of its like they fade faster while only these are heard of.
     """
 
-    __slots__ = ("_at", "_called_off", "_counts", "_distribution", "_half_life_s", "_lost", "_total")
+    __slots__ = ("_at", "_called_off", "_counts", "_distribution", "_half_life_s", "_lost", "_silence", "_total")
 
-    def __init__(self, half_life_s: float, now: float) -> None:
+    def __init__(self, half_life_s: float, now: float, clock: HeardClock | None = None) -> None:
+        self._silence = Silence(clock)
         self._half_life_s = half_life_s
         self._at = now
         self._counts: NDArray[np.float64] = np.zeros(BUCKETS)
@@ -90,7 +95,7 @@ class FadedHistogram:
 
     def add(self, histogram: Histogram, now: float, called_off: Histogram | None = None) -> None:
         """Merge new samples, and of those called off when they were."""
-        factor = math.exp2((self._at - now) / self._half_life_s)
+        factor = math.exp2((self._at - now) / self._half_life_s) * self._silence.end()
         self._at = now
         self._counts = self._counts * factor + histogram.counts
         self._lost = self._lost * factor + histogram.lost
@@ -106,6 +111,10 @@ class FadedHistogram:
 
     def weight(self, now: float) -> float:
         """How many samples it is worth by now, the lost and those called off included."""
+        return self.aged(now) * self._silence.kept()
+
+    def aged(self, now: float) -> float:
+        """The same, were its like not heard of since."""
         return self._total * math.exp2((self._at - now) / self._half_life_s)
 
     def scaled(self, now: float, sample: int) -> Histogram:

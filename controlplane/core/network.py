@@ -16,6 +16,7 @@ from statistics import median
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from controlplane.core.fading import FadedCount, FadedHistogram
+from controlplane.core.silence import HeardClock
 from protos.histogram import Histogram
 
 if TYPE_CHECKING:
@@ -100,6 +101,8 @@ class RobotNetwork:
         self._half_life_s = half_life_s
         self.paths: OrderedDict[PathKey, PathState] = OrderedDict()
         self._cells: OrderedDict[CellKey, FadedHistogram] = OrderedDict()
+        self._clocks: dict[int, HeardClock] = {}
+        """Of the cells of each size class."""
         self._round_trips: dict[PathKey, float] = {}
         """Median of each path that was probed."""
         self._rows: dict[tuple[InterfaceName, int], list[CellKey]] = {}
@@ -137,7 +140,9 @@ class RobotNetwork:
             return
         self._fresh = False
         key = (report.interface, report.server, report.size_class)
-        cell = self._cells.get(key) or FadedHistogram(self._half_life_s, now)
+        clock = self._clocks.setdefault(report.size_class, HeardClock(now))
+        clock.hear(now)
+        cell = self._cells.get(key) or FadedHistogram(self._half_life_s, now, clock)
         self._keep(self._cells, key, cell, MAX_CELLS)
         cell.add(report.network, now, report.called_off)
 
@@ -244,7 +249,7 @@ class RobotNetwork:
         for of in cells:
             there = self._round_trips.get(of[:2])
             times = self._cells[of].distribution()
-            if there is None or times is None or self._cells[of].weight(now) < SIZE_COST_REQUESTS:
+            if there is None or times is None or self._cells[of].aged(now) < SIZE_COST_REQUESTS:
                 continue
             took = times.median()
             if math.isfinite(took):

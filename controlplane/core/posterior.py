@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from controlplane.core.silence import Silence
+
+if TYPE_CHECKING:
+    from controlplane.core.silence import HeardClock
 
 MEMORIES = ((1.0, 1.0), (1 / 4, 0.3), (1 / 15, 0.3))
 """Half-lives of the memories beside each other, as parts of the configured one, and how likely each is to be the best
@@ -129,12 +135,13 @@ class FadedTrials:
     what came, as in Bayesian model averaging with forgetting. Misses come in streaks, so n trials say less than n
     independent ones: the variance of the prediction's errors over batches of `BATCH_S` beside that of independent
     trials, times (1 + r) / (1 - r) for the correlation r of neighbouring batches, is the design effect; n divided by it
-    is what the trials are worth.
+    is what the trials are worth. With the clock of their like they fade faster while only these are heard of.
     """
 
-    __slots__ = ("_at", "_half_life_s", "_memories", "_streaks")
+    __slots__ = ("_at", "_half_life_s", "_memories", "_silence", "_streaks")
 
-    def __init__(self, half_life_s: float, now: float) -> None:
+    def __init__(self, half_life_s: float, now: float, clock: HeardClock | None = None) -> None:
+        self._silence = Silence(clock)
         self._half_life_s = half_life_s
         self._at = now
         self._memories = tuple(_Memory(half_life_s * part, share) for part, share in MEMORIES)
@@ -144,6 +151,7 @@ class FadedTrials:
         """Count trials, `misses` of them missed."""
         passed_s = now - self._at
         self._at = now
+        self._forget(self._silence.end())
         ratios = self._ratios(IGNORANCE, 0.0)
         predicted, _ = self._average(ratios, 0.0)
         score_fade = math.exp2(-passed_s / (self._half_life_s * SCORE_HALF_LIFE))
@@ -157,12 +165,20 @@ class FadedTrials:
         self._streaks.fade(math.exp2(-passed_s / self._half_life_s))
         self._streaks.add(trials, misses, predicted, now)
 
+    def _forget(self, kept: float) -> None:
+        if kept < 1.0:
+            for memory in self._memories:
+                memory.trials *= kept
+                memory.misses *= kept
+                memory.score *= kept
+
     def _ratios(self, prior: Estimate, passed_s: float) -> list[float]:
         """Of each memory after so many more seconds, each from the one before, the longest from the prior."""
         ratios: list[float] = []
         start = prior
+        kept = self._silence.kept()
         for memory in self._memories:
-            fade = math.exp2(-passed_s / memory.half_life_s)
+            fade = math.exp2(-passed_s / memory.half_life_s) * kept
             ratio = (memory.misses * fade + start.misses) / (memory.trials * fade + start.weight)
             ratios.append(ratio)
             start = Estimate.of(ratio, HANDED_ON)
@@ -172,7 +188,8 @@ class FadedTrials:
         """(ratio, trials) over all memories, by how well each predicted."""
         best = max(memory.score for memory in self._memories)
         shares = [memory.share * math.exp(memory.score - best) for memory in self._memories]
-        trials = [memory.trials * math.exp2(-passed_s / memory.half_life_s) for memory in self._memories]
+        kept = self._silence.kept()
+        trials = [memory.trials * math.exp2(-passed_s / memory.half_life_s) * kept for memory in self._memories]
         total = sum(shares)
         return (
             sum(share * ratio for share, ratio in zip(shares, ratios, strict=True)) / total,
@@ -181,7 +198,7 @@ class FadedTrials:
 
     def counts(self, now: float) -> tuple[float, float]:
         """Trials and misses that the longest memory still holds."""
-        fade = math.exp2((self._at - now) / self._half_life_s)
+        fade = math.exp2((self._at - now) / self._half_life_s) * self._silence.kept()
         return self._memories[0].trials * fade, self._memories[0].misses * fade
 
     def design_effect(self) -> float:

@@ -33,3 +33,13 @@ def test_of_none_there_are_none() -> None:
 def test_an_interval_next_to_0_is_none_upside_down(misses: float) -> None:
     ((low, high),) = intervals([Estimate(misses, 60.0)], 0.9)
     assert 0.0 <= low <= high
+
+
+@pytest.mark.parametrize("trials", [30.0, 3000.0])
+def test_trials_without_a_miss_leave_three_over_their_number(trials: float) -> None:
+    ((low, high),) = intervals([Estimate(1e-6, trials)], 0.9)
+    assert low < 1e-9
+    assert high == pytest.approx(3.0 / trials, rel=0.1)
+    ((low, high),) = intervals([Estimate(trials, 1e-6)], 0.9)
+    assert 1.0 - low == pytest.approx(3.0 / trials, rel=0.1)
+    assert high > 1.0 - 1e-9
