@@ -2,15 +2,17 @@
 
 50 requests a second of 1 kB, answers of 1 kB, over plain kernel cables. The path that carried more of the warm-up is
 the one that is cut, in the middle of the network, both ways: for whoever uses one path at a time, that is the one in
-use. The clients are bare programs, ours a sidecar's engine with the application in its process. All of them run with
-real-time priority on processors that do not sleep: a few milliseconds are judged, not the machine's other business.
+use. The clients are bare programs, ours a sidecar's engine with the application in its process.
+
+Ours and plain UDP run once more with real-time priority on processors that do not sleep (`_steady_`): the difference is
+what the machine's other business and its sleep cost.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import Ours
@@ -40,7 +42,9 @@ ZENOH_LEASE_MS = 1_000
 """Its default is 10 s; with it, nothing is answered before a run ends."""
 NAMES = {
     "blackhole": "ours",
+    "blackhole_steady": "ours, steady",
     "udp": "plain UDP on both",
+    "udp_steady": "plain UDP on both, steady",
     "tcp": "TCP",
     "mptcp": "kernel MPTCP",
     "zenoh_multilink": "zenoh, two links",
@@ -56,19 +60,19 @@ class World:
     context: Context
     robot: Host
     cloud: Host
+    before: tuple[str, ...] = ()
+    """The command that starts every program."""
 
     def remote(self, program: str, host: Host, side: str) -> Remote:
         """Start a program."""
-        return Remote.start(program, self.context.folder, host=host, name=f"{program}.{side}", before=realtime())
+        return Remote.start(program, self.context.folder, host=host, name=f"{program}.{side}", before=self.before)
 
 
 def measure(context: Context) -> Findings:
     """Measure."""
     runs: dict[str, list[tuple[Calls, float]]] = {}
     notes = []
-    with Lab(cables()) as lab, awake() as kept_awake:
-        if not kept_awake or not realtime():
-            notes.append("no real-time priority or no say in idle states here: the machine's other business counts too")
+    with Lab(cables()) as lab:
         world = World(lab, context, lab.host(ROBOT), lab.host(CLOUD))
         for repeat in range(context.repeats):
             for key, start in _CONTENDERS.items():
@@ -137,7 +141,7 @@ def _sent_bytes(host: Host) -> dict[str, int]:
 
 @contextlib.contextmanager
 def _ours(world: World) -> Iterator[Remote]:
-    with Ours.in_lab(world.lab, world.context.folder, answer_bytes=SIZE, before=realtime()) as ours:
+    with Ours.in_lab(world.lab, world.context.folder, answer_bytes=SIZE, before=world.before) as ours:
         yield ours.robot
 
 
@@ -147,6 +151,16 @@ def _udp(world: World) -> Iterator[Remote]:
         port = server.ask("listen", answer_bytes=SIZE)
         client.ask("connect", paths=[(carrier, world.cloud.address(), port) for carrier in CARRIERS])
         yield client
+
+
+@contextlib.contextmanager
+def _steady(start: Callable[[World], contextlib.AbstractContextManager[Remote]], world: World) -> Iterator[Remote]:
+    """The same undisturbed, as far as the kernel lets us. Raises RuntimeError where it does not."""
+    with awake() as kept_awake:
+        if not kept_awake or not realtime():
+            raise RuntimeError("no real-time priority, or no say in how processors sleep")
+        with start(replace(world, before=realtime())) as client:
+            yield client
 
 
 @contextlib.contextmanager
@@ -194,7 +208,9 @@ def _zenoh_sessions(world: World) -> contextlib.AbstractContextManager[Remote]:
 
 _CONTENDERS: dict[str, Callable[[World], contextlib.AbstractContextManager[Remote]]] = {
     "blackhole": _ours,
+    "blackhole_steady": lambda world: _steady(_ours, world),
     "udp": _udp,
+    "udp_steady": lambda world: _steady(_udp, world),
     "tcp": _tcp,
     "mptcp": _mptcp,
     "zenoh_multilink": _zenoh_multilink,
