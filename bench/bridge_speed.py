@@ -173,6 +173,9 @@ class Shortcut:
             )
         )
 
+    def answered_here(self, request_id: RequestId) -> None:
+        raise AssertionError("nothing has a fallback here")
+
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         request_id, service = self._requests.pop(execution)
         assert self.robot is not None

@@ -240,6 +240,11 @@ def _check_order(config: SidecarConfig, index: int) -> Iterator[_Problem]:
                 ("services", index, "name"),
                 f"expected each name once, got '{name}' in services[{before}] too",
             )
+        if service.fallback is not None and service.fallback == config.services[index].fallback:
+            yield ("services", index, "fallback"), f"expected another than that of services[{before}]"
+    for other, service in enumerate(config.services):
+        if service.fallback == name:
+            yield ("services", index, "name"), f"expected a service that is not the fallback of services[{other}]"
     if not is_glob(name):
         winner = find_rule(config.service_rules()[:index], ServiceName(name))
         if winner is not None and winner.pattern != name:

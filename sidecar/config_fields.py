@@ -47,6 +47,12 @@ def _check_service(text: str) -> str:
     return text
 
 
+def _check_service_name(text: str) -> str:
+    if len(text) > _MAX_SERVICE_CHARACTERS or not _SERVICE.fullmatch(text):
+        raise ValueError(f"expected a service name such as /plan_locally, got {text!r}")
+    return text
+
+
 def _check_repair_share(value: object) -> float | str:
     if value is False:  # YAML reads an unquoted off so
         return "off"
@@ -90,6 +96,7 @@ class Section(BaseModel):
 SidecarName = Annotated[str, AfterValidator(_check_node_name)]
 InterfacePattern = Annotated[str, AfterValidator(_check_interface)]
 ServicePattern = Annotated[str, AfterValidator(_check_service)]
+FullServiceName = Annotated[str, AfterValidator(_check_service_name)]
 RepairShare = Annotated[
     float | str,
     PlainValidator(_check_repair_share),

@@ -301,6 +301,21 @@ def _bridge(stats: BridgeStats) -> Iterator[Metric]:
         ("service",),
         by_one(stats.abandoned),
     )
+    yield counter(
+        "plr_fallback_requests",
+        "Requests that the network left to the fallback on this robot, by what it did for them.",
+        ("service", "outcome"),
+        stats.fallbacks,
+    )
+    yield gauge(
+        "plr_fallback_up", "Whether a service's fallback can be asked.", ("service",), by_one(stats.fallback_up)
+    )
+    yield gauge(
+        "plr_fallback_expected_seconds",
+        "How long a service's fallback is expected to take for a request.",
+        ("service",),
+        by_one(stats.fallback_takes_s),
+    )
     yield counter("plr_bridge_dropped", "Events and messages the bridge dropped.", ("reason",), by_one(stats.dropped))
     yield counter("plr_bridge_errors", "Failures of rmw or the bridge.", ("where",), by_one(stats.errors))
     yield gauge("plr_bridge_pending", "Requests between the bridge and an answer.", (), {(): stats.pending})

@@ -19,6 +19,9 @@ class DataPlane(Protocol):
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
         """Robot: send a serialised request; ends in exactly one ResponseArrived or RequestFailed."""
 
+    def answered_here(self, request_id: RequestId) -> None:
+        """Robot: the application has its answer, not from the network; how the request ends is told all the same."""
+
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         """Cloud: the local server answered after `processing_s` seconds."""
 

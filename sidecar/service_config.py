@@ -8,18 +8,22 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from protos.convert.fields import MAX_CHARGE
-from protos.model import Role
+from protos.model import Role, ServiceName
 from protos.preferences import AT_MOST_EVERY_INTERFACE, DEFAULT_CHARGE, EVERY_INTERFACE
 from sidecar.config_fields import (
     CopiesWanted,
     DomainLabel,
+    FullServiceName,
     InterfacePattern,
     RepairShare,
     Section,
     ServicePattern,
     converted,
+    is_glob,
 )
 from sidecar.core.budgets import Budget
+from sidecar.core.fallback_queue import SPARE
+from sidecar.core.fallback_rule import FallbackRule
 from sidecar.core.priority import Priority
 from sidecar.core.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule
@@ -69,6 +73,9 @@ _ROBOTS_KEYS = (
     "copies",
     "mode",
     "target_miss",
+    "fallback",
+    "fallback_start",
+    "fallback_takes_ms",
 )
 
 
@@ -85,6 +92,13 @@ class ModeWord(enum.Enum):
 
     MOST_RELIABLE = "most_reliable"
     CHEAPEST = "cheapest"
+
+
+class FallbackStart(enum.Enum):
+    """When a service's fallback is asked."""
+
+    IN_TIME = "in_time"
+    ON_MISS = "on_miss"
 
 
 class NetworkConfig(Section):
@@ -144,6 +158,15 @@ class ServiceConfig(Section):
     exploration: Annotated[float, Field(ge=0, le=MAX_EXPLORATION)] | None = None
     """Robot: share of the requests that may get one more copy over a path that the mapping does not use, to learn how
     good it is; idempotent services only. Default 0.01, at most 0.1."""
+    fallback: FullServiceName | None = None
+    """Robot: a service of the same type, served by a node on this robot, that answers when the network does not;
+    idempotent services only."""
+    fallback_start: Annotated[FallbackStart | None, converted] = None
+    """Robot, with fallback: in_time (early enough to answer by the deadline) or on_miss (when the network has missed
+    the deadline). Default in_time."""
+    fallback_takes_ms: Annotated[float, Field(gt=0, le=MAX_DEADLINE_MS)] | None = None
+    """Robot, with fallback_start in_time: milliseconds that the fallback takes for a request at most. Default: as
+    measured."""
     capacity_interfaces: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Cloud: how many robot interfaces may be mapped to this server for the service; none: no limit."""
     cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] | None = None
@@ -173,7 +196,15 @@ class ServiceConfig(Section):
             copies=self.copies or (AT_MOST_EVERY_INTERFACE if self.target_miss else EVERY_INTERFACE),
             target_miss=self.target_miss or 0.0,
             charge=self.cost_per_request or 0.0,
+            fallback=self._fallback_rule(),
         )
+
+    def _fallback_rule(self) -> FallbackRule | None:
+        if self.fallback is None:
+            return None
+        takes_s = None if self.fallback_takes_ms is None else self.fallback_takes_ms / _MS_PER_S
+        in_time = self.fallback_start is not FallbackStart.ON_MISS
+        return FallbackRule(ServiceName(self.fallback), in_time=in_time, takes_s=takes_s)
 
     def problems(self, role: Role) -> Iterator[tuple[str, str]]:
         """What single keys cannot know: each key that is wrong in this role or beside others, and why."""
@@ -196,6 +227,7 @@ class ServiceConfig(Section):
             yield "hedge_quantile", "expected only beside redundancy: hedge"
         if self.exploration and not self.idempotent:
             yield "exploration", "expected beside idempotent: true, as copies would run on several servers"
+        yield from self._fallback_problems()
         if self.deadline_ms is None:
             yield "deadline_ms", "expected milliseconds, but missing"
         elif self.lifetime_ms is not None and self.lifetime_ms <= self.deadline_ms:
@@ -203,6 +235,25 @@ class ServiceConfig(Section):
                 "lifetime_ms",
                 f"expected more than deadline_ms ({self.deadline_ms:g}), got {self.lifetime_ms:g}",
             )
+
+    def _fallback_problems(self) -> Iterator[tuple[str, str]]:
+        if self.fallback is None:
+            for key in ("fallback_start", "fallback_takes_ms"):
+                if getattr(self, key) is not None:
+                    yield key, "expected only beside fallback"
+            return
+        if is_glob(self.name):
+            yield "fallback", f"expected only beside the full name of one service, not '{self.name}'"
+        if self.fallback == self.name:
+            yield "fallback", "expected another service than the one that it stands in for"
+        if not self.idempotent:
+            yield "fallback", "expected beside idempotent: true only, as a request may run in the cloud as well"
+        if self.fallback_takes_ms is None or self.deadline_ms is None:
+            return
+        if self.fallback_start is FallbackStart.ON_MISS:
+            yield "fallback_takes_ms", "expected only beside fallback_start: in_time"
+        elif self.fallback_takes_ms >= (most := (1 - SPARE) * self.deadline_ms):
+            yield "fallback_takes_ms", f"expected less than {most:g}, else it can not answer by deadline_ms"
 
 
 def _redundancy(fec: float | str | None) -> Redundancy:

@@ -83,6 +83,10 @@ class Request:
     done: bool = False
     """The application got its response, or the request failed."""
     missed: bool = False
+    answered_here: bool = False
+    """The application has its answer, not from the network: copies are sent no more, and are awaited until the deadline
+    for what they tell of their paths."""
+    found_unreachable: bool = False
     outcomes_measured: bool = False
     """Which of its copies missed the deadline has been counted."""
 

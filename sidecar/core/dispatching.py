@@ -102,7 +102,7 @@ class Dispatching:
         request has not arrived: then the path is slow, which another copy would only make worse.
         """
         waiting = request.relied_on()
-        if request.done or not waiting:
+        if request.done or request.answered_here or not waiting:
             return
         if request.rule.redundancy is RedundancyMode.HEDGE:
             path = self._next_withheld(request)
@@ -120,7 +120,7 @@ class Dispatching:
         """
         routes = self._parts.routes
         waiting = request.relied_on()
-        if waiting and not request.rule.redundancy.helps:
+        if request.answered_here or (waiting and not request.rule.redundancy.helps):
             return
         if not insist and any(routes.state(copy.path) is PathState.UP for copy in waiting):
             return

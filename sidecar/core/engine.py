@@ -133,11 +133,15 @@ class Engine:
         kind = self._offers.offered.get(service)
         if rule is None or kind is None:
             self.stats.requests[service, "rejected"] += 1
-            self._events.append(
-                RequestFailed(request_id, service, "rejected", "no server offers this service any more", 0.0)
-            )
+            why = "no server offers this service any more"
+            self._events.append(RequestFailed(request_id, service, "rejected", why, 0.0))
             return
         self._requests.submit(request_id, service, kind, rule, payload, now)
+        self.stats.in_flight = self._requests.unanswered
+
+    def answered_here(self, request_id: RequestId, now: float) -> None:
+        """Robot: the application has its answer, not from the network."""
+        self._requests.answered_here(request_id, now)
         self.stats.in_flight = self._requests.unanswered
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:

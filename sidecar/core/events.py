@@ -79,7 +79,10 @@ class ResponseArrived:
 
 @dataclass(frozen=True, slots=True)
 class DeadlineMissed:
-    """A request's deadline passed without a response; the request goes on until its lifetime ends."""
+    """A request's deadline passed without a response; the request goes on until its lifetime ends.
+
+    Not told of a request that the application has its answer to (`answered_here`).
+    """
 
     request_id: RequestId
     service: ServiceName
@@ -88,8 +91,17 @@ class DeadlineMissed:
 
 
 @dataclass(frozen=True, slots=True)
+class Unreachable:
+    """No path to any server of the request is up, and its service has a fallback. Told once for each request."""
+
+    request_id: RequestId
+    service: ServiceName
+
+
+@dataclass(frozen=True, slots=True)
 class RequestFailed:
-    """No response will come. `outcome` is a label of plr_requests_total: failed, rejected or late_dropped."""
+    """No response will come. `outcome` is a label of plr_requests_total: failed, rejected or late_dropped.
+    Of a request with `answered_here`: deadline_missed."""
 
     request_id: RequestId
     service: ServiceName
@@ -144,6 +156,7 @@ ApplicationEvent = (
     | WithdrawService
     | ResponseArrived
     | DeadlineMissed
+    | Unreachable
     | RequestFailed
     | ExecuteRequest
     | AbandonExecution

@@ -25,6 +25,7 @@ from sidecar.core.events import (
     RequestFailed,
     RequestId,
     ResponseArrived,
+    Unreachable,
 )
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
@@ -84,6 +85,15 @@ class RequestTable:
         self._held_bytes += len(payload)
         heapq.heappush(self._timers, (request.deadline_at, request_id))
         self._dispatch(request, now)
+        self._notice_unreachable(request)
+
+    def answered_here(self, request_id: RequestId, now: float) -> None:
+        """The application has its answer, not from the network. The request ends at its deadline at the latest."""
+        request = self._requests.get(request_id)
+        if request is not None and not request.done:
+            request.answered_here = True
+            if now >= request.deadline_at:
+                self._end_answered_here(request, now)
 
     def _problem(self, request: Request) -> str | None:
         size = len(request.payload or b"")
@@ -208,15 +218,23 @@ class RequestTable:
     def on_path_changed(self, path: PathId, state: PathState, now: float) -> None:
         """Bring requests whose copies are in trouble to another path."""
         for request in list(self._requests.values()):
-            if request.done:
+            if request.done or request.answered_here:
                 continue
             if state is not PathState.UP:
                 if any(copy.path == path for copy in request.pending()):
                     self._dispatching.rescue(request, now)
+                self._notice_unreachable(request)
             elif not request.copies:
                 self._dispatch(request, now)
             elif request.withheld or not request.pending():
                 self._dispatching.rescue(request, now)
+
+    def _notice_unreachable(self, request: Request) -> None:
+        if request.rule.fallback is None or request.found_unreachable or request.done:
+            return
+        if not any(self._parts.routes.reaches(server) for server in self._parts.offers.servers(request.service)):
+            request.found_unreachable = True
+            self._parts.emit(Unreachable(request.id, request.service))
 
     def on_copy_lost(self, message: OutboundMessage, now: float) -> None:
         """Nothing is heard of a message: if it is a copy with a backup, that one is sent now."""
@@ -252,6 +270,8 @@ class RequestTable:
             self._measure(request, now)
             if request.done:
                 self._settle(request, now)
+            elif request.answered_here:
+                self._end_answered_here(request, now)
             elif not request.missed:
                 self._miss(request)
                 if request.rule.idempotent:
@@ -261,6 +281,13 @@ class RequestTable:
         request.missed = True
         copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
+
+    def _end_answered_here(self, request: Request, now: float) -> None:
+        """What the network has not answered by the deadline it need not answer any more: it missed."""
+        if not request.observed:
+            self._calling_off.call_off(request, request.pending(), now)
+        self._fail(request, "deadline_missed", "answered on the robot meanwhile", now)
+        self._settle(request, now)
 
     def _measure(self, request: Request, now: float) -> None:
         """Which copies missed the deadline is known: note it, once."""

@@ -1,7 +1,8 @@
 """Which services are carried, and how: the configuration's rules, matched by name.
 
-The first rule that matches wins. Parameter and lifecycle services of nodes are carried only when a rule names them
-exactly: a glob such as /* must not open every node's parameters to other machines.
+The first rule that matches wins. What is the fallback of a rule is never carried itself. Parameter and lifecycle
+services of nodes are carried only when a rule names them exactly: a glob such as /* must not open every node's
+parameters to other machines.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from sidecar.core.priority import Priority
 from sidecar.core.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Sequence
 
     from protos.model import ServiceName
+    from sidecar.core.fallback_rule import FallbackRule
     from sidecar.core.redundancy import Redundancy
 
 MAX_LIFETIME_S = 300.0
@@ -69,15 +71,20 @@ class ServiceRule:
     """Robot: above 0, the cheapest mapping is wanted that misses no more often; 0: the most reliable one."""
     exploration: float = 0.0
     """Robot: at most this share of the requests gets one more copy over a path that the mapping does not use."""
+    fallback: FallbackRule | None = None
+    """Robot: what answers here when the network does not; `pattern` is a name then."""
     capacity: int = 0
     """Cloud: how many robot interfaces may be mapped here; 0 means no limit."""
     charge: float = 0.0
     """Cloud: what a request costs that runs here."""
 
 
-def find_rule(rules: Iterable[ServiceRule], name: ServiceName) -> ServiceRule | None:
+def find_rule(rules: Sequence[ServiceRule], name: ServiceName) -> ServiceRule | None:
     """Return the rule under which the service is carried, or None when it is not."""
     internal = name.rsplit("/", 1)[-1] in _NODE_INTERNAL_SUFFIXES or "/_action/" in name
+    for rule in rules:
+        if rule.fallback is not None and rule.fallback.service == name:
+            return None
     for rule in rules:
         if rule.pattern == name or (not internal and fnmatch.fnmatchcase(name, rule.pattern)):
             return rule

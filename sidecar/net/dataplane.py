@@ -136,6 +136,13 @@ class ThreadedDataPlane:
             woken = self._queue_outputs()
         self._wake(woken)
 
+    def answered_here(self, request_id: RequestId) -> None:
+        """Robot: the application has its answer, not from the network."""
+        with self._lock:
+            self._engine.answered_here(request_id, self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         """Cloud: the local server answered."""
         with self._lock:

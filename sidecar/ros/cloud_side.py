@@ -199,12 +199,9 @@ class CloudSide:
 
     def _notice_restart(self, runner: ServiceRunner) -> None:
         """A server that went and came back between two looks will not answer what the old one was asked."""
-        endpoints = graph.server_endpoints(self._loop.node, runner.name)
-        if endpoints and runner.endpoints and not endpoints & runner.endpoints:
+        if runner.was_replaced():
             log.warning("service %s: its server was replaced by another", runner.name)
             self._give_up_executions(runner, "the server was replaced")
-        if endpoints:
-            runner.endpoints = endpoints
 
     def _notice_several_servers(self, name: ServiceName, nodes: frozenset[str]) -> None:
         """ROS gives each request to all servers of a name: at most once on each, but more than once here."""
@@ -235,7 +232,6 @@ class CloudSide:
                 log.error("service %s is not offered to robots: %s", name, error)
             return
         self._missing_types.pop(name, None)
-        runner.endpoints = graph.server_endpoints(self._loop.node, name)
         self._runners[name] = runner
         self._loop.set_clients(tuple(self._runners.values()))
 

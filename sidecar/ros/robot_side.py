@@ -1,4 +1,4 @@
-"""Robot: the proxied services, and the applications' requests that wait for an answer."""
+"""Robot: the applications' requests, which wait for the network's answer or a fallback's."""
 
 from __future__ import annotations
 
@@ -6,37 +6,35 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.events import DeadlineMissed, OfferService, RequestFailed, ResponseArrived, WithdrawService
-from sidecar.core.rules import find_rule
+from sidecar.core.events import (
+    DeadlineMissed,
+    OfferService,
+    RequestFailed,
+    ResponseArrived,
+    Unreachable,
+    WithdrawService,
+)
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.fallback_caller import FallbackCaller
 from sidecar.ros.notices import NoticePublisher
+from sidecar.ros.proxies import Proxies
 from sidecar.ros.reply_pacer import ReplyPacer
 from sidecar.ros.request_numbering import RequestNumbering
-from sidecar.ros.service_proxy import ServiceProxy
-from sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:
-    from protos.model import ServiceName
     from sidecar.core.events import ApplicationEvent, RequestId
     from sidecar.core.rules import ServiceRule
     from sidecar.ports import DataPlane
+    from sidecar.ros.fallback_caller import FallbackAnswer
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.rcl import Message, RmwRequestId
     from sidecar.ros.ros_loop import RosLoop
+    from sidecar.ros.service_proxy import ServiceProxy
     from sidecar.ros.stats import BridgeStats
 
 MAX_PENDING_REQUESTS = 4096
 """Applications' requests without an answer; beyond this new ones are dropped, for an older one may still be in time."""
-MAX_OFFERED_SERVICES = 512
-"""Services that peers may offer; each costs DDS endpoints and a slot in every wait."""
-DISCOVERY_SETTLES_S = 1.0
-"""After joining the domain, nothing is offered for so long: servers that run here already must be discovered first."""
-NAME_IS_FREE_S = 0.15
-"""Nobody else must have served a name for so long: two looks. In the cloud's own domain, where robot and cloud may both
-be, the server whose service we are offered was perhaps discovered by the cloud's sidecar a moment before ours."""
-TYPE_RETRY_S = 30.0
-"""How often a type that is not installed is looked for again: someone may be installing it."""
 
 log = logging.getLogger(__name__)
 
@@ -70,22 +68,31 @@ class RobotSide:
         now: float,
     ) -> None:
         self._loop = loop
-        self._own_node = loop.node.get_fully_qualified_name()
-        self._rules = rules
         self._data_plane = data_plane
         self._stats = stats
         self._limited = limited_log
         self._notices = NoticePublisher(loop.node, name)
         self._numbering = RequestNumbering(data_plane.session)
         self._pacer: ReplyPacer[_PacedAnswer] = ReplyPacer()
-        self._offers: dict[ServiceName, str] = {}
-        self._proxies: dict[ServiceName, ServiceProxy] = {}
+        self._fallbacks = FallbackCaller(
+            loop=loop,
+            rules=rules,
+            stats=stats,
+            limited_log=limited_log,
+            on_answer=self._answer_from_fallback,
+            on_failure=self._tell_failure,
+        )
         self._pending: dict[RequestId, _Pending] = {}
-        self._missing_types: dict[ServiceName, str] = {}
-        self._left_alone: dict[ServiceName, frozenset[str]] = {}
-        self._free_since: dict[ServiceName, float] = {}
-        self._types_retried_at = 0.0
-        self._settled_at = now + DISCOVERY_SETTLES_S
+        self._proxies = Proxies(
+            loop=loop,
+            rules=rules,
+            stats=stats,
+            now=now,
+            on_request=self._submit,
+            on_bad_request=self._bad_request,
+            on_closed=self._proxy_closed,
+            on_carried=data_plane.set_carried,
+        )
         self.look_is_due = False
         """The graph should be looked at before the next scan period is over."""
 
@@ -95,55 +102,92 @@ class RobotSide:
         """Act on one event of the data plane."""
         match event:
             case ResponseArrived():
-                self._answer(event, now)
+                self._answer_from_network(event, now)
             case DeadlineMissed():
-                self._stats.deadlines_missed[event.service] += 1
-                self._limited.log(
-                    logging.WARNING,
-                    ("deadline", event.service),
-                    now,
-                    "%s: deadline of %.0f ms missed by request %s on %d paths",
-                    event.service,
-                    event.deadline_s * 1000,
-                    event.request_id.hex(),
-                    len(event.copies),
-                )
-                self._notices.deadline_missed(event)
+                self._miss(event, now)
+            case Unreachable():
+                self._fallbacks.unreachable(event.request_id, now)
             case RequestFailed():
                 self._fail(event, now)
             case OfferService():
-                self._offer(event)
+                self._proxies.offer(event)
+                self.look_is_due = True
             case WithdrawService():
-                self._withdraw(event)
+                self._proxies.withdraw(event, self._fallbacks.types())
             case _:
                 self._stats.dropped["event_for_other_role"] += 1
 
-    def _answer(self, event: ResponseArrived, now: float) -> None:
-        pending = self._pending.pop(event.request_id, None)
-        self._stats.pending = len(self._pending)
+    def _miss(self, event: DeadlineMissed, now: float) -> None:
+        if not self._fallbacks.deadline_missed(event.request_id, now):
+            return  # answered a moment ago
+        self._stats.deadlines_missed[event.service] += 1
+        self._limited.log(
+            logging.WARNING,
+            ("deadline", event.service),
+            now,
+            "%s: deadline of %.0f ms missed by request %s on %d paths",
+            event.service,
+            event.deadline_s * 1000,
+            event.request_id.hex(),
+            len(event.copies),
+        )
+        self._notices.deadline_missed(event)
+
+    def _answer_from_network(self, event: ResponseArrived, now: float) -> None:
+        request_id = event.request_id
+        has_answer = request_id not in self._pending and self._fallbacks.has_answered(request_id)
+        error = None if has_answer else self._answer(request_id, event.payload, now, late=event.late)
+        if error is None:
+            self._fallbacks.network_answered(request_id, now)
+            return
+        self._limited.log(
+            logging.ERROR,
+            ("bad_response", event.service),
+            now,
+            "%s: response from %s dropped: %s",
+            event.service,
+            event.server,
+            error,
+        )
+        self._fail(RequestFailed(request_id, event.service, "bad_response", str(error), event.elapsed_s), now)
+
+    def _answer_from_fallback(self, answer: FallbackAnswer, now: float) -> None:
+        error = self._answer(answer.request_id, answer.payload, now, late=answer.late)
+        if error is not None:
+            why = f"its fallback: {error}"
+            self._tell_failure(RequestFailed(answer.request_id, answer.service, "bad_response", why, 0.0), now)
+            return
+        self._limited.log(
+            logging.WARNING,
+            ("fallback", answer.service),
+            now,
+            "%s: its fallback answered request %s before the network",
+            answer.service,
+            answer.request_id.hex(),
+        )
+        self._data_plane.answered_here(answer.request_id)
+
+    def _answer(
+        self, request_id: RequestId, payload: bytes | memoryview, now: float, *, late: bool
+    ) -> RosBridgeError | None:
+        """Give the application its answer, once; returns why the bytes are none."""
+        pending = self._pending.get(request_id)
         if pending is None or not pending.proxy.open:
             # A second answer, or the service was withdrawn while the request was on its way.
             self._stats.dropped["response_without_request"] += 1
-            return
+            return None
         try:
-            response = pending.proxy.parse_answer(event.payload)
+            response = pending.proxy.parse_answer(payload)
         except RosBridgeError as error:
-            self._stats.unanswered[event.service, "bad_response"] += 1
-            self._limited.log(
-                logging.ERROR,
-                ("bad_response", event.service),
-                now,
-                "%s: response from %s dropped: %s",
-                event.service,
-                event.server,
-                error,
-            )
-            return
+            return error
+        del self._pending[request_id]
+        self._stats.pending = len(self._pending)
         answer = _PacedAnswer(pending.proxy, pending.rmw_request_id, response)
-        if self._pacer.offer(pending.client, answer, now, late=event.late):
+        if self._pacer.offer(pending.client, answer, now, late=late):
             self._send(answer, now)
         else:
             self._stats.answers_paced += 1
+        return None
 
     def _send(self, answer: _PacedAnswer, now: float) -> None:
         service = answer.proxy.name
@@ -159,6 +203,10 @@ class RobotSide:
         self._stats.answers_sent[service] += 1
 
     def _fail(self, event: RequestFailed, now: float) -> None:
+        if self._fallbacks.network_failed(event, now):
+            self._tell_failure(event, now)
+
+    def _tell_failure(self, event: RequestFailed, now: float) -> None:
         if self._pending.pop(event.request_id, None) is None:
             self._stats.dropped["failure_without_request"] += 1
             return
@@ -177,31 +225,6 @@ class RobotSide:
         )
         self._notices.request_failed(event)
 
-    def _offer(self, event: OfferService) -> None:
-        if find_rule(self._rules, event.name) is None:
-            self._stats.dropped["offer_not_in_rules"] += 1
-            log.error("service %s is offered, but no rule of this sidecar carries it", event.name)
-            return
-        if event.name not in self._offers and len(self._offers) >= MAX_OFFERED_SERVICES:
-            self._stats.dropped["too_many_offers"] += 1
-            log.error("service %s is not offered here: there are %d already", event.name, MAX_OFFERED_SERVICES)
-            return
-        if self._offers.get(event.name) != event.type:
-            self._close_proxy(event.name)
-            self._missing_types.pop(event.name, None)
-        self._offers[event.name] = event.type
-        self.look_is_due = True
-
-    def _withdraw(self, event: WithdrawService) -> None:
-        if self._offers.pop(event.name, None) is None:
-            return
-        self._missing_types.pop(event.name, None)
-        self._left_alone.pop(event.name, None)
-        self._free_since.pop(event.name, None)
-        if self._close_proxy(event.name):
-            log.info("service %s is withdrawn: %s", event.name, event.reason)
-        self._publish_state()
-
     # -- what applications ask -----------------------------------------------------------------------------------
 
     def _submit(self, proxy: ServiceProxy, rmw_request_id: RmwRequestId, payload: bytes, now: float) -> None:
@@ -214,6 +237,7 @@ class RobotSide:
         self._pending[request_id] = _Pending(proxy, rmw_request_id, client)
         self._stats.pending = len(self._pending)
         self._data_plane.submit(request_id, proxy.name, payload)
+        self._fallbacks.submitted(request_id, proxy.name, payload, now)
 
     def _bad_request(self, proxy: ServiceProxy, error: RosBridgeError, now: float) -> None:
         self._stats.requests_taken[proxy.name] += 1
@@ -223,110 +247,47 @@ class RobotSide:
         self._stats.unanswered[proxy.name, reason] += 1
         self._limited.log(logging.ERROR, (reason, proxy.name), now, "%s: a request is dropped: %s", proxy.name, detail)
 
-    # -- what the graph shows ------------------------------------------------------------------------------------
-
-    @property
-    def scan_period_s(self) -> float:
-        """Seconds until the graph should be looked at again."""
-        return graph.SCAN_PERIOD_S
-
-    def look(self, now: float) -> None:
-        """Compare the graph with what is offered; create and withdraw proxies accordingly."""
-        self.look_is_due = False
-        if not self._offers:
-            return
-        served = graph.scan(self._loop.node)
-        self._stats.scans += 1
-        retry_types = now - self._types_retried_at >= TYPE_RETRY_S
-        if retry_types:
-            self._types_retried_at = now
-        for name, type_name in self._offers.items():
-            others = self._servers_in_our_way(name, served.get(name))
-            if others:
-                self._free_since.pop(name, None)
-                self._leave_alone(name, others)
-                continue
-            free_since = self._free_since.setdefault(name, now)
-            if now < self._settled_at or now - free_since < NAME_IS_FREE_S:
-                continue
-            if self._left_alone.pop(name, None):
-                log.info("service %s: no other node serves it any more", name)
-            if name not in self._proxies and (retry_types or name not in self._missing_types):
-                self._open_proxy(name, type_name)
-        self._publish_state()
-
-    def _servers_in_our_way(self, name: ServiceName, served: graph.Served | None) -> frozenset[str]:
-        if served is None:
-            return frozenset()
-        others = served.nodes() - {self._own_node}
-        if name not in self._proxies:
-            return others
-        # Two robot sidecars in one domain that proxied the name at the same moment: the smaller name stays.
-        return frozenset(node for node in others if not graph.is_sidecar(node) or node < self._own_node)
-
-    def _leave_alone(self, name: ServiceName, others: frozenset[str]) -> None:
-        if self._left_alone.get(name) == others:
-            return
-        self._left_alone[name] = others
-        nodes = ", ".join(sorted(others))
-        if self._close_proxy(name):
-            log.warning("service %s is now served by %s on this robot: ours is withdrawn", name, nodes)
-        else:
-            log.warning("service %s is already served by %s on this robot: left alone", name, nodes)
-
-    def _open_proxy(self, name: ServiceName, type_name: str) -> None:
-        try:
-            proxy = ServiceProxy(self._loop.node, name, load_service_type(type_name), self._submit, self._bad_request)
-        except RosBridgeError as error:
-            if name not in self._missing_types:
-                self._missing_types[name] = type_name
-                kind = "type_not_installed" if isinstance(error, TypeNotInstalledError) else "service_refused"
-                self._stats.errors[kind] += 1
-                log.error("service %s is not offered here: %s", name, error)
-            return
-        self._missing_types.pop(name, None)
-        self._proxies[name] = proxy
-        self._loop.set_services(tuple(self._proxies.values()))
-        log.info("service %s (%s) is offered here", name, type_name)
-
-    def _close_proxy(self, name: ServiceName) -> bool:
-        proxy = self._proxies.pop(name, None)
-        if proxy is None:
-            return False
-        self._loop.set_services(tuple(self._proxies.values()))
-        unseen = proxy.close()
-        self._stats.requests_taken[name] += unseen
+    def _proxy_closed(self, proxy: ServiceProxy, unseen: int) -> None:
+        """The requests at a proxy that was withdrawn get no answer."""
+        self._stats.requests_taken[proxy.name] += unseen
         orphans = [request_id for request_id, pending in self._pending.items() if pending.proxy is proxy]
         for request_id in orphans:
             del self._pending[request_id]
         self._stats.pending = len(self._pending)
         if orphans or unseen:
-            self._stats.unanswered[name, "withdrawn"] += len(orphans) + unseen
-        return True
+            self._stats.unanswered[proxy.name, "withdrawn"] += len(orphans) + unseen
 
-    def _publish_state(self) -> None:
-        self._stats.left_alone = {name: tuple(sorted(nodes)) for name, nodes in self._left_alone.items()}
-        self._stats.missing_types = dict(self._missing_types)
-        carried = frozenset(self._proxies)
-        if carried != self._stats.carried:
-            self._stats.carried = carried
-            self._data_plane.set_carried(carried)
+    # -- what the graph shows ------------------------------------------------------------------------------------
+
+    @property
+    def scan_period_s(self) -> float:
+        """Seconds until the graph should be looked at again."""
+        return graph.SETTLING_PERIOD_S if self._fallbacks.settling else graph.SCAN_PERIOD_S
+
+    def look(self, now: float) -> None:
+        """Compare the graph with what is offered and with the fallbacks."""
+        self.look_is_due = False
+        if self._proxies.offers or self._fallbacks.configured:
+            served = graph.scan(self._loop.node)
+            self._stats.scans += 1
+            self._fallbacks.look(served, self._proxies.offers, now)
+            self._proxies.look(served, self._fallbacks.types(), now)
 
     # -- time ----------------------------------------------------------------------------------------------------
 
     def next_due(self) -> float | None:
         """Return when `on_timer` has something to do, or None."""
-        return self._pacer.next_due()
+        dues = (self._pacer.next_due(), self._fallbacks.next_due())
+        return min((due for due in dues if due is not None), default=None)
 
     def on_timer(self, now: float) -> None:
-        """Send the answers that were held back for their clients' sake."""
+        """Ask fallbacks in time; send the answers that were held back for their clients' sake."""
+        self._fallbacks.on_timer(now)
         if self._pacer.queued:
             for answer in self._pacer.take_due(now):
                 self._send(answer, now)
 
     def close(self) -> None:
-        """Withdraw every proxy."""
-        for name in tuple(self._proxies):
-            self._close_proxy(name)
-        self._offers.clear()
-        self._publish_state()
+        """Withdraw every service."""
+        self._fallbacks.close()
+        self._proxies.close()

@@ -1,4 +1,4 @@
-"""Cloud: the client of one local server, with the executions that wait for its answers."""
+"""Cloud: one local server, with the executions that wait for its answers."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.rcl import Message, send_request, take_response
-from sidecar.ros.request_window import MAX_SIZE, RequestWindow
-from sidecar.ros.ros_loop import service_qos
+from sidecar.ros.local_server import LocalServer
+from sidecar.ros.request_window import RequestWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,10 +15,8 @@ if TYPE_CHECKING:
     from protos.model import ServiceName
     from sidecar.core.events import ExecutionId
     from sidecar.core.priority import Priority
+    from sidecar.ros.rcl import Message
     from sidecar.ros.types import ServiceType
-
-TAKEN_AT_ONCE = 32
-"""Answers taken from one server before the others have their turn."""
 
 
 @dataclass(slots=True, eq=False)
@@ -50,26 +47,18 @@ class ServiceRunner:
     ) -> None:
         self.name = name
         self.type = service_type
-        self._node = node
         self._on_answer = on_answer
         self._on_stray_answer = on_stray_answer
         self._on_unsent = on_unsent
         self._at_server: dict[int, Execution] = {}
         """By rmw's sequence number."""
         self.window: RequestWindow[Execution] = RequestWindow()
-        self.endpoints: frozenset[bytes] = frozenset()
-        """DDS ids of the server, to tell a restarted one from the old one."""
-        try:
-            self._client = node.create_client(service_type.service, name, qos_profile=service_qos(MAX_SIZE))
-        # rclpy validates names with exceptions of several unrelated classes.
-        except Exception as error:
-            raise RosBridgeError(f"rmw refuses a client of {name}, type {service_type.name}: {error}") from error
-        self._pointer: int = self._client.handle.pointer
+        self._server = LocalServer(node, name, service_type)
 
     @property
     def handle(self) -> Any:
         """rclpy's handle."""
-        return self._client.handle
+        return self._server.handle
 
     @property
     def pending(self) -> int:
@@ -78,7 +67,11 @@ class ServiceRunner:
 
     def is_matched(self) -> bool:
         """True once requests reach the server: before, rmw would drop them without a word."""
-        return bool(self._client.handle.service_server_is_available())
+        return self._server.is_matched()
+
+    def was_replaced(self) -> bool:
+        """Whether, since the last call, another server took the place of the old one."""
+        return self._server.was_replaced()
 
     def add(self, execution: Execution, now: float) -> bool:
         """Send `execution` now, or as soon as the server has room; return False when it has to wait."""
@@ -94,7 +87,7 @@ class ServiceRunner:
                 self._on_unsent(self, execution, "its time was over before the server had room for it")
                 continue
             try:
-                number = send_request(self._pointer, request)
+                number = self._server.send(request)
             except RosBridgeError as error:
                 self._on_unsent(self, execution, str(error))
                 continue
@@ -104,11 +97,7 @@ class ServiceRunner:
 
     def take(self, now: float) -> None:
         """Take the answers that have arrived."""
-        for _ in range(TAKEN_AT_ONCE):
-            taken = take_response(self._pointer, self.type.response)
-            if taken is None:
-                break
-            number, payload = taken
+        for number, payload in self._server.take():
             self.window.answered(number, now)
             execution = self._at_server.pop(number, None)
             if execution is None:
@@ -135,5 +124,4 @@ class ServiceRunner:
 
     def close(self) -> None:
         """Destroy the client."""
-        self._pointer = 0  # rcl refuses a null pointer, and would crash on the old one
-        self._node.destroy_client(self._client)
+        self._server.close()

@@ -32,6 +32,12 @@ class BridgeStats:
     """Cloud: (service, reason: RejectReason's name in lower case)."""
     abandoned: Counter[ServiceName] = field(default_factory=Counter)
     """Cloud: requests whose answer nobody waits for any more."""
+    fallbacks: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
+    """Robot: (service, outcome: one of `sidecar.core.fallback.OUTCOMES`)."""
+    fallback_up: dict[ServiceName, bool] = field(default_factory=dict)
+    """Robot: services with a fallback; whether it can be asked. Replaced, never changed."""
+    fallback_takes_s: dict[ServiceName, float] = field(default_factory=dict)
+    """Robot: seconds that their fallbacks are expected to take. Replaced, never changed."""
     dropped: Counter[str] = field(default_factory=Counter)
     """Events and messages by the reason they were dropped for."""
     errors: Counter[str] = field(default_factory=Counter)

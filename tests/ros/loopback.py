@@ -72,6 +72,7 @@ class Loopback:
         self.offers: tuple[ServiceOffer, ...] = ()
         self.carried: frozenset[ServiceName] = frozenset()
         self.refusals: list[tuple[RejectReason, str]] = []
+        self.answered_here: list[RequestId] = []
         self.counts: Counter[str] = Counter()
         self.processing_s: list[float] = []
         self.requests: dict[RequestId, _Request] = {}
@@ -203,6 +204,9 @@ class RobotPlane:
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
         self._link.submitted(request_id, service, payload)
 
+    def answered_here(self, request_id: RequestId) -> None:
+        self._link.answered_here.append(request_id)
+
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         raise AssertionError("a robot completes nothing")
 
@@ -225,6 +229,9 @@ class CloudPlane:
 
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
         raise AssertionError("a server submits nothing")
+
+    def answered_here(self, request_id: RequestId) -> None:
+        raise AssertionError("a server asks nothing")
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         self._link.completed(execution, payload, processing_s)

@@ -56,7 +56,7 @@ def test_more_requests_than_the_ros_thread_has_looked_at(mesh: Mesh, monkeypatch
 
 
 def test_more_services_than_may_be_offered(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.ros.robot_side.MAX_OFFERED_SERVICES", 3)
+    monkeypatch.setattr("sidecar.ros.proxies.MAX_OFFERED_SERVICES", 3)
     mesh.start()
     for number in range(5):
         mesh.robot.handle(OfferService(ServiceName(f"/s{number}"), "std_srvs/srv/Empty"))

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from protos.errors import ConfigError
 from protos.identity import Identity, IdentityRole
-from protos.model import InterfaceName, NodeName, Role
+from protos.model import InterfaceName, NodeName, Role, ServiceName
 from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
 from sidecar.config import (
     DEFAULT_CLOUD_UDP_PORT,
@@ -22,6 +22,7 @@ from sidecar.config import (
     refuse_exposed,
 )
 from sidecar.core.budgets import Budget
+from sidecar.core.fallback_rule import FallbackRule
 from sidecar.core.priority import Priority
 from sidecar.core.redundancy_mode import RedundancyMode
 
@@ -40,6 +41,9 @@ CLOUD: dict[str, Any] = {
     "control_plane": "[2001:db8::1]:50051",
     "services": [{"name": "/*"}],
 }
+
+SAFE: dict[str, Any] = {"idempotent": True}
+BACKED: dict[str, Any] = {"deadline_ms": 100, "idempotent": True, "fallback": "/b"}
 
 
 def parse(base: dict[str, Any], **changes: Any) -> SidecarConfig:
@@ -124,6 +128,16 @@ def test_copies_to_several_servers_only_when_asked_for() -> None:
     assert not rule.idempotent
     assert not rule.drop_late
     assert rule.priority is Priority.NORMAL
+
+
+def test_a_fallback_and_when_it_is_asked() -> None:
+    assert parse(ROBOT).service_rules()[0].fallback is None
+    (rule,) = parse(with_service(ROBOT, **SAFE, fallback="/local")).service_rules()
+    assert rule.fallback == FallbackRule(ServiceName("/local"), in_time=True, takes_s=None)
+    (rule,) = parse(with_service(ROBOT, **SAFE, fallback="/local", fallback_takes_ms=20)).service_rules()
+    assert rule.fallback == FallbackRule(ServiceName("/local"), in_time=True, takes_s=0.02)
+    (rule,) = parse(with_service(ROBOT, **SAFE, fallback="/local", fallback_start="on_miss")).service_rules()
+    assert rule.fallback == FallbackRule(ServiceName("/local"), in_time=False)
 
 
 def test_how_many_copies_are_sent_and_when() -> None:
@@ -216,6 +230,33 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(CLOUD, redundancy="single"), "services[0].redundancy", "on a robot only"),
     (with_service(ROBOT, hedge_quantile=0.9), "services[0].hedge_quantile", "only beside redundancy: hedge"),
     (with_service(ROBOT, hedge_quantile=1), "services[0].hedge_quantile", "0.99"),
+    (with_service(CLOUD, fallback="/b"), "services[0].fallback", "on a robot only"),
+    (with_service(ROBOT, fallback="/b"), "services[0].fallback", "beside idempotent: true only"),
+    (with_service(ROBOT, **SAFE, fallback="/b*"), "services[0].fallback", "a service name such as /plan_locally"),
+    (with_service(ROBOT, **SAFE, fallback="/plan_path"), "services[0].fallback", "expected another service"),
+    (with_service(ROBOT, **SAFE, name="/*", fallback="/b"), "services[0].fallback", "the full name of one service"),
+    (with_service(ROBOT, fallback_takes_ms=5), "services[0].fallback_takes_ms", "only beside fallback"),
+    (with_service(ROBOT, fallback_start="on_miss"), "services[0].fallback_start", "only beside fallback"),
+    (
+        with_service(ROBOT, **SAFE, deadline_ms=100, fallback="/b", fallback_takes_ms=95),
+        "services[0].fallback_takes_ms",
+        "expected less than 95",
+    ),
+    (
+        with_service(ROBOT, **SAFE, fallback="/b", fallback_takes_ms=5, fallback_start="on_miss"),
+        "services[0].fallback_takes_ms",
+        "only beside fallback_start: in_time",
+    ),
+    (
+        ROBOT | {"services": [{**BACKED, "name": "/a"}, {**BACKED, "name": "/c"}]},
+        "services[1].fallback",
+        "expected another than that of services[0]",
+    ),
+    (
+        ROBOT | {"services": [{**BACKED, "name": "/a"}, {"name": "/b", "deadline_ms": 100}]},
+        "services[1].name",
+        "expected a service that is not the fallback of services[0]",
+    ),
     (ROBOT | {"networks": [{"interface": "wlan0", "extra_load": -1}]}, "networks[0].extra_load", "equal to 0"),
     (ROBOT | {"networks": [{"interface": "wlan0", "extra_mb_per_day": -1}]}, "networks[0].extra_mb_per_day", "to 0"),
     (with_service(ROBOT, cost_per_request=1), "services[0].cost_per_request", "on a cloud only"),

@@ -93,6 +93,9 @@ def busy() -> Counters:
     counters.control.ignored["undecodable"] = 1
     counters.bridge.requests_taken[PLAN] = 9
     counters.bridge.unanswered[PLAN, "failed"] = 1
+    counters.bridge.fallbacks[PLAN, "won"] = 2
+    counters.bridge.fallback_up = {PLAN: True}
+    counters.bridge.fallback_takes_s = {PLAN: 0.25}
     counters.state_failures["write_failed"] = 4
     return counters
 
@@ -126,6 +129,9 @@ def test_counters_become_samples() -> None:
         "plr_sidecar_info{name=robot-1,role=robot,version=0.1.0}": 1,
         "plr_requests_total{outcome=ok,service=/plan}": 7,
         "plr_requests_total{outcome=deadline_missed,service=/plan}": 2,
+        "plr_fallback_requests_total{outcome=won,service=/plan}": 2,
+        "plr_fallback_up{service=/plan}": 1,
+        "plr_fallback_expected_seconds{service=/plan}": 0.25,
         "plr_path_wins_total{interface=wlan0,peer=cloud-a,service=/plan}": 7,
         "plr_duplicate_responses_total{}": 5,
         "plr_copies_called_off_total{interface=wlan0,peer=cloud-a,service=/plan}": 6,

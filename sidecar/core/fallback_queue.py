@@ -1,0 +1,120 @@
+"""Robot side: the requests of one service that its fallback may be asked for, and which is to begin when.
+
+The fallback is taken for one server that runs one request after the other. For all to be in time, the request with the
+k-th deadline has to begin k times as long before it as one takes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from sidecar.core.fallback_times import FallbackTimes
+
+if TYPE_CHECKING:
+    from sidecar.core.events import RequestFailed, RequestId
+    from sidecar.core.fallback_rule import FallbackRule
+
+MAX_CALLED = 2
+"""Requests at one fallback at once: one runs, the next lies ready. With more, those that can still be in time would
+stand behind those that cannot."""
+SPARE = 0.05
+"""Share of the deadline that is left for the way to the fallback and back to the application."""
+LEAD_UNTIL_KNOWN = 0.5
+"""Share of the deadline that a fallback is given before it has ever answered."""
+STALL_S = 1.0
+STALL_FACTOR = 4.0
+"""A fallback that is silent for so much longer than it takes, and for STALL_S, has lost what it was asked: of a process
+that crashed, DDS tells after some 20 s only."""
+PLANNED_AHEAD = 64
+"""Requests looked at to see when the first has to begin."""
+
+
+@dataclass(slots=True)
+class FallbackRequest:
+    """One request of an application."""
+
+    id: RequestId
+    payload: bytes | None
+    deadline_at: float
+    expires_at: float
+    wanted: bool = False
+    """Its fallback has to be asked: now, or it was."""
+    over: bool = False
+    """Its fallback will not be asked any more."""
+    attempts: int = 0
+    called_at: float = 0.0
+    answered: bool = False
+    """The application has its answer."""
+    answered_here: bool = False
+    """From the fallback."""
+    network_over: bool = False
+    failure: RequestFailed | None = None
+    """What the network said at last, kept from the application as long as the fallback may answer."""
+
+
+class FallbackQueue:
+    """One service's fallback and the requests that may need it. Times are seconds."""
+
+    def __init__(self, rule: FallbackRule, deadline_s: float, lifetime_s: float, *, drop_late: bool) -> None:
+        self.rule = rule
+        self.deadline_s = deadline_s
+        self.lifetime_s = lifetime_s
+        self.drop_late = drop_late
+        """An answer after the deadline is worth nothing."""
+        self.times = FallbackTimes(rule.takes_s)
+        self.up = False
+        """It can be asked."""
+        self.planned: dict[RequestId, FallbackRequest] = {}
+        """The network may yet answer; in order of their deadlines, since all have the same time."""
+        self.wanted: dict[RequestId, FallbackRequest] = {}
+        """Wait for room."""
+        self.called: dict[RequestId, FallbackRequest] = {}
+        """At the fallback."""
+
+    def remove(self, request: FallbackRequest) -> None:
+        """It is not to be asked any more; if it was, its answer is still to come."""
+        self.planned.pop(request.id, None)
+        self.wanted.pop(request.id, None)
+
+    def begin_at(self) -> float | None:
+        """When the first that is planned has to be wanted; None: not before the network has missed."""
+        lead_s = self._lead_s()
+        if not self.rule.in_time or not self.planned or lead_s is None:
+            return None
+        # Those that are wanted already run first, whatever is added behind them. More than fit into one deadline cannot
+        # all be in time, however soon the first begins.
+        fit = int((1 - SPARE) * self.deadline_s / lead_s)
+        ahead = enumerate(islice(self.planned.values(), min(fit, PLANNED_AHEAD)), 1)
+        latest = min(request.deadline_at - place * lead_s for place, request in ahead)
+        return latest - SPARE * self.deadline_s
+
+    def _lead_s(self) -> float | None:
+        """What one request takes; None: more than there is, so that to begin early would be for nothing."""
+        takes_s = self.times.expected_s()
+        if takes_s is None:
+            return LEAD_UNTIL_KNOWN * self.deadline_s
+        return takes_s if takes_s < (1 - SPARE) * self.deadline_s else None
+
+    def next_call(self, now: float) -> FallbackRequest | None:
+        """Take the request whose turn it is: of those that can be in time, or else of all, the earliest deadline."""
+        if not self.up or len(self.called) >= MAX_CALLED or not self.wanted:
+            return None
+        done_at = now + (self.times.expected_s() or 0.0)
+        request = min(self.wanted.values(), key=lambda one: (one.deadline_at < done_at, one.deadline_at))
+        del self.wanted[request.id]
+        self.called[request.id] = request
+        request.called_at = now
+        request.attempts += 1
+        return request
+
+    def is_worthless(self, request: FallbackRequest, now: float) -> bool:
+        """Whether an answer to it would not be delivered any more."""
+        return request.answered or (self.drop_late and now >= request.deadline_at)
+
+    def stalled_at(self, request: FallbackRequest) -> float:
+        """When its answer is not awaited any more, although the fallback may be there."""
+        takes_s = self.times.expected_s()
+        patience_s = self.deadline_s if takes_s is None else STALL_FACTOR * takes_s
+        return self.times.begun_at(request.called_at) + max(STALL_S, patience_s)

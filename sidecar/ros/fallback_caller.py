@@ -1,0 +1,297 @@
+"""Robot: the local services that stand in for the network: where they are, and what they are asked.
+
+When they are asked, and which answer counts, is settled in `sidecar.core.fallback`.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from sidecar.core.fallback import Fallbacks
+from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.local_server import LocalServer
+from sidecar.ros.types import load_service_type
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from protos.model import ServiceName
+    from sidecar.core.events import RequestFailed, RequestId
+    from sidecar.core.fallback import FallbackCall
+    from sidecar.core.rules import ServiceRule
+    from sidecar.ros.graph import Served
+    from sidecar.ros.log_limit import LimitedLog
+    from sidecar.ros.ros_loop import RosLoop
+    from sidecar.ros.stats import BridgeStats
+
+MAX_ASKED = 64
+"""Requests whose number at one fallback is remembered; the oldest is forgotten: it was lost long ago."""
+COMPLAIN_AFTER_S = 5.0
+"""For so long a fallback may be missing without a word: the robot's nodes start together."""
+TYPE_RETRY_S = 30.0
+"""How often a type that is not installed is looked for again."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FallbackAnswer:
+    """An answer that the application gets."""
+
+    request_id: RequestId
+    service: ServiceName
+    payload: bytes
+    late: bool
+
+
+class _Fallback:
+    """One fallback that is there."""
+
+    def __init__(
+        self, server: LocalServer, on_answer: Callable[[RequestId, bytes, float], None], on_stray: Callable[[], None]
+    ) -> None:
+        self.server = server
+        self._on_answer = on_answer
+        self._on_stray = on_stray
+        self._asked: dict[int, RequestId] = {}
+        """By rmw's sequence number."""
+
+    @property
+    def handle(self) -> Any:
+        """rclpy's handle."""
+        return self.server.handle
+
+    def ask(self, call: FallbackCall) -> None:
+        """Send a request. Raises RosBridgeError."""
+        number = self.server.send(self.server.type.request.deserialize(call.payload))
+        self._asked[number] = call.request_id
+        if len(self._asked) > MAX_ASKED:
+            del self._asked[next(iter(self._asked))]
+
+    def take(self, now: float) -> None:
+        """Take the answers that have arrived."""
+        for number, payload in self.server.take():
+            request_id = self._asked.pop(number, None)
+            if request_id is None:
+                self._on_stray()
+            else:
+                self._on_answer(request_id, payload, now)
+
+
+@dataclass(slots=True)
+class _Complaint:
+    """Why a fallback can not be asked."""
+
+    text: str
+    since: float
+    told: bool = False
+
+
+class FallbackCaller:
+    """Finds the fallbacks in the local graph and asks them. All methods belong to the ROS thread."""
+
+    def __init__(
+        self,
+        *,
+        loop: RosLoop,
+        rules: Iterable[ServiceRule],
+        stats: BridgeStats,
+        limited_log: LimitedLog,
+        on_answer: Callable[[FallbackAnswer, float], None],
+        on_failure: Callable[[RequestFailed, float], None],
+    ) -> None:
+        """`on_answer` gives an answer to the application, `on_failure` ends a request that gets none."""
+        self._loop = loop
+        self._stats = stats
+        self._limited = limited_log
+        self._on_answer = on_answer
+        self._on_failure = on_failure
+        self._policy = Fallbacks(rules, stats.fallbacks)
+        self._fallbacks: dict[ServiceName, _Fallback] = {}
+        self._up: frozenset[ServiceName] = frozenset()
+        self._complaints: dict[ServiceName, _Complaint] = {}
+        self._refused: dict[ServiceName, str] = {}
+        """Fallbacks whose type can not be used here, and that type."""
+        self._types_retried_at = 0.0
+        self._publish_state()
+
+    @property
+    def configured(self) -> bool:
+        """Whether any service has a fallback."""
+        return bool(self._policy.services)
+
+    @property
+    def settling(self) -> bool:
+        """Whether a fallback that is there can not be asked yet."""
+        return len(self._up) < len(self._fallbacks)
+
+    def types(self) -> dict[ServiceName, str]:
+        """The services whose fallback can be asked right now, with their types."""
+        return {service: self._fallbacks[service].server.type.name for service in self._up}
+
+    # -- what becomes of requests ----------------------------------------------------------------------------------
+
+    def submitted(self, request_id: RequestId, service: ServiceName, payload: bytes, now: float) -> None:
+        """A request goes to the network."""
+        self._policy.submitted(request_id, service, payload, now)
+        self._act(now)
+
+    def unreachable(self, request_id: RequestId, now: float) -> None:
+        """No path to any server is up."""
+        self._policy.unreachable(request_id, now)
+        self._act(now)
+
+    def deadline_missed(self, request_id: RequestId, now: float) -> bool:
+        """The network missed the deadline; returns whether the application has no answer yet."""
+        unanswered = self._policy.deadline_missed(request_id, now)
+        self._act(now)
+        return unanswered
+
+    def has_answered(self, request_id: RequestId) -> bool:
+        """Whether the application has its answer from a fallback."""
+        return self._policy.has_answered(request_id)
+
+    def network_answered(self, request_id: RequestId, now: float) -> None:
+        """The network's answer has arrived."""
+        self._policy.network_answered(request_id, now)
+        self._act(now)
+
+    def network_failed(self, failure: RequestFailed, now: float) -> bool:
+        """The network gives no answer; returns whether nobody else may."""
+        hopeless = self._policy.network_failed(failure, now)
+        self._act(now)
+        return hopeless
+
+    def _answered(self, request_id: RequestId, payload: bytes, now: float) -> None:
+        accepted = self._policy.answered(request_id, now)
+        if accepted is not None:
+            self._on_answer(FallbackAnswer(request_id, accepted.service, payload, accepted.late), now)
+        self._act(now)
+
+    def _act(self, now: float) -> None:
+        while calls := self._policy.take_calls():
+            for call in calls:
+                try:
+                    self._fallbacks[call.service].ask(call)
+                except RosBridgeError as error:
+                    self._limited.log(
+                        logging.ERROR,
+                        ("fallback", call.service),
+                        now,
+                        "service %s: its fallback is not asked: %s",
+                        call.service,
+                        error,
+                    )
+                    self._policy.refused(call.request_id, now)
+        for failure in self._policy.take_failures():
+            self._on_failure(failure, now)
+
+    # -- what the graph shows --------------------------------------------------------------------------------------
+
+    def look(self, served: Mapping[ServiceName, Served], offers: Mapping[ServiceName, str], now: float) -> None:
+        """Follow the fallbacks; `offers`: services of the network and their types, which the fallbacks must have."""
+        retry_types = now - self._types_retried_at >= TYPE_RETRY_S
+        if retry_types:
+            self._types_retried_at = now
+        for service, name in self._policy.services.items():
+            types = frozenset(served[name].applications()) if name in served else frozenset()
+            self._follow(service, name, types, offers.get(service), now, retry_types=retry_types)
+        up = frozenset(name for name, fallback in self._fallbacks.items() if fallback.server.is_matched())
+        for service in up - self._up:
+            log.info("service %s: its fallback %s is there", service, self._policy.services[service])
+        if up != self._up:
+            self._up = up
+            self._policy.set_up(up, now)
+            self._act(now)
+        self._publish_state()
+
+    def _follow(
+        self,
+        service: ServiceName,
+        name: ServiceName,
+        types: frozenset[str],
+        wanted: str | None,
+        now: float,
+        *,
+        retry_types: bool,
+    ) -> None:
+        fallback = self._fallbacks.get(service)
+        used = None if fallback is None else fallback.server.type.name
+        if wanted is None:
+            wanted = used if used in types else min(types, default=None)
+        if fallback is not None and (used != wanted or used not in types):
+            self._close(service, now)
+            fallback = None
+        if fallback is not None:
+            if fallback.server.was_replaced():
+                log.warning("service %s: its fallback %s was restarted", service, name)
+                self._policy.replaced(service, now)
+                self._act(now)
+        elif not types:
+            self._complain(service, f"no node serves {name} on this robot: start the one that does", now)
+        elif wanted not in types:
+            found = ", ".join(sorted(types))
+            self._complain(service, f"{name} has type {found}, not {wanted} as the servers of {service}", now)
+        elif retry_types or self._refused.get(service) != wanted:
+            self._open(service, name, wanted, now)
+
+    def _open(self, service: ServiceName, name: ServiceName, type_name: str, now: float) -> None:
+        try:
+            server = LocalServer(self._loop.node, name, load_service_type(type_name))
+        except RosBridgeError as error:
+            self._refused[service] = type_name
+            self._complain(service, str(error), now)
+            return
+        self._refused.pop(service, None)
+        self._complaints.pop(service, None)
+        self._fallbacks[service] = _Fallback(server, self._answered, self._stray)
+        self._loop.set_clients(tuple(self._fallbacks.values()))
+
+    def _close(self, service: ServiceName, now: float) -> None:
+        fallback = self._fallbacks.pop(service)
+        self._loop.set_clients(tuple(self._fallbacks.values()))
+        fallback.server.close()
+        if service in self._up:
+            self._up -= {service}
+            self._policy.set_up(self._up, now)
+            self._act(now)
+            log.warning("service %s: its fallback %s is gone", service, self._policy.services[service])
+
+    def _complain(self, service: ServiceName, text: str, now: float) -> None:
+        complaint = self._complaints.get(service)
+        if complaint is None or complaint.text != text:
+            complaint = self._complaints[service] = _Complaint(text, now)
+        if not complaint.told and now - complaint.since >= COMPLAIN_AFTER_S:
+            complaint.told = True
+            log.error("service %s has no fallback: %s", service, text)
+
+    def _stray(self) -> None:
+        """An answer to what was given up as lost, or a second answer because two nodes serve one name."""
+        self._stats.dropped["answer_without_execution"] += 1
+
+    def _publish_state(self) -> None:
+        policy = self._policy
+        self._stats.fallback_up = {service: service in self._up for service in policy.services}
+        times = {service: policy.expected_s(service) for service in policy.services}
+        self._stats.fallback_takes_s = {name: takes_s for name, takes_s in times.items() if takes_s is not None}
+
+    # -- time ------------------------------------------------------------------------------------------------------
+
+    def next_due(self) -> float | None:
+        """When `on_timer` has something to do, or None."""
+        return self._policy.next_timer()
+
+    def on_timer(self, now: float) -> None:
+        """Ask what has to begin."""
+        self._policy.handle_timer(now)
+        self._act(now)
+
+    def close(self) -> None:
+        """Ask nobody any more."""
+        self._loop.set_clients(())
+        for fallback in self._fallbacks.values():
+            fallback.server.close()
+        self._fallbacks.clear()
+        self._up = frozenset()

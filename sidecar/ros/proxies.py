@@ -1,0 +1,185 @@
+"""Robot: which services are offered to the local applications, following the network and the local graph."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from sidecar.core.rules import find_rule
+from sidecar.ros import graph
+from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.service_proxy import ServiceProxy
+from sidecar.ros.types import TypeNotInstalledError, load_service_type
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from protos.model import ServiceName
+    from sidecar.core.events import OfferService, WithdrawService
+    from sidecar.core.rules import ServiceRule
+    from sidecar.ros.rcl import RmwRequestId
+    from sidecar.ros.ros_loop import RosLoop
+    from sidecar.ros.stats import BridgeStats
+
+MAX_OFFERED_SERVICES = 512
+"""Services that peers may offer; each costs DDS endpoints and a slot in every wait."""
+DISCOVERY_SETTLES_S = 1.0
+"""After joining the domain, nothing is offered for so long: servers that run here already must be discovered first."""
+NAME_IS_FREE_S = 0.15
+"""Nobody else must have served a name for so long: two looks. In the cloud's own domain, where robot and cloud may both
+be, the server whose service we are offered was perhaps discovered by the cloud's sidecar a moment before ours."""
+TYPE_RETRY_S = 30.0
+"""How often a type that is not installed is looked for again: someone may be installing it."""
+
+log = logging.getLogger(__name__)
+
+
+class Proxies:
+    """The proxied services. A name that another local node serves is left alone."""
+
+    def __init__(
+        self,
+        *,
+        loop: RosLoop,
+        rules: tuple[ServiceRule, ...],
+        stats: BridgeStats,
+        now: float,
+        on_request: Callable[[ServiceProxy, RmwRequestId, bytes, float], None],
+        on_bad_request: Callable[[ServiceProxy, RosBridgeError, float], None],
+        on_closed: Callable[[ServiceProxy, int], None],
+        on_carried: Callable[[frozenset[ServiceName]], None],
+    ) -> None:
+        """`on_closed` is told how many requests lay at a proxy unseen, `on_carried` which services exist now."""
+        self._loop = loop
+        self._own_node = loop.node.get_fully_qualified_name()
+        self._rules = rules
+        self._stats = stats
+        self._on_request = on_request
+        self._on_bad_request = on_bad_request
+        self._on_closed = on_closed
+        self._on_carried = on_carried
+        self.offers: dict[ServiceName, str] = {}
+        """What servers in the network offer, and of which type."""
+        self._proxies: dict[ServiceName, ServiceProxy] = {}
+        self._missing_types: dict[ServiceName, str] = {}
+        self._left_alone: dict[ServiceName, frozenset[str]] = {}
+        self._free_since: dict[ServiceName, float] = {}
+        self._types_retried_at = 0.0
+        self._settled_at = now + DISCOVERY_SETTLES_S
+
+    def offer(self, event: OfferService) -> None:
+        """A server in the network offers this."""
+        if find_rule(self._rules, event.name) is None:
+            self._stats.dropped["offer_not_in_rules"] += 1
+            log.error("service %s is offered, but no rule of this sidecar carries it", event.name)
+            return
+        if event.name not in self.offers and len(self.offers) >= MAX_OFFERED_SERVICES:
+            self._stats.dropped["too_many_offers"] += 1
+            log.error("service %s is not offered here: there are %d already", event.name, MAX_OFFERED_SERVICES)
+            return
+        if self.offers.get(event.name) != event.type:
+            proxy = self._proxies.get(event.name)
+            if proxy is not None and proxy.type.name != event.type:
+                self._close_proxy(event.name)
+            self._missing_types.pop(event.name, None)
+        self.offers[event.name] = event.type
+
+    def withdraw(self, event: WithdrawService, fallbacks: Mapping[ServiceName, str]) -> None:
+        """No server in the network offers this any more; `fallbacks`: what has one on this robot, and its type."""
+        if self.offers.pop(event.name, None) is None:
+            return
+        self._missing_types.pop(event.name, None)
+        self._left_alone.pop(event.name, None)
+        self._free_since.pop(event.name, None)
+        proxy = self._proxies.get(event.name)
+        if proxy is not None and fallbacks.get(event.name) == proxy.type.name:
+            log.warning("service %s: its fallback alone answers from now on: %s", event.name, event.reason)
+        elif self._close_proxy(event.name):
+            log.info("service %s is withdrawn: %s", event.name, event.reason)
+        self._publish_state()
+
+    def look(
+        self, served: Mapping[ServiceName, graph.Served], fallbacks: Mapping[ServiceName, str], now: float
+    ) -> None:
+        """Compare the graph with what is to be offered; create and withdraw proxies accordingly."""
+        # What has a fallback is offered without any server as well.
+        wanted = {**fallbacks, **self.offers}
+        for name in [name for name in self._proxies if name not in wanted]:
+            self._close_proxy(name)
+            log.warning("service %s is withdrawn: no server, and its fallback is gone", name)
+        retry_types = now - self._types_retried_at >= TYPE_RETRY_S
+        if retry_types:
+            self._types_retried_at = now
+        for name, type_name in wanted.items():
+            others = self._servers_in_our_way(name, served.get(name))
+            if others:
+                self._free_since.pop(name, None)
+                self._leave_alone(name, others)
+                continue
+            free_since = self._free_since.setdefault(name, now)
+            if now < self._settled_at or now - free_since < NAME_IS_FREE_S:
+                continue
+            if self._left_alone.pop(name, None):
+                log.info("service %s: no other node serves it any more", name)
+            if name not in self._proxies and (retry_types or name not in self._missing_types):
+                self._open_proxy(name, type_name)
+        self._publish_state()
+
+    def _servers_in_our_way(self, name: ServiceName, served: graph.Served | None) -> frozenset[str]:
+        if served is None:
+            return frozenset()
+        others = served.nodes() - {self._own_node}
+        if name not in self._proxies:
+            return others
+        # Two robot sidecars in one domain that proxied the name at the same moment: the smaller name stays.
+        return frozenset(node for node in others if not graph.is_sidecar(node) or node < self._own_node)
+
+    def _leave_alone(self, name: ServiceName, others: frozenset[str]) -> None:
+        if self._left_alone.get(name) == others:
+            return
+        self._left_alone[name] = others
+        nodes = ", ".join(sorted(others))
+        if self._close_proxy(name):
+            log.warning("service %s is now served by %s on this robot: ours is withdrawn", name, nodes)
+        else:
+            log.warning("service %s is already served by %s on this robot: left alone", name, nodes)
+
+    def _open_proxy(self, name: ServiceName, type_name: str) -> None:
+        try:
+            proxy = ServiceProxy(
+                self._loop.node, name, load_service_type(type_name), self._on_request, self._on_bad_request
+            )
+        except RosBridgeError as error:
+            if name not in self._missing_types:
+                self._missing_types[name] = type_name
+                kind = "type_not_installed" if isinstance(error, TypeNotInstalledError) else "service_refused"
+                self._stats.errors[kind] += 1
+                log.error("service %s is not offered here: %s", name, error)
+            return
+        self._missing_types.pop(name, None)
+        self._proxies[name] = proxy
+        self._loop.set_services(tuple(self._proxies.values()))
+        log.info("service %s (%s) is offered here", name, type_name)
+
+    def _close_proxy(self, name: ServiceName) -> bool:
+        proxy = self._proxies.pop(name, None)
+        if proxy is None:
+            return False
+        self._loop.set_services(tuple(self._proxies.values()))
+        self._on_closed(proxy, proxy.close())
+        return True
+
+    def _publish_state(self) -> None:
+        self._stats.left_alone = {name: tuple(sorted(nodes)) for name, nodes in self._left_alone.items()}
+        self._stats.missing_types = dict(self._missing_types)
+        carried = frozenset(self._proxies)
+        if carried != self._stats.carried:
+            self._stats.carried = carried
+            self._on_carried(carried)
+
+    def close(self) -> None:
+        """Withdraw every proxy."""
+        for name in tuple(self._proxies):
+            self._close_proxy(name)
+        self.offers.clear()
+        self._publish_state()
