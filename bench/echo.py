@@ -77,6 +77,7 @@ def main() -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     serve = commands.add_parser("serve")
     service_server.add_arguments(serve)
+    serve.add_argument("--service", default=SERVICE, metavar="NAME", help="serve it under this name (%(default)s)")
     serve.add_argument("--burden", type=Path, metavar="FILE", help="be as many ms slower as this file says")
     call = commands.add_parser("call")
     robot_client.add_arguments(call, rate_hz=50.0, deadline_ms=500.0)
@@ -85,7 +86,7 @@ def main() -> int:
     options = parser.parse_args()
     if options.command == "serve":
         serving = answer if options.burden is None else Burden(options.burden).answer
-        return service_server.run("echo", DetectPeople, SERVICE, serving, options)
+        return service_server.run("echo", DetectPeople, options.service, serving, options)
     workload = EchoRequests(options.size, options.ask_delay_ms, random.Random(options.seed))
     return robot_client.run("caller", DetectPeople, SERVICE, workload, options)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -28,10 +28,15 @@ if TYPE_CHECKING:
     Clients = Sequence[Remote]
     """Each sends every request, at the same moments; the first answer counts."""
 
+SERVICE = "/echo"
+"""As of `bench.echo`, which needs ROS."""
 PATHS = dict(zip(CARRIERS, ("a", "b"), strict=True))
 """The robot's interface -> the path of the trace behind it."""
 WARM = LinkProfile(delay_ms=20.0, rate_kbps=50_000.0)
 """Both links while everybody starts and finds the others: the same good network for all."""
+FALLBACK = "/echo_here"
+FALLBACK_TAKES = 0.15
+"""Share of the deadline that the robot's own server takes for a request, with a smaller model: 150 ms of 1 s."""
 ZENOH_PORT = 7447
 ZENOH_LEASE_MS = 10_000
 """Its default: TCP below survives what is shorter."""
@@ -45,6 +50,8 @@ class World:
     folder: Path
     """For configurations and logs."""
     traffic: Traffic
+    notes: dict[str, Any] = field(default_factory=dict)
+    """What a contender tells of its run at the end, for the record."""
 
     @property
     def robot(self) -> Host:
@@ -67,6 +74,12 @@ class World:
         if stall["stall_every"]:
             argv += ["--delay-ms", f"{stall['stall_s'] * 1e3:g}", "--delay-every", str(stall["stall_every"])]
         host.popen(argv, env=environment, log_path=self.folder / f"{host.name}.echo.log")
+
+    def start_fallback(self, host: Host) -> None:
+        """Start the robot's own ROS server, which is told how long to compute for the clouds."""
+        delay_ms = max(0.0, FALLBACK_TAKES * self.traffic.deadline_ms - self.traffic.compute_ms)
+        argv = [sys.executable, "-m", "bench.echo", "serve", "--service", FALLBACK, "--delay-ms", f"{delay_ms:g}"]
+        host.popen(argv, log_path=self.folder / f"{host.name}.echo.log")
 
     @contextlib.contextmanager
     def ros_client(self, **environment: str) -> Iterator[Remote]:
@@ -137,17 +150,30 @@ def _zenoh(world: World) -> Iterator[Clients]:
         yield tuple(clients)
 
 
-def _plr(world: World, *, clouds: Sequence[str] = CLOUDS, carriers: Sequence[str] = CARRIERS) -> Iterator[Clients]:
-    service = {"name": "/echo", "deadline_ms": world.traffic.deadline_ms, "idempotent": True}
+def _plr(
+    world: World, *, clouds: Sequence[str] = CLOUDS, carriers: Sequence[str] = CARRIERS, fallback: bool = False
+) -> Iterator[Clients]:
+    service = {"name": SERVICE, "deadline_ms": world.traffic.deadline_ms, "idempotent": True}
+    if fallback:
+        service["fallback"] = FALLBACK
     system = System(world.lab, world.folder)
     try:
         system.start_control_plane()
         for cloud in clouds:
             world.start_ros_server(world.lab.host(cloud))
-            system.start_cloud(cloud, [{"name": "/echo"}])
+            system.start_cloud(cloud, [{"name": SERVICE}])
         system.wait_for_offer(system.start_robot([service], interfaces=carriers))
+        if fallback:
+            world.start_fallback(world.robot)
+            up = f'plr_fallback_up{{service="{SERVICE}"}}'
+            system.wait("the fallback", lambda: system.metrics(ROBOT).get(up) == 1)
         with world.ros_client() as client:
             yield (client,)
+            world.notes["counters"] = {
+                series: value
+                for series, value in system.metrics(ROBOT).items()
+                if series.startswith(("plr_requests_total", "plr_fallback"))
+            }
     finally:
         system.close()
 
@@ -177,6 +203,11 @@ _ALL = (
     Contender("mptcp", "one connection of the kernel's multipath TCP", contextlib.contextmanager(_mptcp)),
     Contender("zenoh", "a zenoh session over each carrier, first reply", contextlib.contextmanager(_zenoh)),
     Contender("plr-replicate", "every request over both carriers, first answer", contextlib.contextmanager(_plr)),
+    Contender(
+        "plr-fallback",
+        "the same, and a slower server on the robot for what the network misses",
+        contextlib.contextmanager(partial(_plr, fallback=True)),
+    ),
     *(_plr_of(interfaces, servers) for interfaces, servers in ((1, 1), (1, 2), (2, 1))),
 )
 CONTENDERS = {contender.name: contender for contender in _ALL}

@@ -42,7 +42,8 @@ def run(scenario: Scenario, contender: Contender, folder: Path, *, seed: int = 1
     traffic = scenario.traffic
     trace = scenario.trace()
     plan = {"size": traffic.request_bytes, "rate_hz": traffic.rate_hz}
-    with Lab(contender.lab(), seed=seed) as lab, contender.start(World(lab, folder, traffic)) as clients:
+    notes: dict[str, Any] = {}
+    with Lab(contender.lab(), seed=seed) as lab, contender.start(World(lab, folder, traffic, notes)) as clients:
         _call(clients, {**plan, "count": max(1, round(WARM_UP_S * traffic.rate_hz))})
         before = {name: lab.link(name).stats(reset=True) for name in contender.carriers}
         pressure = CpuPressure()
@@ -71,6 +72,7 @@ def run(scenario: Scenario, contender: Contender, folder: Path, *, seed: int = 1
             "cpu_pressure": busy,
             "unsent": sum(max(0, scenario.count - len(one.sent_s)) for one in calls),
             "client_late_p99_ms": (quantile(late_s, 0.99) or 0.0) * MS,
+            **notes,
             "links": {name: _conditions(stats) for name, stats in after.items()},
         },
     )
