@@ -87,7 +87,7 @@ def test_two_cloud_sidecars_and_a_robot_in_one_domain(mesh: Mesh) -> None:
         # robot-1 proxies a service of another mesh into the domain of cloud-2, which must not offer it on.
         mesh.robot.handle(OfferService(ServiceName("/elsewhere"), PLAN_TYPE))
         mesh.serve("--plan", "/plan")
-        wait_until(lambda: second_link.carried == {"/plan"}, "the real service")
+        wait_until(lambda: second_link.carried == {"/plan"} and mesh.link.offers, "the real service")
         scans = second_cloud.stats.scans
         wait_until(lambda: second_cloud.stats.scans >= scans + 3, "three looks at the graph")
         assert {offer.name for offer in second_link.offers} == {offer.name for offer in mesh.link.offers} == {"/plan"}
