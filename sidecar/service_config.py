@@ -25,7 +25,7 @@ from sidecar.core.budgets import Budget
 from sidecar.core.fallback_queue import SPARE
 from sidecar.core.fallback_rule import FallbackRule
 from sidecar.core.priority import Priority
-from sidecar.core.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from sidecar.core.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule
 
 if TYPE_CHECKING:
@@ -144,7 +144,8 @@ class ServiceConfig(Section):
     auto: as many as the loss measured on the path asks for. Default auto."""
     redundancy: Annotated[RedundancyMode | None, converted] = None
     """Robot: which of the mapped pairs carry a copy: single (the best), backup (the next one too, when the best is in
-    trouble), hedge (the next one too, when the answer takes long) or replicate (all). Default replicate."""
+    trouble), hedge (the next one too, when the answer takes long), adaptive (further ones, as late as target_miss
+    allows) or replicate (all). Default replicate."""
     hedge_quantile: Annotated[float, Field(ge=MIN_HEDGE_QUANTILE, le=MAX_HEDGE_QUANTILE)] | None = None
     """Robot, with redundancy hedge: the next copy is sent when the answer takes longer than this share of the answers
     did. Default 0.95."""
@@ -154,7 +155,8 @@ class ServiceConfig(Section):
     mode: Annotated[ModeWord | None, converted] = None
     """Robot: most_reliable or cheapest, as long as target_miss is kept. Default most_reliable."""
     target_miss: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Robot, with mode cheapest: the largest predicted probability that a request misses its deadline."""
+    """Robot, with mode cheapest or redundancy adaptive: the largest predicted probability that a request misses its
+    deadline. With mode cheapest required, with redundancy adaptive alone 0.001 by default."""
     exploration: Annotated[float, Field(ge=0, le=MAX_EXPLORATION)] | None = None
     """Robot: share of the requests that may get one more copy over a path that the mapping does not use, to learn how
     good it is; idempotent services only. Default 0.01, at most 0.1."""
@@ -181,6 +183,7 @@ class ServiceConfig(Section):
             deadline_ms = self.deadline_ms or MAX_DEADLINE_MS
             default_ms = min(max(LIFETIME_PER_DEADLINE * deadline_ms, MIN_DEFAULT_LIFETIME_MS), _MAX_LIFETIME_MS)
             lifetime_ms = self.lifetime_ms or default_ms
+        cheapest = self.mode is ModeWord.CHEAPEST
         return ServiceRule(
             pattern=self.name,
             deadline_s=deadline_ms / _MS_PER_S,
@@ -193,8 +196,9 @@ class ServiceConfig(Section):
             capacity=self.capacity_interfaces or _UNLIMITED,
             redundancy=self.redundancy or RedundancyMode.REPLICATE,
             hedge_quantile=self.hedge_quantile or DEFAULT_HEDGE_QUANTILE,
-            copies=self.copies or (AT_MOST_EVERY_INTERFACE if self.target_miss else EVERY_INTERFACE),
-            target_miss=self.target_miss or 0.0,
+            adaptive_target=self.target_miss or DEFAULT_ADAPTIVE_TARGET,
+            copies=self.copies or (AT_MOST_EVERY_INTERFACE if cheapest else EVERY_INTERFACE),
+            target_miss=(self.target_miss or 0.0) if cheapest else 0.0,
             charge=self.cost_per_request or 0.0,
             fallback=self._fallback_rule(),
         )
@@ -219,10 +223,12 @@ class ServiceConfig(Section):
             yield "cost_per_request", "expected on a cloud only: a robot's costs are its networks'"
         if self.mode is ModeWord.CHEAPEST and self.target_miss is None:
             yield "target_miss", "expected a probability beside mode: cheapest, but missing"
-        if self.mode is not ModeWord.CHEAPEST and self.target_miss is not None:
-            yield "target_miss", "expected only beside mode: cheapest"
-        if self.redundancy is RedundancyMode.HEDGE and not self.idempotent:
-            yield "redundancy", "expected hedge beside idempotent: true only, as copies run on several servers"
+        adaptive = self.redundancy is RedundancyMode.ADAPTIVE
+        if self.mode is not ModeWord.CHEAPEST and not adaptive and self.target_miss is not None:
+            yield "target_miss", "expected only beside mode: cheapest or redundancy: adaptive"
+        if self.redundancy is not None and self.redundancy.sends_late and not self.idempotent:
+            word = self.redundancy.value
+            yield "redundancy", f"expected {word} beside idempotent: true only, as copies run on several servers"
         if self.redundancy is not RedundancyMode.HEDGE and self.hedge_quantile is not None:
             yield "hedge_quantile", "expected only beside redundancy: hedge"
         if self.exploration and not self.idempotent:

@@ -6,8 +6,6 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.redundancy_mode import RedundancyMode
-
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.events import RequestId
@@ -61,6 +59,15 @@ class Copy:
     """It was sent to learn, over a path that is not used otherwise: nothing relies on it."""
     hedges: bool = False
     """It was sent since another one took long. It says of its path how it is then only, and is not measured."""
+    forecast_s: float | None = None
+    """How long its answer was expected to take when it was sent."""
+    arrived: int = 0
+    """Symbols of it known to have arrived when it was last looked at ..."""
+    progress_at: float = field(init=False)
+    """... and when that was first seen."""
+
+    def __post_init__(self) -> None:
+        self.progress_at = self.sent_at
 
 
 @dataclass(slots=True)
@@ -140,7 +147,7 @@ class Request:
 
         A single copy has nobody to lose against, unless it may be hedged.
         """
-        hedged = self.rule.redundancy is RedundancyMode.HEDGE
+        hedged = self.rule.redundancy.sends_late
         self.observed = (len(self.copies) < 2 and not hedged) or self.is_race()
 
     def started_together(self) -> list[Copy]:

@@ -9,11 +9,13 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
+from sidecar.core.adaptive import Adaptive
 from sidecar.core.budgets import Budgets
 from sidecar.core.copies import HEDGE_AT, Copy, CopyState, Request
 from sidecar.core.exploration import Exploration
 from sidecar.core.messages import RequestMessage, encode_message
 from sidecar.core.path_id import PathState
+from sidecar.core.path_pace import PathPaces
 from sidecar.core.path_records import PathRecords
 from sidecar.core.redundancy_mode import RedundancyMode
 
@@ -42,6 +44,8 @@ class Dispatching:
         self._parts = parts
         self._exploration = Exploration(parts.mapping, parts.routes, parts.outbox)
         self._records = PathRecords(parts.stats)
+        self._paces = PathPaces(parts.routes, parts.stats)
+        self._adaptive = Adaptive(parts.routes, self._paces)
         self._budgets = Budgets(parts.budgets, parts.stats)
 
     def with_room(self, servers: tuple[NodeName, ...], size: int) -> list[NodeName]:
@@ -50,7 +54,7 @@ class Dispatching:
         return [server for server in servers if has_room(server, size)]
 
     def start(self, request: Request, now: float) -> float | None:
-        """Send the first copies; returns when `hedge` is wanted, if at all."""
+        """Send the first copies; returns when `look_again` is wanted, if at all."""
         rule = request.rule
         servers = self.with_room(self._parts.offers.servers(request.service), len(request.payload or b""))
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
@@ -61,32 +65,40 @@ class Dispatching:
             self._send_best(request, self._best_first(request, chosen, now), now)
         if servers and not request.copies:
             self._parts.seek(frozenset(servers))
-        hedge_at = self._hedge_at(request, now)
+        look_at = self._first_look(request, now)
         unmapped = self._exploration.path(request, servers, now)
         if unmapped is not None:
             self._send(request, unmapped, now, _Why.EXPLORATION)
         request.choose_observation()
-        return hedge_at
+        return look_at
 
     def _send_best(self, request: Request, paths: list[PathId], now: float) -> None:
         while paths and not request.copies:
             self._send(request, paths.pop(0), now, _Why.MAPPED)
         request.withheld = tuple(paths)
-        if request.copies:
+        if request.copies and request.rule.redundancy is not RedundancyMode.ADAPTIVE:
             self.rescue(request, now)
 
     def _best_first(self, request: Request, paths: Iterable[PathId], now: float) -> list[PathId]:
-        """Those that are up first; among them those that missed least lately, then the fastest."""
+        """Those that are up first; among them those that missed least lately, then the fastest.
+
+        With RedundancyMode.ADAPTIVE the fastest at present: what is missed or rescued makes a pair slow as well.
+        """
+        adaptive = request.rule.redundancy is RedundancyMode.ADAPTIVE
 
         def order(path: PathId) -> tuple[bool, float, float]:
             up = self._parts.routes.state(path) is PathState.UP
+            if adaptive:
+                return not up, self._adaptive.expected_s(request, path, now), self._parts.routes.rtt(path)
             return not up, self._records.miss_share(request.service, path, now), self._parts.routes.rtt(path)
 
         return sorted(paths, key=order)
 
-    def _hedge_at(self, request: Request, now: float) -> float | None:
+    def _first_look(self, request: Request, now: float) -> float | None:
         if not request.copies or now >= request.deadline_at or not request.rule.redundancy.helps:
             return None
+        if request.rule.redundancy is RedundancyMode.ADAPTIVE:
+            return self._adapt(request, now)
         half = request.submitted_at + HEDGE_AT * request.rule.deadline_s
         if request.rule.redundancy is RedundancyMode.HEDGE:
             path, quantile = request.copies[0].path, request.rule.hedge_quantile
@@ -94,22 +106,47 @@ class Dispatching:
             return half if delay_s is None else min(now + delay_s, half)
         return half if request.rule.idempotent and len(request.asked()) == 1 else None
 
-    def hedge(self, request: Request, now: float) -> None:
-        """The moment that `start` named has come: send another copy if that promises anything.
+    def _adapt(self, request: Request, now: float) -> float | None:
+        """Send further copies as the target asks for; returns when to look again, None if that has no sense."""
+        while True:
+            miss = self._adaptive.miss_probability(request, now)
+            path = self._next_over_another_interface(request)
+            if path is None or not self._adaptive.needs(request, path, miss, now):
+                break
+            if not self._send(request, path, now, _Why.HEDGE):
+                return None  # no budget: to ask for it again and again would only count as so many refusals
+        if path is None and now >= request.submitted_at + HEDGE_AT * request.rule.deadline_s:
+            self._ask_another_server(request, now)
+        look_at = self._adaptive.next_look(request, now)
+        return look_at if look_at < request.deadline_at else None
+
+    def look_again(self, request: Request, now: float) -> float | None:
+        """The moment that `start` or the last call named has come; returns when to look once more."""
+        if request.done or request.answered_here or not request.relied_on():
+            return None
+        if request.rule.redundancy is RedundancyMode.ADAPTIVE:
+            return self._adapt(request, now)
+        self._hedge(request, now)
+        return None
+
+    def _hedge(self, request: Request, now: float) -> None:
+        """Send another copy if that promises anything.
 
         With RedundancyMode.HEDGE, over another interface. Else, and where there is none, to another server if the only
         one asked has the request and is silent: it may have died unnoticed. Not over the same interface when the
         request has not arrived: then the path is slow, which another copy would only make worse.
         """
         waiting = request.relied_on()
-        if request.done or request.answered_here or not waiting:
-            return
         if request.rule.redundancy is RedundancyMode.HEDGE:
             path = self._next_withheld(request)
             if path is not None and path.interface != waiting[0].path.interface:
                 if len(waiting) == 1:
                     self._send(request, path, now, _Why.HEDGE)
                 return
+        self._ask_another_server(request, now)
+
+    def _ask_another_server(self, request: Request, now: float) -> None:
+        """Also over the same interface, if the only server asked has the request and is silent."""
         if request.rule.idempotent and request.waits_for_one_server():
             self.rescue(request, now, insist=True)
 
@@ -122,11 +159,20 @@ class Dispatching:
         waiting = request.relied_on()
         if request.answered_here or (waiting and not request.rule.redundancy.helps):
             return
+        alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
+        if alive and not insist and request.rule.redundancy is RedundancyMode.ADAPTIVE:
+            self._adapt(request, now)
+            return
         if not insist and any(routes.state(copy.path) is PathState.UP for copy in waiting):
             return
         path = self._next_withheld(request) or self._elsewhere(request, rejected=rejected)
         if path is not None:
             self._send(request, path, now, _Why.TROUBLE)
+
+    def _next_over_another_interface(self, request: Request) -> PathId | None:
+        used = {copy.path.interface for copy in request.relied_on()}
+        path = self._next_withheld(request)
+        return None if path is None or path.interface in used else path
 
     def _next_withheld(self, request: Request) -> PathId | None:
         """The best path that is up of those its mapping names and that carry no copy, to a server that may run it."""
@@ -144,6 +190,11 @@ class Dispatching:
             return None
         servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=rejected)
         return self._parts.mapping.rescue(self.with_room(servers, len(request.payload or b"")))
+
+    def answered(self, request: Request, copy: Copy, processing_s: float, now: float) -> None:
+        """A copy was answered. After the deadline it had to wait for what is fresh, so its pace means nothing."""
+        latency_s = min(now - copy.sent_at, request.rule.deadline_s)
+        self._paces.answered(request.service, copy.path, latency_s, processing_s, now)
 
     def ended(self, request: Request, now: float) -> None:
         """What became of the copies is known, or the deadline is over. Called once for each request."""

@@ -6,6 +6,8 @@ import enum
 
 DEFAULT_HEDGE_QUANTILE = 0.95
 """As in The Tail at Scale (Dean and Barroso 2013): about 5 % more load."""
+DEFAULT_ADAPTIVE_TARGET = 0.001
+"""One request in a thousand may miss, as far as a second copy can prevent it."""
 
 
 class RedundancyMode(enum.Enum):
@@ -17,8 +19,15 @@ class RedundancyMode(enum.Enum):
     """The same, and the next pair as soon as the best one's path is unstable or down, or loses the request."""
     HEDGE = "hedge"
     """The same, and the next pair when the answer takes longer than it mostly does (a hedged request)."""
+    ADAPTIVE = "adaptive"
+    """Over the best mapped pair; others as late as keeps the target miss probability (`adaptive.py`)."""
     REPLICATE = "replicate"
     """Over every mapped pair at once (paper, section IV)."""
+
+    @property
+    def sends_late(self) -> bool:
+        """Whether another copy goes out since the first is, or may be, slow."""
+        return self in (RedundancyMode.HEDGE, RedundancyMode.ADAPTIVE)
 
     @property
     def helps(self) -> bool:

@@ -113,9 +113,11 @@ class RequestTable:
         return None
 
     def _dispatch(self, request: Request, now: float) -> None:
-        hedge_at = self._dispatching.start(request, now)
-        if hedge_at is not None:
-            heapq.heappush(self._timers, (hedge_at, request.id))
+        self._look_at(request, self._dispatching.start(request, now))
+
+    def _look_at(self, request: Request, when: float | None) -> None:
+        if when is not None:
+            heapq.heappush(self._timers, (when, request.id))
 
     # -- the peers ------------------------------------------------------------------------------------------------
 
@@ -132,6 +134,7 @@ class RequestTable:
         copy.in_time = copy.state is CopyState.PENDING and now <= request.deadline_at
         copy.state = CopyState.ANSWERED
         copy.ended_at = now
+        self._dispatching.answered(request, copy, response.processing_s, now)
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
         self._parts.outbox.on_answered(copy.message)
         if measure:
@@ -140,9 +143,10 @@ class RequestTable:
             self._parts.stats.duplicate_responses += 1
         else:
             self._deliver(request, copy, response, now)
-            if not request.observed:
+            losers = [copy for copy in request.pending() if copy.hedges or not request.observed]
+            if losers:
                 small = len(response.payload) <= SMALL_ANSWER_BYTES
-                self._calling_off.call_off(request, request.pending(), now, untold=server if small else None)
+                self._calling_off.call_off(request, losers, now, untold=server if small else None)
         self._settle(request, now)
 
     def _deliver(self, request: Request, copy: Copy, response: ResponseMessage, now: float) -> None:
@@ -264,7 +268,7 @@ class RequestTable:
                 self._expire(request, now)
                 continue
             if now < request.deadline_at:
-                self._dispatching.hedge(request, now)
+                self._look_at(request, self._dispatching.look_again(request, now))
                 continue
             heapq.heappush(self._timers, (request.expires_at, request_id))
             self._measure(request, now)

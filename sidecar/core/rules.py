@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from protos.preferences import EVERY_INTERFACE, Copies
 from sidecar.core.priority import Priority
-from sidecar.core.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from sidecar.core.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,6 +65,8 @@ class ServiceRule:
     """Robot: which of the mapped pairs carry a copy, and when."""
     hedge_quantile: float = DEFAULT_HEDGE_QUANTILE
     """Robot, with RedundancyMode.HEDGE: the share of first copies that is waited for."""
+    adaptive_target: float = DEFAULT_ADAPTIVE_TARGET
+    """Robot, with RedundancyMode.ADAPTIVE: the probability to miss the deadline that further copies are to keep."""
     copies: Copies = EVERY_INTERFACE
     """Robot: how many copies of a request the control plane may map."""
     target_miss: float = 0.0

@@ -89,22 +89,26 @@ def outcome(mesh: Mesh, robot: Node, before: int) -> Outcome:
 
 
 def test_each_mode_misses_less_than_the_cheaper_one() -> None:
-    single, backup, hedge, replicate = (drive(mode).misses for mode in RedundancyMode)
+    single, backup, hedge, adaptive, replicate = (drive(mode).misses for mode in RedundancyMode)
     assert single >= 3, "there is something to avoid"
     assert single > backup >= hedge
     assert single - hedge >= 0.9 * (single - replicate)
+    assert single > adaptive
 
 
 def test_hedges_cost_little() -> None:
-    single, backup, hedge, replicate = (drive(mode) for mode in RedundancyMode)
+    single, backup, hedge, adaptive, replicate = (drive(mode) for mode in RedundancyMode)
     assert single.extra <= 0.02, "exploration only"
     assert backup.extra < hedge.extra < 0.2
     assert replicate.extra == pytest.approx(1.0, abs=0.02), "beside a few sent in trouble"
     assert hedge.carried < 1.2 * single.carried
+    assert adaptive.carried < 1.25 * single.carried
     assert replicate.carried > 1.6 * single.carried
 
 
-@pytest.mark.parametrize(("mode", "spent"), [(RedundancyMode.HEDGE, 0.03), (RedundancyMode.REPLICATE, 0.08)])
+@pytest.mark.parametrize(
+    ("mode", "spent"), [(RedundancyMode.HEDGE, 0.03), (RedundancyMode.ADAPTIVE, 0.03), (RedundancyMode.REPLICATE, 0.08)]
+)
 def test_a_budget_is_used_and_never_exceeded(mode: RedundancyMode, spent: float) -> None:
     limited = drive(mode, budget=Budget("w*", extra_load=0.05))
     # Either interface may spend 5 % of all that was answered in time.

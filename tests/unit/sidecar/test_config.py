@@ -146,6 +146,11 @@ def test_how_many_copies_are_sent_and_when() -> None:
     changed = with_service(ROBOT, idempotent=True, redundancy="hedge", hedge_quantile=0.9)
     (rule,) = parse(changed).service_rules()
     assert (rule.redundancy, rule.hedge_quantile) == (RedundancyMode.HEDGE, 0.9)
+    assert rule.adaptive_target == 0.001
+    changed = with_service(ROBOT, idempotent=True, redundancy="adaptive", target_miss=0.01)
+    (rule,) = parse(changed).service_rules()
+    assert (rule.redundancy, rule.adaptive_target) == (RedundancyMode.ADAPTIVE, 0.01)
+    assert (rule.copies, rule.target_miss) == (EVERY_INTERFACE, 0.0), "it says nothing of the mapping"
 
 
 def test_what_extra_copies_may_cost() -> None:
@@ -222,11 +227,12 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(CLOUD, copies=2), "services[0].copies", "on a robot only"),
     (with_service(ROBOT, mode="cheap"), "services[0].mode", "expected 'most_reliable' or 'cheapest'"),
     (with_service(ROBOT, mode="cheapest"), "services[0].target_miss", "beside mode: cheapest, but missing"),
-    (with_service(ROBOT, target_miss=0.1), "services[0].target_miss", "only beside mode: cheapest"),
+    (with_service(ROBOT, target_miss=0.1), "services[0].target_miss", "only beside mode: cheapest or"),
     (with_service(ROBOT, mode="cheapest", target_miss=0), "services[0].target_miss", "greater than 0"),
     (with_service(ROBOT, mode="cheapest", target_miss=1.0), "services[0].target_miss", "less than 1"),
-    (with_service(ROBOT, redundancy="all"), "services[0].redundancy", "'single', 'backup', 'hedge' or 'replicate'"),
+    (with_service(ROBOT, redundancy="all"), "services[0].redundancy", "'hedge', 'adaptive' or 'replicate'"),
     (with_service(ROBOT, redundancy="hedge"), "services[0].redundancy", "beside idempotent: true only"),
+    (with_service(ROBOT, redundancy="adaptive"), "services[0].redundancy", "expected adaptive beside idempotent: true"),
     (with_service(CLOUD, redundancy="single"), "services[0].redundancy", "on a robot only"),
     (with_service(ROBOT, hedge_quantile=0.9), "services[0].hedge_quantile", "only beside redundancy: hedge"),
     (with_service(ROBOT, hedge_quantile=1), "services[0].hedge_quantile", "0.99"),
