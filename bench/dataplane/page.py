@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 VERDICTS = {True: "met", False: "missed", None: "not measured"}
 
-_STYLE = """
+STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 62rem; padding: 0 1rem; color: #1b1f24; }
 table { border-collapse: collapse; margin: 1rem 0; }
 caption { text-align: left; font-weight: 600; padding: .3rem 0; }
@@ -37,7 +37,7 @@ def render(report: Report) -> str:
     sections = "".join(_section(report.titles[name], findings) for name, findings in report.sections.items())
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>FogROS2-PLR data plane</title>'
-        f"<style>{_STYLE}</style></head><body><h1>FogROS2-PLR: data plane</h1>"
+        f"<style>{STYLE}</style></head><body><h1>FogROS2-PLR: data plane</h1>"
         f'<p class="note">{html.escape(how)}; {html.escape(machine)}</p>{_verdicts(report.figures)}{sections}'
         "</body></html>\n"
     )
@@ -67,13 +67,14 @@ def _verdicts(figures: dict[str, Figure]) -> str:
 
 def _section(title: str, findings: Findings) -> str:
     parts = [f"<h2>{html.escape(title)}</h2>"]
-    parts += [_table(table) for table in findings.tables]
+    parts += [table_as_html(table) for table in findings.tables]
     parts += [_image(plot) for plot in findings.plots]
     parts += [f'<p class="note">{html.escape(note)}</p>' for note in findings.notes]
     return "".join(parts)
 
 
-def _table(table: Table) -> str:
+def table_as_html(table: Table) -> str:
+    """One table, its title as the caption."""
     heads = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
     rows = "".join(
         "<tr>" + "".join(f"<td>{html.escape(text_of(cell))}</td>" for cell in row) + "</tr>" for row in table.rows

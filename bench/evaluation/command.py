@@ -16,10 +16,12 @@ from rich.console import Console
 from bench.dataplane.command import rich_table
 from bench.dataplane.report import machine
 from bench.dataplane.section import Figure, Table
+from bench.evaluation import page
 from bench.evaluation.comparison import compare, gains
 from bench.evaluation.contenders import CONTENDERS
 from bench.evaluation.ideal import IDEALS, compute
 from bench.evaluation.outcome import Outcome
+from bench.evaluation.redundancy_costs import ModeCost, mode_costs
 from bench.evaluation.runner import run as run_in_lab
 from bench.evaluation.scenario import Scenario, read_scenarios
 from bench.netlab import LabConfigError
@@ -28,7 +30,7 @@ from protos.errors import ConfigError
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 RUNS = "evaluation"
 """Folder of the records, within that of the reports."""
@@ -46,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--contender",
         action="append",
         choices=names,
-        help="this one; may be repeated (default: all but those like plr-1x1)",
+        help="this one; may be repeated (default: all but plr-1x1 and the like, and those with a budget)",
     )
     parser.add_argument("--traces", type=Path, help="folder of recorded traces; default: made-up scenarios alone")
     parser.add_argument("--seconds", type=float, help="shorten every window to so much")
@@ -90,8 +92,11 @@ def run(options: argparse.Namespace) -> int:
         except ValueError as error:
             print(error, file=sys.stderr)
             return 2
-        console.print(rich_table(_table(scenario, outcomes)))
+        console.print(rich_table(_table(scenario.name, outcomes)))
         _write(options.out, outcomes, failed)
+    costs = mode_costs(outcomes)
+    if costs:
+        console.print(rich_table(_costs_table(costs)))
     for text in failed:
         console.print(f"failed: {text}")
     return 1 if failed or (void and not options.quick) else 0
@@ -118,18 +123,38 @@ def _run(scenario: Scenario, contender: str, keep_logs: Path | None) -> Outcome:
         return run_in_lab(scenario, CONTENDERS[contender], folder)
 
 
-def _table(scenario: Scenario, outcomes: Sequence[Outcome]) -> Table:
+def _table(scenario: str, outcomes: Sequence[Outcome]) -> Table:
     rows: list[tuple[str | Figure, ...]] = []
+    title = scenario
     for outcome in outcomes:
-        if outcome.scenario == scenario.name:
+        if outcome.scenario == scenario:
             figures = outcome.figures()
             kilobytes = None if figures.bytes_per_request is None else figures.bytes_per_request / 1e3
             shares = (f"{figures.miss_ratio:.1%}", f"{figures.unanswered_ratio:.1%}")
             latencies = (figures.mean_ms, figures.p50_ms, figures.p99_ms)
             void = "void" if outcome.disturbances else ""
             rows.append((outcome.contender, *shares, *latencies, kilobytes, void))
-    title = f"{scenario.name}: {scenario.count} requests, deadline {scenario.traffic.deadline_ms:g} ms"
+            title = f"{scenario}: {figures.requests} requests, deadline {outcome.deadline_ms:g} ms"
     return Table(title, _COLUMNS, tuple(rows))
+
+
+def _costs_table(costs: Mapping[str, ModeCost]) -> Table:
+    rows = tuple(
+        (
+            name,
+            cost.windows,
+            f"{cost.miss_ratio:.1%}",
+            cost.bytes_per_request / 1e3,
+            None if cost.avoided is None else f"{cost.avoided:.1%}",
+            f"{cost.extra_bytes:+.1%}",
+        )
+        for name, cost in costs.items()
+    )
+    return Table(
+        "redundancy modes, over the windows where direct-a, direct-b, plr-single and plr-replicate ran",
+        page.COLUMNS,
+        rows,
+    )
 
 
 def _write(folder: Path, outcomes: Sequence[Outcome], failed: Sequence[str]) -> None:
@@ -146,5 +171,9 @@ def _write(folder: Path, outcomes: Sequence[Outcome], failed: Sequence[str]) -> 
             "void": list(outcome.disturbances),
         }
     medians = {name: asdict(gain) for name, gain in gains(outcomes).items()}
-    report = {"gains": medians, "runs": runs, "failed": list(failed), "machine": machine()}
+    costs = mode_costs(outcomes)
+    modes = {name: asdict(cost) for name, cost in costs.items()}
+    tables = [_table(name, outcomes) for name in runs]
+    (folder / "evaluation.html").write_text(page.render(costs, _costs_table(costs), tables), encoding="utf-8")
+    report = {"gains": medians, "redundancy_modes": modes, "runs": runs, "failed": list(failed), "machine": machine()}
     (folder / "evaluation.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")

@@ -37,6 +37,8 @@ WARM = LinkProfile(delay_ms=20.0, rate_kbps=50_000.0)
 FALLBACK = "/echo_here"
 FALLBACK_TAKES = 0.15
 """Share of the deadline that the robot's own server takes for a request, with a smaller model: 150 ms of 1 s."""
+BUDGET = 0.1
+"""Of an interface, for the contenders that have one."""
 ZENOH_PORT = 7447
 ZENOH_LEASE_MS = 10_000
 """Its default: TCP below survives what is shorter."""
@@ -103,7 +105,7 @@ class Contender:
     carriers: tuple[str, ...] = CARRIERS
     """Interfaces that the robot has."""
     ablation: bool = False
-    """Ours with less of something: run when asked for by name alone."""
+    """Ours with less of something: run only when asked for by name."""
 
     def lab(self) -> LabConfig:
         """The lab that it needs."""
@@ -151,18 +153,32 @@ def _zenoh(world: World) -> Iterator[Clients]:
 
 
 def _plr(
-    world: World, *, clouds: Sequence[str] = CLOUDS, carriers: Sequence[str] = CARRIERS, fallback: bool = False
+    world: World,
+    *,
+    clouds: Sequence[str] = CLOUDS,
+    carriers: Sequence[str] = CARRIERS,
+    fallback: bool = False,
+    redundancy: str = "replicate",
+    extra_load: float | None = None,
 ) -> Iterator[Clients]:
-    service = {"name": SERVICE, "deadline_ms": world.traffic.deadline_ms, "idempotent": True}
+    service = {
+        "name": SERVICE,
+        "deadline_ms": world.traffic.deadline_ms,
+        "idempotent": True,
+        "redundancy": redundancy,
+    }
     if fallback:
         service["fallback"] = FALLBACK
+    networks: dict[str, Any] = (
+        {"networks": [{"interface": "*", "extra_load": extra_load}]} if extra_load is not None else {}
+    )
     system = System(world.lab, world.folder)
     try:
         system.start_control_plane()
         for cloud in clouds:
             world.start_ros_server(world.lab.host(cloud))
             system.start_cloud(cloud, [{"name": SERVICE}])
-        system.wait_for_offer(system.start_robot([service], interfaces=carriers))
+        system.wait_for_offer(system.start_robot([service], interfaces=carriers, **networks))
         if fallback:
             world.start_fallback(world.robot)
             up = f'plr_fallback_up{{service="{SERVICE}"}}'
@@ -198,16 +214,31 @@ def _plr_of(interfaces: int, servers: int) -> Contender:
     )
 
 
+def _plr_in(redundancy: str, about: str) -> Contender:
+    start = contextlib.contextmanager(partial(_plr, redundancy=redundancy))
+    return Contender(f"plr-{redundancy}", f"ours: {about}", start)
+
+
+def _plr_within_budget(redundancy: str) -> Contender:
+    start = contextlib.contextmanager(partial(_plr, redundancy=redundancy, extra_load=BUDGET))
+    about = f"plr-{redundancy}, further copies at most {BUDGET:.0%} of what was answered on each carrier"
+    return Contender(f"plr-{redundancy}-{BUDGET:.0%}", about, start, ablation=True)
+
+
 _ALL = (
     *(_direct_over(name, carrier) for carrier, name in PATHS.items()),
     Contender("mptcp", "one connection of the kernel's multipath TCP", contextlib.contextmanager(_mptcp)),
     Contender("zenoh", "a zenoh session over each carrier, first reply", contextlib.contextmanager(_zenoh)),
-    Contender("plr-replicate", "every request over both carriers, first answer", contextlib.contextmanager(_plr)),
+    _plr_in("replicate", "every request over both carriers, first answer"),
+    _plr_in("adaptive", "a second copy as late as the target miss probability allows"),
+    _plr_in("hedge", "a second copy when the answer takes longer than 95 % did"),
+    _plr_in("single", "every request over the better carrier alone"),
     Contender(
         "plr-fallback",
-        "the same, and a slower server on the robot for what the network misses",
+        "plr-replicate, and a slower server on the robot for what the network misses",
         contextlib.contextmanager(partial(_plr, fallback=True)),
     ),
+    *(_plr_within_budget(redundancy) for redundancy in ("adaptive", "hedge")),
     *(_plr_of(interfaces, servers) for interfaces, servers in ((1, 1), (1, 2), (2, 1))),
 )
 CONTENDERS = {contender.name: contender for contender in _ALL}

@@ -1,0 +1,68 @@
+"""What each redundancy mode avoids and costs: misses against bytes, over the windows in which all that it takes ran."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from bench.evaluation.comparison import DIRECT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from bench.evaluation.outcome import Figures, Outcome
+
+CHEAPEST, SUREST = "plr-single", "plr-replicate"
+MODES = (CHEAPEST, "plr-hedge-10%", "plr-hedge", "plr-adaptive-10%", "plr-adaptive", SUREST)
+
+
+@dataclass(frozen=True, slots=True)
+class ModeCost:
+    """One mode, over all windows in which it ran beside both direct runs, `single` and `replicate`."""
+
+    windows: int
+    miss_ratio: float
+    bytes_per_request: float
+    avoided: float | None
+    """Misses of the better direct run of each window that it avoids, as a share of those that `replicate` avoids; None:
+    there are none."""
+    extra_bytes: float
+    """Bytes beyond those of `single`, as a share of them."""
+
+
+def mode_costs(outcomes: Iterable[Outcome]) -> dict[str, ModeCost]:
+    """Mode -> cost, of runs that are not void."""
+    windows: dict[str, dict[str, Figures]] = {}
+    for outcome in outcomes:
+        if not outcome.disturbances:
+            windows.setdefault(outcome.scenario, {})[outcome.contender] = outcome.figures()
+    needed = {*DIRECT, CHEAPEST, SUREST}
+    complete = [window for window in windows.values() if needed <= window.keys()]
+    found = {mode: _cost(mode, [window for window in complete if mode in window]) for mode in MODES}
+    return {mode: cost for mode, cost in found.items() if cost is not None}
+
+
+def _cost(mode: str, windows: list[dict[str, Figures]]) -> ModeCost | None:
+    sent = sum(_bytes(window[mode]) for window in windows)
+    least = sum(_bytes(window[CHEAPEST]) for window in windows)
+    if not least:
+        return None
+    requests = sum(window[mode].requests for window in windows)
+    misses = sum(_misses(window[mode]) for window in windows)
+    alone = sum(min(_misses(window[direct]) for direct in DIRECT) for window in windows)
+    avoidable = alone - sum(_misses(window[SUREST]) for window in windows)
+    return ModeCost(
+        windows=len(windows),
+        miss_ratio=misses / requests,
+        bytes_per_request=sent / requests,
+        avoided=(alone - misses) / avoidable if avoidable > 0 else None,
+        extra_bytes=sent / least - 1.0,
+    )
+
+
+def _misses(figures: Figures) -> float:
+    return figures.miss_ratio * figures.requests
+
+
+def _bytes(figures: Figures) -> float:
+    return (figures.bytes_per_request or 0.0) * figures.requests
