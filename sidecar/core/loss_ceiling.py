@@ -1,14 +1,16 @@
 """A ceiling on the bytes in flight of one path, cut by losses that mean congestion.
 
 Radio links lose datagrams without being full, so a loss alone says nothing. Congestion is a loss while a queue stands,
-when such losses are clearly more frequent than those without a queue; and heavy loss in any case. The ceiling then
-falls and grows again as CUBIC's window does (RFC 9438), so that TCP at the same bottleneck keeps its share.
+when such losses are clearly more frequent than those without one; where there are hardly any without one, a single
+loss that met a full queue; and heavy loss in any case. The ceiling then falls and grows again as CUBIC's window does
+(RFC 9438), so that TCP at the same bottleneck keeps its share.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sidecar.core.standing_queue import StandingQueue
 from sidecar.core.units import DATAGRAM_BYTES
 
 if TYPE_CHECKING:
@@ -22,9 +24,12 @@ LEAST_BYTES = 4 * DATAGRAM_BYTES
 SIGNIFICANT = 2.0
 """A queue's losses are congestion when they are this many times as frequent as those without a queue."""
 UNUSUAL = 0.005
-"""Less than this share lost without a queue is as good as nothing."""
+"""Where less than this share is lost without a queue, a single loss is congestion if it met a full queue. Else the
+losses that a radio has now and then would cut again and again wherever the route becomes longer for a while."""
 MEMORY_BYTES = 500 * DATAGRAM_BYTES
 """Over how much the frequency of losses without a queue is measured."""
+MEMORY_S = 10.0
+"""... and how long it is known where a queue always stands, whose own losses would pass for usual if that was wrong."""
 HEAVY_LOSS = 0.2
 HEAVY_BYTES = 8 * DATAGRAM_BYTES
 """Losing this share and this much of what was sent of late is congestion even without a queue: a policer, a tiny
@@ -38,13 +43,6 @@ RECENT_BYTES = 64 * DATAGRAM_BYTES
 REGAIN = 1.25
 """A ceiling that binds grows this much with each round that neither met a queue nor lost more than usual. It need not
 find where the path ends: the model of the path, whose rate is what was delivered, sees to that."""
-QUEUE_FACTOR = 0.2
-"""A round trip that is longer than the floor by this share, and by more than it varies, shows a queue."""
-VARIATIONS = 2.5
-QUEUE_S = 0.001
-FLOOR_MEMORY_S = 60.0
-"""How long the least round trip counts as the floor. Longer than the minimum that sets the window: the queue of a TCP
-flow that never drains raises that one, and its losses must still be seen as a queue's."""
 
 
 class LossCeiling:
@@ -53,11 +51,10 @@ class LossCeiling:
     __slots__ = (
         "_acked",
         "_at",
-        "_floor_at",
-        "_floor_s",
         "_lost",
         "_most_before",
         "_most_in_flight",
+        "_queue",
         "_queue_before",
         "_queue_cut",
         "_queued",
@@ -66,6 +63,8 @@ class LossCeiling:
         "_regained_at",
         "_start",
         "_top",
+        "_unclear",
+        "_usual_at",
         "_usual_bytes",
         "_usual_lost",
         "bytes",
@@ -86,10 +85,14 @@ class LossCeiling:
         """Whether the last cut was for losses while a queue stood."""
         self._queued = False
         self._queue_before = False
+        self._unclear = True
+        """Whether what this round loses says nothing of what is usual: a cut was made for it; or it is the first,
+        which sends a burst into a path of which nothing is known."""
         self._usual_bytes = 0.0
         self._usual_lost = 0.0
-        self._floor_s = float("inf")
-        self._floor_at = 0.0
+        self._usual_at = 0.0
+        """When these two were last added to."""
+        self._queue = StandingQueue()
 
     def on_sent(self, in_flight: int) -> None:
         """So many bytes are in flight."""
@@ -100,13 +103,9 @@ class LossCeiling:
         self._acked += size
         self._note_recent(size)
         if rtt_s:
-            if rtt_s <= self._floor_s:
-                if rtt_s < self._floor_s - self._short_s:
-                    self._usual_bytes = self._usual_lost = 0.0  # learnt with others' queue taken for none
-                self._floor_s, self._floor_at = rtt_s, now
-            elif now - self._floor_at > FLOOR_MEMORY_S:
-                self._floor_s, self._floor_at = rtt.minimum, now
-            self._queued |= rtt_s - self._floor_s > max(self._short_s, VARIATIONS * rtt.variation)
+            if self._queue.note(rtt_s, rtt, now):
+                self._usual_bytes = self._usual_lost = 0.0  # learnt with others' queue taken for none
+            self._queued |= self._queue.is_met_by(rtt_s, rtt)
         if self.bytes is not None:
             self.bytes = self._grown(now - self._at, rtt.smoothed)
             if self.bytes > 2 * max(wanted, self._top):
@@ -119,9 +118,10 @@ class LossCeiling:
         self._recent_lost += size
         if sent_at <= self._at:
             return False  # it left before the last cut could help (RFC 9002 section 7.3.2)
-        queue = self._queue_stands(rtt) and self._is_unusual()
+        queue = self._queue.stands(rtt) and self._is_unusual(full=self._queue.is_full(rtt))
         if not queue and not self._is_heavy():
             return False
+        self._unclear = True
         self._queue_cut = queue
         before = float(max(in_flight + size, self._most_in_flight))
         if self.bytes is not None:
@@ -135,15 +135,18 @@ class LossCeiling:
 
     def end_round(self, rtt: RttEstimator, now: float) -> None:
         """A round trip is over. What it lost while no datagram met a queue, nor in the one before, is usual."""
-        if not self._queued and not self._queue_before and not self._is_heavy():
+        if not self._queued and not self._queue_before and not self._unclear and not self._is_heavy():
             self._regain(rtt, now)
+            self._usual_at = now
             if self._usual_bytes > MEMORY_BYTES:
                 self._usual_bytes /= 2
                 self._usual_lost /= 2
             self._usual_bytes += self._acked + self._lost
             self._usual_lost += self._lost
+        elif now - self._usual_at > MEMORY_S:
+            self._usual_bytes = self._usual_lost = 0.0
         self._queue_before = self._queued
-        self._queued = False
+        self._queued = self._unclear = False
         self._acked = self._lost = 0
         self._most_before, self._most_in_flight = self._most_in_flight, 0
 
@@ -178,21 +181,12 @@ class LossCeiling:
         reno = start + 3 * (1 - CUT) / (1 + CUT) * elapsed_s / max(rtt_s, 0.001)
         return float(max(cubic, reno, start)) * DATAGRAM_BYTES
 
-    def _queue_stands(self, rtt: RttEstimator) -> bool:
-        """Whether there is a queue, whosever, and not only for a moment."""
-        excess_s = min(rtt.smoothed, rtt.latest) - self._floor_s
-        return excess_s > max(self._short_s, VARIATIONS * rtt.variation)
-
-    @property
-    def _short_s(self) -> float:
-        """What a queue shorter than this is taken for none."""
-        return max(QUEUE_FACTOR * self._floor_s, QUEUE_S)
-
     def _is_heavy(self) -> bool:
         return self._recent_lost > max(HEAVY_LOSS * self._recent, HEAVY_BYTES)
 
-    def _is_unusual(self) -> bool:
-        if self._usual_lost <= UNUSUAL * self._usual_bytes:
+    def _is_unusual(self, *, full: bool) -> bool:
+        """Whether more was lost of late than without a queue; `full`: whether the last loss met a full one."""
+        if full and self._usual_lost <= UNUSUAL * self._usual_bytes:
             return True
-        usual = self._usual_lost / self._usual_bytes * self._recent
+        usual = self._usual_lost / max(self._usual_bytes, self._recent) * self._recent
         return self._recent_lost > SIGNIFICANT * (usual + DATAGRAM_BYTES)

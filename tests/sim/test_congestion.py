@@ -40,9 +40,12 @@ def test_bulk_fills_the_path_whatever_it_loses_at_random(
 
 
 @pytest.mark.parametrize("other", ["reno", "cubic"])
-@pytest.mark.parametrize("buffer", [0.5, 4.0])
-def test_tcp_and_we_leave_each_other_a_share(buffer: float, other: str) -> None:
-    assert 0.25 <= share(20 * MBIT, 0.040, buffer, other) <= 4.0
+@pytest.mark.parametrize(
+    ("rate", "rtt_s", "buffer"),
+    [(20 * MBIT, 0.040, 0.5), (20 * MBIT, 0.040, 4.0), (5 * MBIT, 0.060, 0.5), (2 * MBIT, 0.050, 1.0)],
+)
+def test_tcp_and_we_leave_each_other_a_share(rate: float, rtt_s: float, buffer: float, other: str) -> None:
+    assert 0.25 <= share(rate, rtt_s, buffer, other) <= 4.0
 
 
 @pytest.mark.parametrize("buffer", [0.5, 4.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from typing import TYPE_CHECKING
 
 import pytest
@@ -25,8 +26,8 @@ class World:
         self.robot: Node = self.mesh.robot("wlan0", rules=(rule(**rules),))
         cloud = self.mesh.cloud("cloud-a")
         self.mesh.push_views()
-        self.up, down = self.mesh.both_ways("robot.wlan0", "cloud-a.eth0")
-        for wire in (self.up, down):
+        self.up, self.down = self.mesh.both_ways("robot.wlan0", "cloud-a.eth0")
+        for wire in (self.up, self.down):
             wire.delay_s, wire.bytes_per_s = delay_s, rate
         complete = cloud.engine.complete
 
@@ -42,14 +43,14 @@ class World:
         (path,) = link._paths.values()
         return path.control
 
-    def request(self, size: int, seconds: float) -> list[RequestId]:
-        """Send requests at HZ for so long; forgets the longest wait in the network before."""
+    def request(self, size: int, seconds: float, hz: int = HZ) -> list[RequestId]:
+        """Send requests at that rate for so long; forgets the longest wait in the network before."""
         self.up.longest_wait_s = 0.0
         ids = []
-        for _ in range(int(seconds * HZ)):
+        for _ in range(int(seconds * hz)):
             self.mesh.calls += 1
             ids.append(self.robot.submit(self.mesh.calls.to_bytes(4, "big") + bytes(size)))
-            self.mesh.run(1 / HZ)
+            self.mesh.run(1 / hz)
         return ids
 
     def elapsed(self, ids: list[RequestId]) -> list[float]:
@@ -140,3 +141,22 @@ def test_losing_all_that_is_in_flight_does_not_stall_the_path() -> None:
     world.mesh.run(2.0)
     assert world.elapsed(ids)
     assert max(world.elapsed(ids)) < 0.6
+
+
+def test_a_route_that_gets_longer_for_a_while_and_a_radio_that_loses_some_are_no_congestion() -> None:
+    size, usual_s = 120_000, 0.025
+    world = World(20 * MBIT, usual_s, deadline_s=1.0)
+    rng = random.Random(1)
+    world.request(size, 2.0)
+    later = []
+    for _ in range(15):
+        for wire in (world.up, world.down):
+            wire.delay_s, wire.loss = usual_s * rng.uniform(0.8, 1.6), 0.003
+        later += world.request(size, 1.0, hz=5)
+    window = world.control.ceiling.bytes
+    assert window is None or window > 100_000
+    world.mesh.run(2.0)
+    elapsed = sorted(world.elapsed(later))
+    assert len(elapsed) == len(later)
+    assert elapsed[len(elapsed) // 2] < 0.15
+    assert elapsed[-1] < 0.5

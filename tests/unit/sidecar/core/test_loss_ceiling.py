@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.loss_ceiling import CUT, LEAST_BYTES, LossCeiling
+from sidecar.core.loss_ceiling import CUT, LEAST_BYTES, MEMORY_S, LossCeiling
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.units import DATAGRAM_BYTES
 
@@ -14,11 +14,11 @@ WANTED = 2.0 * IN_FLIGHT
 class World:
     """A ceiling, and the round trips it is told of."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, lost_first: int = 0) -> None:
         self.ceiling = LossCeiling()
         self.rtt = RttEstimator()
         self.now = 0.0
-        self.round(FLOOR_S)
+        self.round(FLOOR_S, lost=lost_first)
 
     def round(self, rtt_s: float, *, lost: int = 0, acked: int = 100) -> bool:
         """One round trip with so many datagrams acknowledged and lost; whether that cut the ceiling."""
@@ -43,6 +43,37 @@ def test_a_loss_with_a_queue_cuts() -> None:
     world.round(2 * FLOOR_S)
     assert world.round(2 * FLOOR_S, lost=1)
     assert world.ceiling.bytes == pytest.approx(CUT * IN_FLIGHT)
+
+
+def test_below_a_full_queue_a_single_loss_is_the_radios_but_several_cut() -> None:
+    world = World()
+    world.round(3 * FLOOR_S)
+    world.round(2 * FLOOR_S)
+    assert not world.round(2 * FLOOR_S, lost=1)
+    assert world.round(2 * FLOOR_S, lost=4)
+
+
+def test_what_the_first_burst_lost_is_not_usual() -> None:
+    world = World(lost_first=15)
+    world.round(2 * FLOOR_S)
+    assert world.round(2 * FLOOR_S, lost=1)
+
+
+def test_what_a_cut_was_made_for_is_not_usual() -> None:
+    world = World()
+    assert world.round(FLOOR_S, lost=30)
+    world.round(2 * FLOOR_S)
+    assert world.round(2 * FLOOR_S, lost=1)
+
+
+def test_what_is_usual_is_forgotten_where_a_queue_always_stands() -> None:
+    world = World()
+    for _ in range(20):
+        world.round(FLOOR_S, lost=5)
+    until = world.now + MEMORY_S + 1.0
+    while world.now < until:
+        world.round(2 * FLOOR_S)
+    assert world.round(2 * FLOOR_S, lost=1)
 
 
 def test_with_a_queue_the_usual_loss_cuts_nothing_but_more_does() -> None:
