@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 _LOWER_EDGES = np.concatenate(([0.0], EDGES))
 _MIDS = np.array(MIDS)
+_ROUNDING = 1e-9
+"""What sums of probabilities may be off by: half of the samples is half, whatever was added in between."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +47,9 @@ class Distribution:
 
     def median(self) -> float:
         """Median within 2 %; inf if an answer is less likely than none."""
-        slower = np.flatnonzero(self.tail <= 0.5)
+        slower = np.flatnonzero(self.tail <= 0.5 + _ROUNDING)
         index = int(slower[0]) - 1 if slower.size else BUCKETS - 1
-        return MIDS[index] if index < BUCKETS - 1 or self.never <= 0.5 else math.inf
+        return MIDS[index] if index < BUCKETS - 1 or self.never <= 0.5 + _ROUNDING else math.inf
 
     def over(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """P(X > s) for each s, linear inside a bucket; the overflow bucket is over whatever there is."""

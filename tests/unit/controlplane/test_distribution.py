@@ -6,7 +6,7 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from controlplane.core.distribution import Distribution
@@ -25,6 +25,7 @@ def of(*seconds: float, lost: int = 0) -> Distribution:
 
 
 @given(values, st.integers(0, 4), st.floats(0.0, 100.0))
+@example([0.0] * 11 + [1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 3.0, 3.0, 4.0], 2, 0.0).via("half, but for rounding")
 def test_it_is_what_a_plain_histogram_says(seconds: list[float], lost: int, limit: float) -> None:
     made = of(*seconds, lost=lost)
     plain = histogram(*seconds, lost=lost)
