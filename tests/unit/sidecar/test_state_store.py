@@ -218,9 +218,11 @@ import sidecar.state_store as state_store
 from protos.model import MappingSet, NodeName, Version
 state_store.MIN_WRITE_INTERVAL_S = 0.0
 store = state_store.StateStore(Path(sys.argv[1]), NodeName("robot-1"))
+busy = False
 for version in itertools.count(1):
     store.remember(MappingSet(Version(version), 0))
-    if version == 100:
+    if not busy and version >= 100 and Path(sys.argv[1], state_store.LAST_GOOD_FILE).exists():
+        busy = True
         sys.stdout.write("busy\\n")
         sys.stdout.flush()
 """
