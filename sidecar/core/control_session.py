@@ -291,6 +291,10 @@ class ControlSession:
         messages: list[SidecarMessage] = []
         if self._register_due:
             messages.append(self._current_registration())
+            self._register_due = False
+        if self.state is ControlState.REGISTERING and not self._draining:
+            # The rest waits for the Welcome: a write that meets a refusal can hide its reason (gRPC says INTERNAL).
+            return messages
         if self._candidates_due:
             messages.append(self._candidates)
         if self._services_due:
