@@ -39,4 +39,8 @@ class Application(Protocol):
     """What the data plane calls."""
 
     def handle(self, event: ApplicationEvent) -> None:
-        """Take an event. Called from data-plane threads: must return at once (queue it)."""
+        """Take an event. Called from data-plane threads: must return at once.
+
+        It may call the data plane, to answer a request then and there: that saves two wake-ups, and its answer leaves
+        before the thread that received the request sleeps. What takes time (a ROS server) belongs into a queue.
+        """

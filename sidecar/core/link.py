@@ -84,6 +84,8 @@ class Link:
         self._ready = False
         self._carrier = True
         self._timers: Timers[PathId] = Timers()
+        self._unarmed: dict[PathId, Path] = {}
+        """What has sent since its timer was set: that waits until timers are asked for, the datagrams do not."""
         self._measure_at = now + MEASURE_EVERY_S
 
     # -- what the driver calls ------------------------------------------------------------------------------------
@@ -196,7 +198,7 @@ class Link:
         for path in list(self._dirty.values()):
             if self._builder.build(path, burst, now, probing=probing):
                 del self._dirty[path.id]
-                self._arm(path)
+                self._unarmed[path.id] = path
             if burst.full:
                 break
         return burst.batches
@@ -270,6 +272,7 @@ class Link:
                 self._keeper.take_down(path, "peer left or restarted")
             if (path.peer, path.remote_id) not in self._paths:
                 self._dirty.pop(path.id, None)
+                self._unarmed.pop(path.id, None)
                 self._timers.arm(path.id, None)
 
     # -- timers ---------------------------------------------------------------------------------------------------
@@ -277,6 +280,9 @@ class Link:
     def _rearm(self) -> None:
         for path in self._dirty.values():
             self._arm(path)
+        for path in self._unarmed.values():
+            self._arm(path)
+        self._unarmed.clear()
 
     def _arm(self, path: Path) -> None:
         recovery = path.recovery

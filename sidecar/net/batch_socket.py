@@ -90,13 +90,13 @@ class BatchSocket:
             self._drop(error.errno, batch.datagrams)
         return None
 
-    def receive(self) -> list[Run]:
-        """Return what has arrived, up to one turn's worth; the views hold until the next call."""
+    def receive(self, at_most: int = RECEIVE_CALLS) -> list[Run]:
+        """Return what has arrived, up to so many system calls' worth; the views hold until the next call."""
         arena, receive = self._arena, self._socket.recvmsg_into
         runs: list[Run] = []
         start = end = segment = 0
         sender: tuple[Any, ...] = ()
-        for _ in range(RECEIVE_CALLS):
+        for _ in range(at_most):
             if end > ARENA_BYTES - ROOM_BYTES:
                 break
             try:

@@ -70,7 +70,7 @@ class ThreadedDataPlane:
         self._hooks = hooks
         self._clock = time.monotonic
         self._engine = Engine(config, own, self._clock())
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # the application may call us from within its `handle`
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
         self._watchdog = Watchdog(self._clock())

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import logging
-import queue
 import random
 import sys
 import threading
@@ -64,7 +63,6 @@ class EngineProgram:
         self._failed: list[str] = []
         self._one_way: list[tuple[int, float]] = []
         self._answer_bytes = HEADER.size
-        self._executions: queue.SimpleQueue[ExecuteRequest | None] = queue.SimpleQueue()
         self._candidates: tuple[Candidate, ...] = ()
         self._offered = threading.Event()
         self._have_candidates = threading.Event()
@@ -94,7 +92,6 @@ class EngineProgram:
         if parsed.role is Role.CLOUD:
             rules = parsed.service_rules()
             self._plane.set_offers(tuple(ServiceOffer(ServiceName(rule.pattern), TYPE) for rule in rules))
-            threading.Thread(target=self._answer, daemon=True, name="application").start()
         if not self._have_candidates.wait(READY_TIMEOUT_S):
             raise TimeoutError("no interface came into use")
         interpreter.settle()
@@ -162,7 +159,7 @@ class EngineProgram:
             case ExecuteRequest():
                 number, sent = HEADER.unpack_from(event.payload)
                 self._one_way.append((number, now - sent))
-                self._executions.put(event)
+                self._plane.complete(event.execution, bytes(event.payload[: self._answer_bytes]), 0.0)
             case OfferService():
                 self._offered.set()
             case RequestFailed():
@@ -176,10 +173,6 @@ class EngineProgram:
         # The session makes the id unique over several runs of the robot's side.
         request_id = RequestId(self._plane.session.to_bytes(8, "big") + (number & (1 << 64) - 1).to_bytes(8, "big"))
         self._plane.submit(request_id, SERVICE, data)
-
-    def _answer(self) -> None:
-        while (request := self._executions.get()) is not None:
-            self._plane.complete(request.execution, bytes(request.payload[: self._answer_bytes]), 0.0)
 
     # -- what the control plane would do --------------------------------------------------------------------------
 

@@ -2,7 +2,8 @@
 
 50 requests a second of 1 kB, answers of 1 kB, over plain kernel cables. The path that carried more of the warm-up is
 the one that is cut, in the middle of the network, both ways: for whoever uses one path at a time, that is the one in
-use. The clients are bare programs, ours a sidecar's engine with the application in its process.
+use. The clients are bare programs, ours a sidecar's engine with the application in its process; every server answers
+on the thread that received the request.
 
 Ours and plain UDP run once more with real-time priority on processors that do not sleep (`_steady_`): the difference is
 what the machine's other business and its sleep cost.

@@ -59,6 +59,7 @@ class Node:
     """A sidecar's data plane on one loopback socket; its application echoes and takes notes."""
 
     def __init__(self, name: str, role: Role, session: int) -> None:
+        self.answers_at_once = False
         self.name, self.role, self.session = NodeName(name), role, SessionId(session)
         self.token = session.to_bytes(16, "big")
         self.offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
@@ -77,9 +78,11 @@ class Node:
 
     def handle(self, event: ApplicationEvent) -> None:
         if isinstance(event, ExecuteRequest):
-            # On a thread of its own, as a server's answer comes; never from within `handle`.
             arguments = (event.execution, b"echo:" + event.payload, 0.0)
-            threading.Thread(target=self.plane.complete, args=arguments).start()
+            if self.answers_at_once:
+                self.plane.complete(*arguments)
+            else:
+                threading.Thread(target=self.plane.complete, args=arguments).start()
         with self.news:
             self.events.append(event)
             self.news.notify_all()
@@ -125,8 +128,10 @@ def submit(robot: Node, number: int, payload: bytes) -> None:
     robot.plane.submit(RequestId(number.to_bytes(16, "big")), SERVICE, payload)
 
 
-def test_requests_of_all_sizes_are_answered_once_each(nodes: tuple[Node, Node]) -> None:
-    robot, _ = nodes
+@pytest.mark.parametrize("at_once", [False, True], ids=["by a thread of its own", "from within handle"])
+def test_requests_of_all_sizes_are_answered_once_each(nodes: tuple[Node, Node], *, at_once: bool) -> None:
+    robot, cloud = nodes
+    cloud.answers_at_once = at_once
     payloads = [random.Random(size).randbytes(size) for size in (0, 1, 1000, 5000, 150_000, 2_000_000)]
     for number, payload in enumerate(payloads):
         submit(robot, number, payload)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import threading
 from typing import TYPE_CHECKING
 
 from protos.model import InterfaceName, PeerSet, Role, ServiceOffer, SessionId, Version
@@ -52,8 +53,16 @@ def test_messages_are_decoded_while_nothing_is_locked(monkeypatch: pytest.Monkey
     decode = Partial.decode
     locked: list[bool] = []
 
+    def ask() -> None:
+        free = plane._lock.acquire(blocking=False)
+        locked.append(not free)
+        if free:
+            plane._lock.release()
+
     def watched(partial: Partial) -> memoryview:
-        locked.append(plane._lock.locked())
+        asking = threading.Thread(target=ask)
+        asking.start()
+        asking.join()
         return decode(partial)
 
     monkeypatch.setattr(Partial, "decode", watched)
