@@ -37,7 +37,10 @@ MIN_GROUP_TIME_S = 0.01
 """Time a group of blocks gets for the search even when those before it used up the limit."""
 
 MAX_COLUMNS = 30_000
-"""Choices of all blocks of a group that CP-SAT is given: a second's work to set up."""
+"""Choices of all blocks of a group that CP-SAT is given at most."""
+
+COLUMNS_A_SECOND = 30_000
+"""How many are set up in a second; no more than there is time for."""
 
 MIN_COLUMNS_BLOCK = 4
 MAX_COLUMNS_BLOCK = 4096
@@ -79,7 +82,7 @@ class GroupSolver:
         )
         proven = self._is_good(relaxed.standing.cost, relaxed) and relaxed.excess_proven
         choices, bound = relaxed.standing.choices(), relaxed.bound
-        if not proven and len(self._limits):
+        if not proven and len(self._limits) and (self._is_small or time.monotonic() < self._end):
             choices, bound, proven = self._search(relaxed)
         found = dict(zip(self._limits.keys, relaxed.price.tolist(), strict=False))
         return Found(choices, bound, proven, found, decomposition.worth(relaxed.price))
@@ -104,7 +107,9 @@ class GroupSolver:
         """Let CP-SAT choose among the choices that the bound leaves a chance."""
         standing, limits = relaxed.standing, self._limits
         margin = math.inf if relaxed.extra else standing.cost - relaxed.bound
-        at_most = min(MAX_COLUMNS_BLOCK, max(MIN_COLUMNS_BLOCK, MAX_COLUMNS // len(self._group.blocks)))
+        left_s = max(MIN_GROUP_TIME_S, self._end - time.monotonic())
+        columns_all = min(MAX_COLUMNS, int(COLUMNS_A_SECOND * left_s))
+        at_most = min(MAX_COLUMNS_BLOCK, max(MIN_COLUMNS_BLOCK, columns_all // len(self._group.blocks)))
         columns: list[list[Column]] = []
         picks = []
         hint = []

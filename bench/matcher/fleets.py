@@ -7,6 +7,7 @@ its share of all interfaces as capacity, and `ROOM` times that.
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,13 @@ def random_fleet(
     )
     capacity = max(1, int(robots * interfaces * room / servers))
     return Problem(blocks, {FleetKey(name, SERVICE): capacity for name in names}, Objective.JOINT)
+
+
+def in_regions(problem: Problem, regions: int, *, seed: int) -> Problem:
+    """The fleet with its servers in so many regions."""
+    rng = random.Random(seed)
+    labels = tuple(f"region-{rng.randrange(regions)}" for _ in problem.blocks[0].servers)
+    return replace(problem, blocks=tuple(replace(block, regions=labels) for block in problem.blocks))
 
 
 def random_block(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from controlplane.core.domains import repeats
-from controlplane.core.objectives import PROBABILITY_FLOOR, epsilon_matrix
+from controlplane.core.objectives import epsilon_matrix, log_lift
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,6 +26,9 @@ OWN_EXCESS_PRICE = 1e6
 
 MAX_LISTED = 4096
 """Choices looked at of one block: 2 interfaces with 64 servers, 3 with 16, 4 with 8."""
+
+TRIED_A_CHOICE = 16
+"""Combinations of cheap servers that are looked at for each choice wanted near a block's best."""
 
 CHOICES_A_WAY = 4
 """Choices there should be room for, at least, for each set of interfaces that carries copies."""
@@ -138,8 +141,13 @@ def lift_floor(block: Block) -> float:
     """What all lifts of a choice together add at least to the logarithm of its miss probability; at most 0."""
     least: dict[tuple[int, int], float] = {}
     for ((i, _), (k, _)), lift in block.lifts.items():
-        least[i, k] = min(least.get((i, k), 0.0), math.log(max(lift, PROBABILITY_FLOOR)))
+        least[i, k] = min(least.get((i, k), 0.0), log_lift(lift))
     return sum(least.values())
+
+
+def tried_of_each(interfaces: int, at_most: int) -> int:
+    """Of how many servers of each interface the combinations are looked at for so many choices near the best."""
+    return max(1, int(min(MAX_LISTED, TRIED_A_CHOICE * at_most) ** (1 / interfaces) + 1e-9))
 
 
 def nearest(values: Floats, excess: Indices, picks: Indices, margin: float, at_most: int, *, complete: bool) -> Near:

@@ -12,6 +12,7 @@ excess has a price too, which no price of a limit is above: the bound then holds
 
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from controlplane.core.choices import MAX_LISTED, OWN_EXCESS_PRICE
 from controlplane.core.domains import chooses_interfaces, has_shared_regions
+from controlplane.core.pattern_stack import PatternStack
 from controlplane.core.plan import relative_gap
 from controlplane.core.problem import Objective
 from controlplane.core.stacks import EnumeratedStack, SeparableStack
@@ -49,21 +51,50 @@ MIN_LISTED = 256
 """Choices listed of a block in any case: 2 interfaces with 16 servers, 4 with 4."""
 
 
+MAX_PATTERNS_ALL = 16_000_000
+"""Patterns of all blocks together (some 10 bytes each)."""
+
+MAX_PATTERN_INTERFACES = 12
+"""With more there would be a single pattern."""
+
+
+class Kind(enum.Enum):
+    """How a stack finds its blocks' best choices."""
+
+    SEPARABLE = enum.auto()
+    ENUMERATED = enum.auto()
+    PATTERNS = enum.auto()
+
+
 def stack_blocks(objective: Objective, blocks: Sequence[Block], limits: Limits) -> list[Stack]:
     """Stack blocks of one shape and kind."""
-    shapes: dict[tuple[bool, bool, int], list[Block]] = {}
-    listed = 0
+    listed = [block for block in blocks if block.idempotent and not _adds_up(objective, block)]
+    at_most = min(MAX_LISTED, max(MIN_LISTED, MAX_LISTED_ALL // max(1, len(listed))))
+    shapes: dict[tuple[Kind, bool, int], list[Block]] = {}
     for block in blocks:
-        adds_up = _adds_up(objective, block)
-        listed += block.idempotent and not adds_up
-        shapes.setdefault((block.idempotent, adds_up, len(block.interfaces)), []).append(block)
-    at_most = min(MAX_LISTED, max(MIN_LISTED, MAX_LISTED_ALL // max(1, listed)))
-    return [
-        SeparableStack(objective, members, limits)
-        if adds_up
-        else EnumeratedStack(objective, members, limits, at_most=at_most)
-        for (_, adds_up, _), members in shapes.items()
-    ]
+        shape = _kind(objective, block, at_most), block.idempotent, len(block.interfaces)
+        shapes.setdefault(shape, []).append(block)
+    return [_stack(kind, objective, members, limits, at_most) for (kind, _, _), members in shapes.items()]
+
+
+def _stack(kind: Kind, objective: Objective, blocks: Sequence[Block], limits: Limits, at_most: int) -> Stack:
+    match kind:
+        case Kind.SEPARABLE:
+            return SeparableStack(objective, blocks, limits)
+        case Kind.ENUMERATED:
+            return EnumeratedStack(objective, blocks, limits, at_most=at_most)
+        case Kind.PATTERNS:
+            at_most = min(MAX_LISTED, max(MIN_LISTED, MAX_PATTERNS_ALL // len(blocks)))
+            return PatternStack(objective, blocks, limits, at_most=at_most)
+
+
+def _kind(objective: Objective, block: Block, at_most: int) -> Kind:
+    if _adds_up(objective, block):
+        return Kind.SEPARABLE
+    if not block.idempotent or block.target is not None or len(block.interfaces) > MAX_PATTERN_INTERFACES:
+        return Kind.ENUMERATED
+    options = len(block.servers) + chooses_interfaces(block)
+    return Kind.PATTERNS if options ** len(block.interfaces) > at_most else Kind.ENUMERATED
 
 
 def _adds_up(objective: Objective, block: Block) -> bool:
@@ -95,7 +126,7 @@ class Decomposition:
         self.stacks = stack_blocks(problem.objective, problem.blocks, limits)
         self._objective = problem.objective
         self.start = np.array([*(prices.get(key, 0.0) for key in limits.keys), 0.0])
-        free = [stack.best(stack.every, np.zeros((len(stack.blocks), stack.servers + 1))) for stack in self.stacks]
+        free = [stack.free for stack in self.stacks]
         self._forced = [best.excess for best in free]
         self._wanted = sum(block.copies_wanted.least for block in problem.blocks)
         self._forced_all = sum(int(excess.sum()) for excess in self._forced)
@@ -156,8 +187,9 @@ class Decomposition:
     def _dual(self, price: Floats) -> tuple[float, list[Best]]:
         """What no plan is below that exceeds capacities by no more than the best one known."""
         extra = self._extra()
-        excess_price = float(price.max()) if extra else OWN_EXCESS_PRICE
-        total = -float(price[:-1] @ self.limits.capacity) - (excess_price * extra if extra else 0.0)
+        # Where the limits alone force that much excess, no such plan exceeds a block's own capacity.
+        excess_price = OWN_EXCESS_PRICE if self._is_excess_proven() else float(price.max())
+        total = -float(price[:-1] @ self.limits.capacity) - max(0, extra) * float(price.max())
         found = []
         for stack, forced in zip(self.stacks, self._forced, strict=True):
             prices = price[stack.limit]

@@ -58,9 +58,9 @@ def violation_counts(block: Block, choices: Indices) -> Indices:
         crowd = beyond(choices, np.array(block.capacity))
         count += crowd.sum(axis=1) if block.target is not None else 0
     if block.idempotent and block.regions:
-        count += repeats(np.where((choices < 0) | crowd, -1, _numbered(block.regions)[choices]), np.array(1))
+        count += repeats(np.where((choices < 0) | crowd, -1, numbered(block.regions)[choices]), np.array(1))
     if block.carriers and chooses_interfaces(block):
-        count += repeats(np.where(choices < 0, -1, _numbered(block.carriers)), np.array(1))
+        count += repeats(np.where(choices < 0, -1, numbered(block.carriers)), np.array(1))
     return count
 
 
@@ -121,6 +121,7 @@ def _repeats(labels: Sequence[str]) -> int:
     return len(labels) - len(set(labels))
 
 
-def _numbered(labels: Sequence[str]) -> Indices:
+def numbered(labels: Sequence[str]) -> Indices:
+    """Labels as numbers, equal ones as the same; -1 where there is none."""
     number = {label: position for position, label in enumerate(dict.fromkeys(labels))}
     return np.array([number[label] if label else -1 for label in labels], dtype=np.intp)

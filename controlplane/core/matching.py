@@ -10,8 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from controlplane.core.domains import repeats
+from controlplane.core.objectives import epsilon_matrix
+from controlplane.core.problem import reachable
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from controlplane.core.problem import Block
 
 NO_PATH_COST = 1e12
 """Stands for infinity, which the method cannot subtract."""
@@ -24,6 +30,17 @@ def cheapest_matching(costs: NDArray[np.float64], slots: int, excess_price: floa
     within = min(slots, interfaces)
     wide = np.hstack([finite] * within + [finite + excess_price] * (interfaces - within))
     return [column % servers for column in cheapest_columns(wide)]
+
+
+def forced_excess(block: Block) -> int:
+    """By how many interfaces a block exceeds its own capacity at least."""
+    interfaces = len(block.interfaces)
+    if not block.capacity or min(len(reachable(row)) for row in block.epsilon) * block.capacity >= interfaces:
+        return 0
+    costs = np.where(np.isnan(epsilon_matrix(block)), np.inf, 0.0)
+    servers = cheapest_matching(costs, block.capacity, 1.0)
+    beyond = int(repeats(np.array(servers), np.array(block.capacity)))
+    return max(0, beyond - (interfaces - block.copies_wanted.least))
 
 
 def cheapest_columns(costs: NDArray[np.float64]) -> list[int]:

@@ -64,6 +64,11 @@ def joint_miss(block: Block, choice: Choice) -> float:
     return max(min(total, cap), LEAST_POSITIVE)
 
 
+def log_lift(lift: float) -> float:
+    """Its logarithm, finite."""
+    return math.log(max(lift, PROBABILITY_FLOOR))
+
+
 def epsilon_matrix(block: Block) -> NDArray[np.float64]:
     """By interface, then server; NaN where there is no path."""
     return np.array(block.epsilon, dtype=np.float64)
@@ -124,7 +129,7 @@ def _lifts_of_pairs(block: Block, servers: int) -> dict[tuple[int, int], tuple[N
     """
     lifts: dict[tuple[int, int], list[tuple[int, float]]] = {}
     for ((i, j), (k, m)), lift in block.lifts.items():
-        lifts.setdefault((i, k), []).append((j * servers + m, math.log(max(lift, PROBABILITY_FLOOR))))
+        lifts.setdefault((i, k), []).append((j * servers + m, log_lift(lift)))
     found = {}
     for pair, entries in lifts.items():
         codes, logs = zip(*sorted(entries), strict=True)

@@ -12,17 +12,18 @@ from __future__ import annotations
 
 import abc
 import itertools
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from controlplane.core.choices import (
-    MAX_LISTED,
     OWN_EXCESS_PRICE,
     combinations,
     list_choices,
     nearest,
     own_excess,
+    tried_of_each,
 )
 from controlplane.core.costs import choice_costs
 from controlplane.core.domains import repeats
@@ -56,6 +57,8 @@ class Best(NamedTuple):
     """By how many interfaces the block's own capacity is exceeded."""
     picks: Indices
     """By block, then interface: the server's index; the stack's number of servers where an interface has none."""
+    least: Floats
+    """What no choice is below, with `excess_price` for each interface in excess."""
 
 
 class Stack(abc.ABC):
@@ -72,6 +75,11 @@ class Stack(abc.ABC):
         for row, block in enumerate(blocks):
             self.limit[row, : len(block.servers)] = limits.of_block(block)
 
+    @cached_property
+    def free(self) -> Best:
+        """The best choices of all blocks where nothing has a price."""
+        return self.best(self.every, np.zeros((len(self.blocks), self.servers + 1)))
+
     @abc.abstractmethod
     def best(self, rows: Indices, price: Floats, excess_price: float = OWN_EXCESS_PRICE) -> Best:
         """The best choice of these blocks at these prices, of the servers and of an interface in excess."""
@@ -81,10 +89,10 @@ class Stack(abc.ABC):
         """Choices of one block within `margin` of its best."""
 
     def bound(self, price: Floats, best: Best, forced: Indices, excess_price: float) -> Floats:
-        """What the best of each block is worth at least: `best` at these prices, and `excess_price` for each interface
-        by which it exceeds the block's own capacity beyond what it must (`forced`)."""
-        value: Floats = best.value + np.multiply(best.excess - forced, excess_price, dtype=np.float64)
-        return value
+        """What the best of each block is worth at least, given `best` at these prices, and `excess_price` for each
+        interface by which it exceeds the block's own capacity beyond what it must (`forced`)."""
+        least: Floats = best.least - excess_price * forced
+        return least
 
     def picks_of(self, choice: Choice) -> list[int]:
         """A choice in this stack's numbering."""
@@ -115,13 +123,13 @@ class SeparableStack(Stack):
             solve = _try_all if self.interfaces <= MAX_TRIED else _match
             solved = solve(priced[crowded], self._capacity[rows[crowded]], excess_price)
             value[crowded], excess[crowded], picks[crowded] = solved
-        return Best(value, excess, picks)
+        return Best(value, excess, picks, value + excess_price * excess)
 
     def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
         priced = self._cost[row] + price[: self.servers]
-        (value,), _, _ = self.best(np.array([row]), price[None])
+        (value,) = self.best(np.array([row]), price[None]).value
         slack = value + margin - priced.min(axis=1).sum()
-        share = max(1, int(MAX_LISTED ** (1 / self.interfaces) + 1e-9))
+        share = tried_of_each(self.interfaces, at_most)
         options = []
         complete = True
         for costs in priced:
@@ -134,7 +142,7 @@ class SeparableStack(Stack):
         return nearest(values, repeats(picks, self._capacity[row]), picks, margin, at_most, complete=complete)
 
 
-def _try_all(priced: Floats, capacity: Indices, excess_price: float) -> Best:
+def _try_all(priced: Floats, capacity: Indices, excess_price: float) -> tuple[Floats, Indices, Indices]:
     interfaces, servers = priced.shape[1:]
     tried = min(interfaces, servers)
     cheapest = np.argpartition(priced, tried - 1, axis=2)[:, :, :tried]
@@ -143,14 +151,14 @@ def _try_all(priced: Floats, capacity: Indices, excess_price: float) -> Best:
     values = np.take_along_axis(priced, cheapest, 2)[:, rows, grid].sum(axis=2)
     excess = repeats(picks, capacity[:, None])
     at = np.arange(len(priced)), (values + excess_price * excess).argmin(axis=1)
-    return Best(values[at], excess[at], picks[at])
+    return values[at], excess[at], picks[at]
 
 
-def _match(priced: Floats, capacity: Indices, excess_price: float) -> Best:
+def _match(priced: Floats, capacity: Indices, excess_price: float) -> tuple[Floats, Indices, Indices]:
     found = [cheapest_matching(costs, int(slots), excess_price) for costs, slots in zip(priced, capacity, strict=True)]
     picks = np.array(found, dtype=np.intp)
     value = np.take_along_axis(priced, picks[:, :, None], 2)[:, :, 0].sum(axis=1)
-    return Best(value, repeats(picks, capacity), picks)
+    return value, repeats(picks, capacity), picks
 
 
 class EnumeratedStack(Stack):
@@ -185,8 +193,10 @@ class EnumeratedStack(Stack):
 
     def best(self, rows: Indices, price: Floats, excess_price: float = OWN_EXCESS_PRICE) -> Best:
         values = self._priced(rows, price)
-        chosen = (values + excess_price * self._excess[rows]).argmin(axis=1)
-        return Best(values[np.arange(len(rows)), chosen], self._excess[rows, chosen], self._choices[rows, chosen])
+        ranks = values + excess_price * self._excess[rows]
+        chosen = ranks.argmin(axis=1)
+        at = np.arange(len(rows)), chosen
+        return Best(values[at], self._excess[rows, chosen], self._choices[rows, chosen], ranks[at])
 
     def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
         count = self._count[row]

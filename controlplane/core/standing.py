@@ -112,14 +112,15 @@ class Standing:
         }
 
     def settle(self, price: Floats, out_of_time: Callable[[], bool]) -> None:
-        """Move blocks away from limits that are exceeded, those first that lose least at these prices; then to what
-        is cheaper for them, within the limits; then two at a time."""
+        """Move blocks away from limits that are exceeded, those first that lose least at these prices, and that even
+        out of time; then to what is cheaper for them, within the limits; then two at a time."""
+        for _ in range(MAX_SWEEPS):
+            if not self._sweep(price, crowded_only=True):
+                break
         nothing = np.zeros_like(price)
-        for prices, crowded_only in ((price, True), (nothing, False)):
-            for _ in range(MAX_SWEEPS):
-                if out_of_time() or not self._sweep(prices, crowded_only=crowded_only):
-                    break
-
+        for _ in range(MAX_SWEEPS):
+            if out_of_time() or not self._sweep(nothing, crowded_only=False):
+                break
         trade(self, out_of_time)
 
     def exchange(self, goer: Move, comer: Move) -> bool:

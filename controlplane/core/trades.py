@@ -68,7 +68,7 @@ def _wishes(standing: Standing, full: NDArray[np.bool_]) -> dict[int, list[Move]
     """By full limit: the blocks that would gain by coming, did not exactly this one stand in the way."""
     found: dict[int, list[Move]] = {}
     for number, (stack, part) in enumerate(zip(standing.stacks, standing.parts, strict=True)):
-        best = stack.best(stack.every, np.zeros((len(stack.blocks), stack.servers + 1)))
+        best = stack.free
         more = best.value - part.cost
         gaining = np.flatnonzero((more < -MIN_GAIN) & (best.excess <= part.excess))
         now = np.take_along_axis(stack.limit, part.picks, 1)

@@ -181,6 +181,28 @@ def test_a_fleet_with_rules_shares_servers_within_the_capacities_and_near_the_bo
     assert again.bound <= solve(problem, time_limit_s=AMPLE_S).cost
 
 
+@pytest.mark.parametrize("time_limit_s", [1e-9, AMPLE_S])
+def test_a_fleet_with_too_many_choices_to_list_keeps_to_the_capacities(time_limit_s: float) -> None:
+    rng = random.Random(10)
+    problem = fleet(rng, 80, 4, 16, Objective.JOINT, 1.1)
+    regions = tuple(("eu", "us", "asia")[number % 3] for number in range(16))
+    # All lifts of a few paths each, as those have that carried requests together.
+    blocks = []
+    for part in problem.blocks:
+        tried = [(i, j) for i in range(4) for j in rng.sample(range(16), 2)]
+        lifts = {(one, two): rng.uniform(0.7, 3.0) for one in tried for two in tried if one[0] < two[0]}
+        blocks.append(replace(part, regions=regions, lifts=lifts))
+    problem = replace(problem, blocks=tuple(blocks))
+    plan = solve(problem, time_limit_s=time_limit_s)
+    assert plan.relaxed == 0
+    choices = choices_of(problem, {key: made.assignments for key, made in plan.blocks.items()})
+    assert price(problem, choices).cost == pytest.approx(plan.cost)
+    assert plan.bound <= plan.cost
+    if time_limit_s == AMPLE_S:
+        assert plan.gap <= 0.01
+        assert all(len(made.shared) == 1 for made in plan.blocks.values()), "four copies, three regions"
+
+
 def ruled(rng: random.Random, part: Block) -> Block:
     """Three regions and carriers; two copies of the one half's requests, the other half cheap."""
     regions = tuple(("eu", "us", "asia")[number % 3] for number in range(len(part.servers)))

@@ -1,0 +1,192 @@
+"""Blocks with too many choices to list them: the best choice of each by patterns of server groups.
+
+At given prices the best server of each group is taken (`server_groups`), and the best of all patterns. Where that puts
+more interfaces on a server than the block's own capacity allows, it is branched: one of these interfaces may not go
+there, for each of them in turn. What the best pattern is worth is a bound; it is what the choice is worth but where
+lifts above 1 are capped (`objectives`), and where servers share a group that are not alike.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from controlplane.core.choices import OWN_EXCESS_PRICE, combinations, nearest, tried_of_each
+from controlplane.core.costs import RULE_PRICE
+from controlplane.core.matching import forced_excess
+from controlplane.core.server_groups import ROWS_AT_ONCE, ServerGroups, violations
+from controlplane.core.stacked_costs import StackedCosts
+from controlplane.core.stacks import Best, Stack
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from controlplane.core.choices import Near
+    from controlplane.core.limits import Limits
+    from controlplane.core.problem import Block, Objective
+
+    Floats = NDArray[np.float64]
+    Indices = NDArray[np.intp]
+
+MAX_BRANCHINGS = 6
+"""Rounds in which interfaces are kept from servers; each is for fewer blocks."""
+
+MIN_GAIN = 1e-12
+"""Values closer than this are equal: rounding."""
+
+
+class PatternStack(Stack):
+    """Blocks without a target whose service may run on several servers, with up to `at_most` patterns each."""
+
+    def __init__(self, objective: Objective, blocks: Sequence[Block], limits: Limits, *, at_most: int) -> None:
+        super().__init__(blocks, limits)
+        self._costs = StackedCosts(objective, blocks, self.servers)
+        self._paths = np.concatenate([self._costs.of_path, np.full((len(blocks), self.interfaces, 1), np.inf)], axis=2)
+        self._least_copies, self._most_copies = np.array([block.copies_wanted for block in blocks]).T
+        self._forced = np.array([forced_excess(block) for block in blocks])
+        share = max(1, int(at_most ** (1 / self.interfaces) + 1e-9))
+        self._groups = ServerGroups(blocks, self._costs, share)
+        self._classes = combinations(self.interfaces, self._groups.count)
+        shared = violations(blocks, self._costs, self._groups)
+        self._least_shared = np.where(shared < 0, np.iinfo(shared.dtype).max, shared).min(axis=1)
+        self._shared = shared if self._least_shared.any() or shared.any() else None
+        self._lifts = self._lift_tables() if self._costs.has_lifts else {}
+        self._pattern_cost = self._pattern_costs()
+        self._may_cap = np.zeros(len(blocks), dtype=np.bool_)
+        """By block: whether some lift is above 1."""
+        for table in self._lifts.values():
+            self._may_cap |= (table > 0).any(axis=(1, 2))
+
+    def _lift_tables(self) -> dict[tuple[int, int], Floats]:
+        """By pair of interfaces: of each block, the logarithms of the lifts between groups."""
+        single, count = self._groups.single, self._groups.count
+        rows, alone = self.every[:, None, None], single.shape[2]
+        tables = {}
+        for i, k in itertools.combinations(range(self.interfaces), 2):
+            table = np.zeros((len(self.blocks), count, count))
+            servers = single[:, i, :, None], single[:, k, None, :]
+            there = (servers[0] < self.servers) & (servers[1] < self.servers)
+            lifts = self._costs.log_lifts(rows, i, servers[0], k, servers[1])
+            table[:, :alone, :alone] = np.where(there, lifts, 0.0)
+            tables[i, k] = table
+        return tables
+
+    def _pattern_costs(self) -> Floats:
+        """By block and pattern: what it costs beside the paths."""
+        count = self._groups.count
+        found = np.zeros((len(self.blocks), *([count] * self.interfaces)))
+        for (i, k), table in self._lifts.items():
+            shape = [count if axis in (i, k) else 1 for axis in range(self.interfaces)]
+            found += table.reshape(-1, *shape)
+        costs = found.reshape(len(self.blocks), -1)
+        if self._shared is not None:
+            costs += RULE_PRICE * self._shared
+            costs[self._shared < 0] = np.inf
+        return costs
+
+    def best(self, rows: Indices, price: Floats, excess_price: float = OWN_EXCESS_PRICE) -> Best:
+        found = Best(
+            np.full(len(rows), np.inf),
+            np.zeros(len(rows), dtype=np.intp),
+            np.zeros((len(rows), self.interfaces), dtype=np.intp),
+            np.full(len(rows), np.inf),
+        )
+        rank = np.full(len(rows), np.inf)
+        owner = np.arange(len(rows))
+        priced = self._paths[rows]
+        priced[:, :, :-1] += price[:, None, :]
+        for branching in range(MAX_BRANCHINGS + 1):
+            least, picks = self._relaxed(rows[owner], priced, price[owner], excess_price)
+            excess = self._costs.excess(rows[owner], picks)
+            paid = np.take_along_axis(price[owner], picks, 1).sum(axis=1)
+            value = np.where(np.isinf(least), np.inf, self._costs.cost(rows[owner], picks) + paid)
+            ranks = value + excess_price * excess
+            order = np.argsort(ranks, kind="stable")
+            firsts = order[np.unique(owner[order], return_index=True)[1]]
+            better = firsts[ranks[firsts] < rank[owner[firsts]] - MIN_GAIN]
+            at = owner[better]
+            rank[at], found.value[at], found.excess[at], found.picks[at] = (
+                ranks[better],
+                value[better],
+                excess[better],
+                picks[better],
+            )
+            open_ = (excess > 0) & (least < rank[owner] - MIN_GAIN) & (branching < MAX_BRANCHINGS)
+            together = self._together(rows[owner], picks, excess_price)
+            np.minimum.at(found.least, owner, least + np.where(open_, together, 0.0))
+            if not open_.any():
+                break
+            priced, owner = self._kept_apart(rows, priced, owner, picks, open_)
+        return found
+
+    def _together(self, rows: Indices, picks: Indices, excess_price: float) -> Floats:
+        """What it costs at least, beside the bound, not to keep apart those that are too many on a server: that they
+        are one more, but for the region that they share."""
+        crowded = self._costs.crowded_server(rows, picks)
+        waived = np.where(self._costs.region[rows, crowded] >= 0, min(RULE_PRICE, excess_price), 0.0)
+        found: Floats = np.where(self._forced[rows] > 0, 0.0, excess_price - waived)
+        return found
+
+    def _kept_apart(
+        self, rows: Indices, priced: Floats, owner: Indices, picks: Indices, which: NDArray[np.bool_]
+    ) -> tuple[Floats, Indices]:
+        """For a server that too many interfaces are on, once for each of them: that one may not go there."""
+        nodes = np.flatnonzero(which)
+        crowded = self._costs.crowded_server(rows[owner[nodes]], picks[nodes])
+        node, interface = np.nonzero(picks[nodes] == crowded[:, None])
+        apart = priced[nodes[node]]
+        apart[np.arange(len(node)), interface, crowded[node]] = np.inf
+        return apart, owner[nodes[node]]
+
+    def _relaxed(self, rows: Indices, priced: Floats, price: Floats, excess_price: float) -> tuple[Floats, Indices]:
+        """What the best pattern is worth, with the excess that the block cannot help, and its servers, of which some
+        may have to be kept apart."""
+        of_groups = self._groups.priced(rows, priced)
+        least = np.empty(len(rows))
+        pattern = np.empty(len(rows), dtype=np.intp)
+        # Two copies that crowd a server need not pay for the region that they share.
+        spared = max(0.0, RULE_PRICE - excess_price)
+        for begin in range(0, len(rows), ROWS_AT_ONCE):
+            part = slice(begin, begin + ROWS_AT_ONCE)
+            values: Floats = of_groups[part, 0]
+            for interface in range(1, self.interfaces):
+                values = (values[:, :, None] + of_groups[part, interface, None, :]).reshape(len(values), -1)
+            values = values + self._pattern_cost[rows[part]]
+            if spared and self._shared is not None:
+                values -= spared * np.maximum(0, self._shared[rows[part]])
+            pattern[part] = values.argmin(axis=1)
+            least[part] = values[np.arange(len(values)), pattern[part]]
+        picks = self._groups.servers(rows, priced, self._classes[pattern])
+        if self._may_cap.any():
+            capped = self._capped(rows, of_groups, price, min(RULE_PRICE, excess_price))
+            least = np.where(self._may_cap[rows], np.minimum(least, capped), least)
+        waived = np.where((self._costs.region[rows] >= 0).any(axis=1), min(RULE_PRICE, excess_price), 0.0)
+        return least + self._groups.floor[rows] + self._forced[rows] * (excess_price - waived), picks
+
+    def _capped(self, rows: Indices, of_groups: Floats, price: Floats, rule_price: float) -> Floats:
+        """What a choice costs at least of which a single path, or a pair of paths, is all that counts."""
+        cheapest = np.where(self._least_copies[rows] < self.interfaces, 0.0, price[:, : self.servers].min(axis=1))
+        least = of_groups.min(axis=(1, 2)) + (self.interfaces - 1) * cheapest
+        for (i, k), table in self._lifts.items():
+            both = of_groups[:, i, :, None] + of_groups[:, k, None, :] + table[rows]
+            least = np.minimum(least, both.min(axis=(1, 2)) + (self.interfaces - 2) * cheapest)
+        found: Floats = least + rule_price * self._least_shared[rows]
+        return found
+
+    def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
+        priced = self._costs.of_path[row] + price
+        share = tried_of_each(self.interfaces, at_most)
+        options = []
+        for costs in priced:
+            order = np.argsort(costs, kind="stable")[:share]
+            options.append(order[np.isfinite(costs[order])])
+        picks = np.array(list(itertools.product(*options)), dtype=np.intp)
+        copies = (picks < self.servers).sum(axis=1)
+        picks = picks[(copies >= max(1, self._least_copies[row])) & (copies <= self._most_copies[row])]
+        rows = np.full(len(picks), row)
+        values = self._costs.cost(rows, picks) + price[picks].sum(axis=1)
+        return nearest(values, self._costs.excess(rows, picks), picks, margin, at_most, complete=False)
