@@ -42,7 +42,7 @@ from sidecar.core.rules import ServiceRule
 from sidecar.ros import rcl
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from protos.model import ServiceOffer
     from sidecar.core.events import RejectReason, RequestId
@@ -193,8 +193,8 @@ class Shortcut:
         for offer in offers:
             self.robot.handle(OfferService(offer.name, offer.type))
 
-    def set_carried(self, services: frozenset[ServiceName]) -> None:
-        self.carried = services
+    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
+        self.carried = frozenset(services)
 
 
 def run_bridges(services: int) -> None:

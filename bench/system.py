@@ -15,15 +15,19 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import yaml
+from google.protobuf import json_format
 
 from controlplane.ca import Authority
+from protos.convert import explanation_from_proto
 from protos.identity import IdentityRole
+from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from bench.netlab import Host, HostProcess, Lab
+    from protos.explanation import Explanation
 
 CONTROL_PORT = 50051
 STUN_PORT = 3478
@@ -188,6 +192,16 @@ class System:
                 series, _, value = line.rpartition(" ")
                 found[series] = float(value)
         return found
+
+    def explain(self, robot: str, service: str) -> Explanation:
+        """What `plr explain` says. Raises SystemFailureError."""
+        host = self.lab.host("control")
+        argv = [sys.executable, "-m", "controlplane.cli", "explain", robot, service, "--json", "--timeout-s", "20"]
+        argv += ["--tls-dir", self.tls_dir("operator", IdentityRole.OPERATOR)]
+        done = host.run([*argv, "--address", f"{host.address()}:{CONTROL_PORT}"], timeout=60.0)
+        if done.returncode:
+            raise SystemFailureError(f"plr explain: {done.stderr}")
+        return explanation_from_proto(json_format.Parse(done.stdout, admin_pb2.ExplainResponse()))
 
     def wait_for_offer(self, part: Part, services: int = 1) -> None:
         """Wait until a robot's sidecar offers this many services (by its log)."""

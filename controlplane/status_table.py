@@ -53,6 +53,10 @@ def _details(status: SidecarStatus) -> Iterator[str]:
         yield f"REFUSED by the policy: {', '.join(status.refused_offers)} (offered here, told to no robot)"
     for mapping in status.services:
         yield _mapping(mapping)
+    for use in status.uses:
+        if use.fallback_up is not None:
+            state = "ready on the robot" if use.fallback_up else "MISSING: its node does not run, or has another type"
+            yield f"{use.name}: fallback {state}"
     yield from columns([_path(path) for path in status.paths])
 
 

@@ -121,6 +121,8 @@ class ServiceUse:
     copies: Copies = EVERY_INTERFACE
     target_miss: float = 0.0
     """Above 0: the cheapest mapping that misses the deadline no more often; 0: the most reliable one."""
+    fallback_up: bool | None = None
+    """Whether its fallback on the robot itself can be asked; None: it has none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from protos.model import ServiceName, ServiceOffer, SessionId
     from sidecar.core.events import ApplicationEvent, ExecutionId, RejectReason, RequestId
 
@@ -31,8 +33,11 @@ class DataPlane(Protocol):
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         """Cloud: the services that local servers offer right now, a whole new set."""
 
-    def set_carried(self, services: frozenset[ServiceName]) -> None:
-        """Robot: the proxied services that exist in the local ROS graph right now, a whole new set."""
+    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
+        """Robot: the proxied services that exist in the local ROS graph right now, a whole new set.
+
+        Of each, whether its fallback can be asked; None where it has none.
+        """
 
 
 class Application(Protocol):

@@ -87,6 +87,8 @@ def run(options: argparse.Namespace) -> int:
             void |= bool(outcome.disturbances)
             for why in outcome.disturbances:
                 console.print(f"{contender}: void, {why}")
+            for text in outcome.conditions.get("explained", ()):
+                console.print(f"{contender}: {text}")
         try:
             outcomes = [Outcome.read(file) for file in sorted((options.out / RUNS).glob("*/*.json"))]
         except ValueError as error:
@@ -168,6 +170,7 @@ def _write(folder: Path, outcomes: Sequence[Outcome], failed: Sequence[str]) -> 
             **(asdict(comparison) if comparison else {}),
             "case": outcome.case,
             "deadline_ms": outcome.deadline_ms,
+            "explained": outcome.conditions.get("explained", []),
             "void": list(outcome.disturbances),
         }
     medians = {name: asdict(gain) for name, gain in gains(outcomes).items()}

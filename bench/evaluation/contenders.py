@@ -185,6 +185,7 @@ def _plr(
             system.wait("the fallback", lambda: system.metrics(ROBOT).get(up) == 1)
         with world.ros_client() as client:
             yield (client,)
+            world.notes["explained"] = _explained(system)
             world.notes["counters"] = {
                 series: value
                 for series, value in system.metrics(ROBOT).items()
@@ -192,6 +193,19 @@ def _plr(
             }
     finally:
         system.close()
+
+
+def _explained(system: System) -> list[str]:
+    """What `plr explain` says of the paths in force that carried copies of the same requests."""
+    explanation = system.explain(ROBOT, SERVICE)
+    chosen = {pair.path for pair in explanation.pairs if pair.chosen}
+    return [
+        f"{joint.first.interface} -> {joint.first.server}, {joint.second.interface} -> {joint.second.server}: "
+        f"both missed {joint.both_missed:.0f} of {joint.requests:.0f}, {joint.lift:.2g} times chance: "
+        f"{joint.correlation.value}"
+        for joint in explanation.joints
+        if {joint.first, joint.second} <= chosen
+    ]
 
 
 def _direct_over(name: str, carrier: str) -> Contender:

@@ -7,23 +7,17 @@ one too.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from google.protobuf import json_format
-
 from bench.dataplane.section import Findings, Table
 from bench.netlab import Lab, LabConfig, LinkProfile
-from bench.system import CONTROL_PORT, System, SystemFailureError, read_json
-from protos.convert import explanation_from_proto
+from bench.system import System, read_json
 from protos.errors import DecodeError
-from protos.identity import IdentityRole
 from protos.model import NodeName
-from protos.plr.v1 import admin_pb2
 from sidecar.state_file import decode_last_good
 from sidecar.state_store import LAST_GOOD_FILE
 
@@ -105,7 +99,7 @@ def _swap(system: System, before_s: float) -> Followed:
     swapped = time.monotonic()
     _burden(system, busy=next(cloud for cloud in CLOUDS if cloud != other))
     system.wait(f"the mapping to name {other}", lambda: _mapped(system) == {_named(other)}, FOLLOW_S)
-    explanation = _explain(system)
+    explanation = system.explain("robot", SERVICE)
     seconds = time.monotonic() - (explanation.in_force_s or 0.0) - swapped
     time.sleep(AFTER_S)
     client.terminate()
@@ -142,16 +136,6 @@ def _mapped(system: System) -> set[str]:
         return set()
     services = last.mapping.services if last.mapping is not None else ()
     return {assignment.server for mapping in services for assignment in mapping.assignments}
-
-
-def _explain(system: System) -> Explanation:
-    host = system.lab.host("control")
-    argv = [sys.executable, "-m", "controlplane.cli", "explain", "robot", SERVICE, "--json", "--timeout-s", "20"]
-    argv += ["--tls-dir", system.tls_dir("operator", IdentityRole.OPERATOR)]
-    done = host.run([*argv, "--address", f"{host.address()}:{CONTROL_PORT}"], timeout=60.0)
-    if done.returncode:
-        raise SystemFailureError(f"plr explain: {done.stderr}")
-    return explanation_from_proto(json_format.Parse(done.stdout, admin_pb2.ExplainResponse()))
 
 
 def _reason(explanation: Explanation) -> str:

@@ -172,6 +172,7 @@ def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
         idempotent=message.idempotent,
         copies=_copies_from_proto(message),
         target_miss=probability(message.target_miss, "target_miss"),
+        fallback_up=message.fallback_up if message.has_fallback else None,
     )
 
 
@@ -193,6 +194,8 @@ def use_to_proto(use: ServiceUse) -> types_pb2.ServiceUse:
         least_copies=use.copies.least,
         most_copies=use.copies.most,
         target_miss=use.target_miss,
+        has_fallback=use.fallback_up is not None,
+        fallback_up=bool(use.fallback_up),
     )
 
 

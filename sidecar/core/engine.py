@@ -47,7 +47,7 @@ from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceOffer, SessionId
     from sidecar.core.budgets import Budget
@@ -76,7 +76,7 @@ class Engine:
         self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
         self._events: list[ApplicationEvent] = []
         self._interfaces: set[InterfaceName] = set()
-        self._carried: frozenset[ServiceName] = frozenset()
+        self._carried: Mapping[ServiceName, bool | None] = {}
         self._sweep_at = now + SWEEP_EVERY_S
         self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
         self.peers = Peers(own, self.stats.dropped)
@@ -158,8 +158,8 @@ class Engine:
         """Cloud: the services that local servers offer right now."""
         self._serving.set_offers(offers)
 
-    def set_carried(self, services: frozenset[ServiceName]) -> None:
-        """Robot: the proxied services that exist right now."""
+    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
+        """Robot: the proxied services that exist right now, and whether their fallbacks can be asked."""
         self._carried = services
 
     def drain(self) -> None:

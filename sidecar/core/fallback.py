@@ -26,8 +26,9 @@ MAX_WANTED = 64
 """Requests that wait for one fallback; a longer queue helps nobody."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
 """Payloads kept for fallbacks, as many as for the network: it may have given up before they have."""
-MAX_ATTEMPTS = 2
-"""What was lost with a fallback is asked once more; not for ever, as it may have been that request's fault."""
+MAX_ATTEMPTS = 4
+"""What was lost with a fallback is asked again, as it may take seconds to start anew; not for ever, as it may have been
+that request's fault."""
 
 OUTCOMES = ("started", "won", "late", "too_late", "lost", "missing", "overloaded")
 """Labels of plr_fallback_requests_total."""

@@ -14,6 +14,8 @@ from sidecar.core.events import OfferService, WithdrawService
 from sidecar.core.rules import find_rule
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from protos.model import NodeName, Peer, ServiceName
     from sidecar.core.routes import Routes
     from sidecar.core.rules import ServiceRule
@@ -69,13 +71,17 @@ class Offers:
         self._dark_since.pop(name, None)
         return WithdrawService(name, reason)
 
-    def uses(self, carried: frozenset[ServiceName]) -> tuple[ServiceUse, ...]:
-        """Return the offered services of these, as the control plane is told of them."""
+    def uses(self, carried: Mapping[ServiceName, bool | None]) -> tuple[ServiceUse, ...]:
+        """Return the offered services of these, as the control plane is told of them.
+
+        `carried` tells whether their fallbacks can be asked.
+        """
         uses = []
         for name, kind in self._offered.items():
             rule = find_rule(self._rules, name)
             if rule is not None and name in carried:
-                uses.append(ServiceUse(name, kind, rule.deadline_s, rule.idempotent, rule.copies, rule.target_miss))
+                wanted = (rule.deadline_s, rule.idempotent, rule.copies, rule.target_miss)
+                uses.append(ServiceUse(name, kind, *wanted, fallback_up=carried[name]))
         return tuple(uses)
 
     def set_peers(self, peers: list[Peer]) -> None:

@@ -22,7 +22,7 @@ from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from protos.credential import SessionCredential
     from protos.model import (
@@ -163,8 +163,8 @@ class ThreadedDataPlane:
             self._engine.set_offers(offers)
         self._hooks.services_changed()
 
-    def set_carried(self, services: frozenset[ServiceName]) -> None:
-        """Robot: the proxied services that exist right now."""
+    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
+        """Robot: the proxied services that exist right now, and whether their fallbacks can be asked."""
         with self._lock:
             self._engine.set_carried(services)
         self._hooks.services_changed()

@@ -30,6 +30,9 @@ MAX_ASKED = 64
 """Requests whose number at one fallback is remembered; the oldest is forgotten: it was lost long ago."""
 COMPLAIN_AFTER_S = 5.0
 """For so long a fallback may be missing without a word: the robot's nodes start together."""
+KEPT_FOR_S = 15.0
+"""A service is offered for so long although its fallback went away and no server is there: a node that crashed is
+started again within seconds, and what applications asked meanwhile is waiting."""
 TYPE_RETRY_S = 30.0
 """How often a type that is not installed is looked for again."""
 
@@ -111,6 +114,8 @@ class FallbackCaller:
         self._policy = Fallbacks(rules, stats.fallbacks)
         self._fallbacks: dict[ServiceName, _Fallback] = {}
         self._up: frozenset[ServiceName] = frozenset()
+        self._types: dict[ServiceName, tuple[str, float]] = {}
+        """Of those that can be asked, or could a moment ago, their types and when that was seen last."""
         self._complaints: dict[ServiceName, _Complaint] = {}
         self._refused: dict[ServiceName, str] = {}
         """Fallbacks whose type can not be used here, and that type."""
@@ -128,8 +133,8 @@ class FallbackCaller:
         return len(self._up) < len(self._fallbacks)
 
     def types(self) -> dict[ServiceName, str]:
-        """The services whose fallback can be asked right now, with their types."""
-        return {service: self._fallbacks[service].server.type.name for service in self._up}
+        """The services whose fallback can be asked, or is likely to come back, with their types."""
+        return {service: kind for service, (kind, _) in self._types.items()}
 
     # -- what becomes of requests ----------------------------------------------------------------------------------
 
@@ -205,6 +210,8 @@ class FallbackCaller:
             self._up = up
             self._policy.set_up(up, now)
             self._act(now)
+        self._types = {name: known for name, known in self._types.items() if now - known[1] < KEPT_FOR_S}
+        self._types.update({name: (self._fallbacks[name].server.type.name, now) for name in up})
         self._publish_state()
 
     def _follow(
@@ -294,4 +301,5 @@ class FallbackCaller:
         for fallback in self._fallbacks.values():
             fallback.server.close()
         self._fallbacks.clear()
+        self._types.clear()
         self._up = frozenset()

@@ -47,9 +47,8 @@ class Proxies:
         on_request: Callable[[ServiceProxy, RmwRequestId, bytes, float], None],
         on_bad_request: Callable[[ServiceProxy, RosBridgeError, float], None],
         on_closed: Callable[[ServiceProxy, int], None],
-        on_carried: Callable[[frozenset[ServiceName]], None],
     ) -> None:
-        """`on_closed` is told how many requests lay at a proxy unseen, `on_carried` which services exist now."""
+        """`on_closed` is told how many requests lay at a proxy unseen."""
         self._loop = loop
         self._own_node = loop.node.get_fully_qualified_name()
         self._rules = rules
@@ -57,7 +56,6 @@ class Proxies:
         self._on_request = on_request
         self._on_bad_request = on_bad_request
         self._on_closed = on_closed
-        self._on_carried = on_carried
         self.offers: dict[ServiceName, str] = {}
         """What servers in the network offer, and of which type."""
         self._proxies: dict[ServiceName, ServiceProxy] = {}
@@ -172,10 +170,7 @@ class Proxies:
     def _publish_state(self) -> None:
         self._stats.left_alone = {name: tuple(sorted(nodes)) for name, nodes in self._left_alone.items()}
         self._stats.missing_types = dict(self._missing_types)
-        carried = frozenset(self._proxies)
-        if carried != self._stats.carried:
-            self._stats.carried = carried
-            self._on_carried(carried)
+        self._stats.carried = frozenset(self._proxies)
 
     def close(self) -> None:
         """Withdraw every proxy."""

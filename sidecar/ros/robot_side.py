@@ -23,6 +23,7 @@ from sidecar.ros.reply_pacer import ReplyPacer
 from sidecar.ros.request_numbering import RequestNumbering
 
 if TYPE_CHECKING:
+    from protos.model import ServiceName
     from sidecar.core.events import ApplicationEvent, RequestId
     from sidecar.core.rules import ServiceRule
     from sidecar.ports import DataPlane
@@ -83,6 +84,8 @@ class RobotSide:
             on_failure=self._tell_failure,
         )
         self._pending: dict[RequestId, _Pending] = {}
+        self._carried: dict[ServiceName, bool | None] = {}
+        """What the data plane was told of last."""
         self._proxies = Proxies(
             loop=loop,
             rules=rules,
@@ -91,7 +94,6 @@ class RobotSide:
             on_request=self._submit,
             on_bad_request=self._bad_request,
             on_closed=self._proxy_closed,
-            on_carried=data_plane.set_carried,
         )
         self.look_is_due = False
         """The graph should be looked at before the next scan period is over."""
@@ -111,9 +113,11 @@ class RobotSide:
                 self._fail(event, now)
             case OfferService():
                 self._proxies.offer(event)
+                self._publish_carried()
                 self.look_is_due = True
             case WithdrawService():
                 self._proxies.withdraw(event, self._fallbacks.types())
+                self._publish_carried()
             case _:
                 self._stats.dropped["event_for_other_role"] += 1
 
@@ -272,6 +276,13 @@ class RobotSide:
             self._stats.scans += 1
             self._fallbacks.look(served, self._proxies.offers, now)
             self._proxies.look(served, self._fallbacks.types(), now)
+            self._publish_carried()
+
+    def _publish_carried(self) -> None:
+        carried = {service: self._stats.fallback_up.get(service) for service in self._stats.carried}
+        if carried != self._carried:
+            self._carried = carried
+            self._data_plane.set_carried(carried)
 
     # -- time ----------------------------------------------------------------------------------------------------
 
@@ -291,3 +302,4 @@ class RobotSide:
         """Withdraw every service."""
         self._fallbacks.close()
         self._proxies.close()
+        self._publish_carried()

@@ -151,7 +151,7 @@ class Robot:
         assert self.plane.apply_mapping(MappingSet(Version(1), 1, mappings)) is None
         with self._news:
             assert self._news.wait_for(lambda: self._offered == set(services), PATIENCE_S)
-        self.plane.set_carried(frozenset(services))
+        self.plane.set_carried(dict.fromkeys(services))
 
     def __enter__(self) -> Self:
         return self

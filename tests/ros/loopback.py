@@ -25,7 +25,7 @@ from sidecar.core.events import (
 from sidecar.core.priority import Priority
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from protos.model import ServiceOffer
     from sidecar.core.events import RejectReason, RequestId
@@ -216,8 +216,8 @@ class RobotPlane:
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         raise AssertionError("a robot offers nothing")
 
-    def set_carried(self, services: frozenset[ServiceName]) -> None:
-        self._link.carried = services
+    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
+        self._link.carried = frozenset(services)
 
 
 class CloudPlane:
@@ -242,5 +242,5 @@ class CloudPlane:
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         self._link.offered(offers)
 
-    def set_carried(self, services: frozenset[ServiceName]) -> None:
+    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
         raise AssertionError("a server carries nothing")

@@ -318,7 +318,7 @@ class Mesh:
 
             self.at(delay, answer)
         elif type(event).__name__ == "OfferService":
-            node.engine.set_carried(frozenset(node.engine._offers.offered))
+            node.engine.set_carried(dict.fromkeys(node.engine._offers.offered))
 
     def _carry(self, source: Address, destination: Address, data: bytes) -> None:
         if self.tap is not None:

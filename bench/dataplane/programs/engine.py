@@ -113,7 +113,7 @@ class EngineProgram:
         """Robot: return when a path is up and the service can be called."""
         if not self._offered.wait(READY_TIMEOUT_S):
             raise TimeoutError("no path came up")
-        self._plane.set_carried(frozenset({SERVICE}))
+        self._plane.set_carried({SERVICE: None})
 
     def call(self, **plan: Any) -> dict[str, Any]:
         """Robot: send the requests of a plan; returns its log."""

@@ -189,6 +189,8 @@ class ServiceUse(_message.Message):
     LEAST_COPIES_FIELD_NUMBER: _builtins.int
     MOST_COPIES_FIELD_NUMBER: _builtins.int
     TARGET_MISS_FIELD_NUMBER: _builtins.int
+    HAS_FALLBACK_FIELD_NUMBER: _builtins.int
+    FALLBACK_UP_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     type: _builtins.str
     deadline_us: _builtins.int
@@ -201,6 +203,9 @@ class ServiceUse(_message.Message):
     """Above 0: wanted is the cheapest mapping that misses the deadline with at most this probability. 0: the most
     reliable one.
     """
+    has_fallback: _builtins.bool
+    """A service on the robot itself answers when the network does not, and whether it can be asked right now."""
+    fallback_up: _builtins.bool
     def __init__(
         self,
         *,
@@ -211,10 +216,12 @@ class ServiceUse(_message.Message):
         least_copies: _builtins.int = ...,
         most_copies: _builtins.int = ...,
         target_miss: _builtins.float = ...,
+        has_fallback: _builtins.bool = ...,
+        fallback_up: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["deadline_us", b"deadline_us", "idempotent", b"idempotent", "least_copies", b"least_copies", "most_copies", b"most_copies", "name", b"name", "target_miss", b"target_miss", "type", b"type"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["deadline_us", b"deadline_us", "fallback_up", b"fallback_up", "has_fallback", b"has_fallback", "idempotent", b"idempotent", "least_copies", b"least_copies", "most_copies", b"most_copies", "name", b"name", "target_miss", b"target_miss", "type", b"type"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from controlplane.status_table import render
 from protos.model import (
     Assignment,
@@ -67,6 +69,18 @@ def test_a_mapping_to_nowhere_is_said_so() -> None:
         services=(ServiceMapping(PLAN, (), 1.0, "no live server"),),
     )
     assert "/plan: nowhere (predicted miss 1; no live server)" in render([robot])
+
+
+def test_fallbacks_are_shown_where_there_are_any() -> None:
+    peer = Peer(NodeName("robot"), Role.ROBOT, SessionId(2), b"", 1)
+    for fallback_up, told in (
+        (None, ""),
+        (True, "/plan: fallback ready on the robot"),
+        (False, "/plan: fallback MISSING"),
+    ):
+        text = render([SidecarStatus(peer, True, 1.0, "", uses=(replace(use(), fallback_up=fallback_up),))])
+        assert told in text
+        assert ("fallback" in text) == bool(told)
 
 
 def test_refused_offers_are_shown() -> None:

@@ -139,6 +139,7 @@ uses = st.builds(
     st.booleans(),
     copies.map(lambda pair: Copies(*pair)),
     probabilities,
+    st.none() | st.booleans(),
 )
 permits = st.just(ALL_CALLS) | st.builds(CallPermit, st.frozensets(service_names, max_size=3))
 peers = st.builds(

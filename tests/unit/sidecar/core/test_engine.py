@@ -112,7 +112,7 @@ def cloud() -> Sidecar:
 
 def robot() -> Sidecar:
     sidecar = Sidecar(Role.ROBOT, A)
-    sidecar.engine.set_carried(frozenset({ECHO}))
+    sidecar.engine.set_carried({ECHO: None})
     return sidecar
 
 
@@ -250,8 +250,10 @@ def test_the_robot_offers_what_a_reachable_cloud_offers_and_says_what_it_carries
     engine.on_link_event(PathChanged(path(), PathState.UP, ""), 0.1)
     assert engine.take_events() == [OfferService(ECHO, TYPE)]
     assert engine.uses() == ()
-    engine.set_carried(frozenset({ECHO}))
+    engine.set_carried({ECHO: None})
     assert engine.uses() == (ServiceUse(ECHO, TYPE, 0.1, idempotent=True),)
+    engine.set_carried({ECHO: True})
+    assert engine.uses() == (ServiceUse(ECHO, TYPE, 0.1, idempotent=True, fallback_up=True),)
 
 
 def test_a_request_for_a_service_that_is_not_offered_fails_at_once() -> None:

@@ -188,15 +188,16 @@ def test_missing_is_told_and_asked_when_it_comes() -> None:
     assert world.counted() == {"missing": 2, "started": 1, "late": 1}
 
 
-def test_what_went_down_with_it_is_asked_once_more() -> None:
+def test_what_went_down_with_it_is_asked_again_but_not_for_ever() -> None:
     world = World()
     world.submit(1)
     world.run_until(0.8)
     world.up(0.85, up=False)
     assert world.asked() == []
     world.up(0.9)
-    assert world.asked() == [1]
-    world.fallbacks.replaced(PLAN, 0.95)
+    for _ in range(fallback.MAX_ATTEMPTS - 1):
+        assert world.asked() == [1]
+        world.fallbacks.replaced(PLAN, 0.95)
     assert world.asked() == []
     assert world.counted() == {"started": 1, "lost": 1}
     assert world.fail(1, 2.0)
@@ -206,8 +207,8 @@ def test_what_went_down_with_it_is_asked_once_more() -> None:
 def test_a_hung_one_is_given_up_and_tried_again() -> None:
     world = World()
     world.submit(1)
-    again = START_S + fallback_queue.STALL_S
-    assert world.run_until(9.0) == [(rounded(START_S), 1), (rounded(again), 1)]
+    begins = [rounded(START_S + turn * fallback_queue.STALL_S) for turn in range(fallback.MAX_ATTEMPTS)]
+    assert world.run_until(9.0) == [(at, 1) for at in begins]
     assert not world.fallbacks._queues[PLAN].called, "there is room for the next"
     assert world.fallbacks.answered(request_id(1), 9.0) is None
     assert world.fail(1, 10.0)
