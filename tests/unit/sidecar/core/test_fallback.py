@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections import Counter
 
 import pytest
@@ -288,4 +289,49 @@ def test_services_without_a_fallback_leave_nothing_behind() -> None:
     world.submit(1, service=ServiceName("/other"))
     assert world.fallbacks.deadline_missed(request_id(1), 1.0)
     assert world.fail(1, 2.0)
+    world.assert_empty()
+
+
+@pytest.mark.parametrize("drop_late", [False, True])
+def test_whatever_happens_each_request_ends_once_and_nothing_is_left(*, drop_late: bool) -> None:
+    """Networks and fallbacks that answer, fail, vanish and return at random."""
+    rng = random.Random(3)
+    world = World(takes_s=None, drop_late=drop_late)
+    ends: Counter[int] = Counter()
+    network: list[tuple[float, int, str]] = []
+    asked: list[tuple[float, int]] = []
+    count = 0
+    for step in range(4000):
+        now = step * 0.01
+        if step < 2500 and rng.random() < 0.2:
+            count += 1
+            world.submit(count, now=now)
+            fate = rng.choice(["answer", "fail", "unreachable"])
+            network.append((now + rng.choice([0.05, 0.9, 3.0]), count, fate))
+        if rng.random() < 0.01:
+            world.up(now, up=rng.random() < 0.7)
+        if rng.random() < 0.005:
+            world.fallbacks.replaced(PLAN, now)
+        for at, number, fate in [event for event in network if event[0] <= now]:
+            network.remove((at, number, fate))
+            if fate == "answer":
+                ends[number] += not world.fallbacks.has_answered(request_id(number))
+                world.fallbacks.network_answered(request_id(number), now)
+            elif fate == "fail":
+                ends[number] += world.fail(number, now)
+            else:
+                world.fallbacks.unreachable(request_id(number), now)
+                network.append((at + LIFETIME_S - 3.0, number, "fail"))
+        world.fallbacks.handle_timer(now)
+        asked += [(now + rng.choice([0.05, 0.3, 5.0]), number) for number in world.asked()]
+        for at, number in [answer for answer in asked if answer[0] <= now]:
+            asked.remove((at, number))
+            if rng.random() < 0.1:
+                world.fallbacks.refused(request_id(number), now)
+            else:
+                ends[number] += world.fallbacks.answered(request_id(number), now) is not None
+        for failure in world.fallbacks.take_failures():
+            ends[next(number for number in range(1, count + 1) if request_id(number) == failure.request_id)] += 1
+    assert set(ends.values()) == {1}
+    assert len(ends) == count > 400
     world.assert_empty()
