@@ -57,6 +57,7 @@ class Correlation(enum.Enum):
     """Whether two paths miss together."""
 
     TOGETHER = "fail together"
+    LIKELY = "seem to fail together, but too little was seen to be sure"
     INDEPENDENT = "no sign that one failing says anything of the other"
     APART = "seldom fail together"
 

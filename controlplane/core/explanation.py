@@ -38,7 +38,10 @@ MIN_EXPECTED = 3.0
 """Common misses that chance would have brought, below which their absence says nothing."""
 
 MIN_TOGETHER = 2.0
-"""Common misses that it takes to say that two paths fail together."""
+"""Common misses that it takes to say that two paths fail together, or seem to."""
+
+LIKELY_LIFT = 3.0
+"""How many times as often as by chance both must have missed for paths that seem to fail together."""
 
 
 class UnknownNameError(Exception):
@@ -190,8 +193,11 @@ def _joints(block: Block, estimator: Estimator, now: float) -> tuple[JointExplan
 
 
 def _correlation(both_miss: Belief, product: float, requests: float, both_missed: float) -> Correlation:
-    if both_miss.low > product and both_missed >= MIN_TOGETHER:
-        return Correlation.TOGETHER
+    if both_missed >= MIN_TOGETHER:
+        if both_miss.low > product:
+            return Correlation.TOGETHER
+        if both_miss.mean >= LIKELY_LIFT * product:
+            return Correlation.LIKELY
     if both_miss.high < product and requests * product >= MIN_EXPECTED:
         return Correlation.APART
     return Correlation.INDEPENDENT

@@ -58,6 +58,7 @@ MAX_SHARED = 16
 
 _CORRELATIONS = {
     admin_pb2.CORRELATION_TOGETHER: Correlation.TOGETHER,
+    admin_pb2.CORRELATION_LIKELY: Correlation.LIKELY,
     admin_pb2.CORRELATION_INDEPENDENT: Correlation.INDEPENDENT,
     admin_pb2.CORRELATION_APART: Correlation.APART,
 }

@@ -98,6 +98,16 @@ def test_it_tells_what_the_mapping_rests_on(world: World) -> None:
     assert "capacity for one robot exceeded by 1" in text
 
 
+def test_one_streak_of_common_misses_is_not_taken_for_proof_nor_for_nothing(world: World) -> None:
+    robot = world.sidecars[ROBOT]
+    both = (("wlan0", "a"), ("wwan0", "b"))
+    for seconds, share in ((60, 0.0), (5, 1.0), (40, 0.0)):
+        measured(world, robot, seconds=seconds, misses=dict.fromkeys(both, share))
+    (joint,) = asked(world).joints
+    assert joint.correlation is Correlation.LIKELY
+    assert "seem to fail together" in render(asked(world))
+
+
 def test_paths_that_miss_without_each_other_are_not_said_to_fail_together(world: World) -> None:
     measured(world, world.sidecars[ROBOT], seconds=20, misses={("wlan0", "a"): 0.0, ("wwan0", "b"): 0.1})
     (joint,) = asked(world).joints

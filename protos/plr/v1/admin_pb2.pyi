@@ -76,6 +76,8 @@ class _CorrelationEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Correlati
     CORRELATION_TOGETHER: _Correlation.ValueType  # 1
     CORRELATION_INDEPENDENT: _Correlation.ValueType  # 2
     CORRELATION_APART: _Correlation.ValueType  # 3
+    CORRELATION_LIKELY: _Correlation.ValueType  # 4
+    """More often together than by chance, in too few streaks to be sure."""
 
 class Correlation(_Correlation, metaclass=_CorrelationEnumTypeWrapper): ...
 
@@ -83,6 +85,8 @@ CORRELATION_UNSPECIFIED: Correlation.ValueType  # 0
 CORRELATION_TOGETHER: Correlation.ValueType  # 1
 CORRELATION_INDEPENDENT: Correlation.ValueType  # 2
 CORRELATION_APART: Correlation.ValueType  # 3
+CORRELATION_LIKELY: Correlation.ValueType  # 4
+"""More often together than by chance, in too few streaks to be sure."""
 Global___Correlation: _TypeAlias = Correlation  # noqa: Y015
 
 class _AlternativeKind:
