@@ -121,13 +121,14 @@ def _run(config: SidecarConfig) -> int:
     faulthandler.enable()
     # gRPC's own lines on stderr have another format, and what they tell is in our log.
     os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
-    # Late: it takes a second to import, and a wrong configuration is to be told at once.
-    from sidecar.runtime import run
-
     stop = StopRequest()
     with Logging(config.log_level.value, sys.stderr):
         failure = _stop_on_signals_and_crashes(stop)
         try:
+            # Late: it takes a second to import, several on a busy machine; a wrong configuration has been told by now,
+            # and a signal is heeded meanwhile.
+            from sidecar.runtime import run
+
             code = run(config, software_version(), stop)
         except ConfigError:
             raise

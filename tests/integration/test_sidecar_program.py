@@ -191,6 +191,28 @@ def test_runs_without_control_plane_and_stops_cleanly(program: Program, number: 
     assert " ERROR " not in program.log
 
 
+INTERRUPTED_IMPORT = """
+import signal, sys, types
+
+class Runtime(types.ModuleType):
+    def __getattr__(self, name):
+        if name != "run":
+            raise AttributeError(name)
+        signal.raise_signal(signal.SIGTERM)
+        return lambda config, version, stop: print("stopped", stop.wait()) or 0
+
+sys.modules["sidecar.runtime"] = Runtime("sidecar.runtime")
+from sidecar.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_signal_that_comes_while_it_still_imports_is_heeded(program: Program) -> None:
+    command = [sys.executable, "-c", INTERRUPTED_IMPORT, "--config", str(program.path)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S)
+    assert (ended.returncode, ended.stdout) == (0, "stopped on SIGTERM\n"), ended.stderr
+
+
 CLOUD = with_credential(Peer(NodeName("cloud-a"), Role.CLOUD, SessionId(9), bytes(range(16)), incarnation=1))
 PEERS = PeerSet(Version(11), 0, (CLOUD,))
 
