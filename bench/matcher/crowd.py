@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import time
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from controlplane.core.control import ControlCore
@@ -34,7 +36,7 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterator
 
     from controlplane.core.registry import StreamId
 
@@ -59,6 +61,8 @@ class Crowd:
         self.core = ControlCore(Settings(lease_s=1e6, warm_up_s=0.0), version_epoch=1, now=0.0)
         self.matcher = Matcher()
         self.mappings: dict[NodeName, MappingSet] = {}
+        self.turns: dict[str, list[float]] = {"report": [], "draw": [], "settle": []}
+        """Seconds that each call of the core took, for which all streams of a control plane wait."""
         self._rng = random.Random(seed)
         self._owner: dict[StreamId, NodeName] = {}
         self._stream: dict[NodeName, StreamId] = {}
@@ -134,7 +138,14 @@ class Crowd:
 
     def tell(self, robot: NodeName, report: Report) -> None:
         """The core gets a report."""
-        self.core.receive(self._stream[robot], report, self.now)
+        with self._turn("report"):
+            self.core.receive(self._stream[robot], report, self.now)
+
+    @contextmanager
+    def _turn(self, kind: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.turns[kind].append(time.perf_counter() - began)
 
     def tell_all(self) -> None:
         """All robots report, and the plan that follows is made and sent."""
@@ -146,11 +157,13 @@ class Crowd:
 
     def solve(self) -> int:
         """Do what is due, as the driver does; returns how many mappings were sent."""
-        picture = self.core.start_solving(self.now)
+        picture = None
         while picture is None:
-            picture = self.core.start_solving(self.now)
+            with self._turn("draw"):
+                picture = self.core.start_solving(self.now)
         plan = self.matcher.solve(picture.problem, time_limit_s=SOLVE_LIMIT_S, hint=self.core.plan)
-        self.core.solved(picture, plan, self.now)
+        with self._turn("settle"):
+            self.core.solved(picture, plan, self.now)
         return self.drain()
 
     def drain(self) -> int:

@@ -76,6 +76,8 @@ DEFAULT_LIMIT_S = int(ControlPlaneConfig.model_fields["solver_time_limit_ms"].de
 RECORDS = 1_000_000
 CHANGES = 60
 """Robots whose estimates change, one after the other."""
+ROUNDS_TO_WARM_UP, ROUNDS = 3, 10
+"""Times that each robot of the fleet reports."""
 SPACING_S = 0.02
 """Between two of them."""
 
@@ -97,15 +99,28 @@ def measure(say: Callable[[str], None], *, quick: bool) -> Findings:
         say(f"speed: {name}")
         _one_by_one(name, lifts, findings)
     say("speed: from report to mapping")
-    _from_report_to_mapping(findings)
+    crowd = Crowd(1000, 2, 20, seed=1)
+    for _ in range(ROUNDS_TO_WARM_UP):
+        crowd.tell_all()
+    _from_report_to_mapping(crowd, findings)
+    say("speed: turns")
+    _turns(crowd, findings)
     return findings
 
 
-def _from_report_to_mapping(findings: Findings) -> None:
-    """The whole way in the control plane: a path of one robot dies, and its new mapping is there to be sent."""
-    crowd = Crowd(1000, 2, 20, seed=1)
-    for _ in range(3):
+def _turns(crowd: Crowd, findings: Findings) -> None:
+    """How long all streams wait for one report, a slice of a new problem, and a plan to be put in force, when the whole
+    fleet reports once a second."""
+    crowd.turns = {kind: [] for kind in crowd.turns}
+    for _ in range(ROUNDS):
         crowd.tell_all()
+    for kind, turns in crowd.turns.items():
+        findings.figures[f"control_{kind}_p99_ms"] = float(np.quantile(turns, 0.99)) * 1e3
+        findings.figures[f"control_{kind}_worst_ms"] = max(turns) * 1e3
+
+
+def _from_report_to_mapping(crowd: Crowd, findings: Findings) -> None:
+    """The whole way in the control plane: a path of one robot dies, and its new mapping is there to be sent."""
     took, took_cpu, sent = [], [], 0
     for robot in random.Random(3).sample(crowd.robots, CHANGES):
         report = crowd.report(robot, dead=("if0",))
