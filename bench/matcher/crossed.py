@@ -58,10 +58,10 @@ class Load:
         return start
 
 
-def pairs_of(servers: int) -> tuple[Assignment, ...]:
+def pairs_of(servers: int, interfaces: tuple[str, ...] = PATHS) -> tuple[Assignment, ...]:
     """All pairs of an interface and a server, in the order of a crossed race's paths."""
     return tuple(
-        Assignment(InterfaceName(path), NodeName(f"cloud-{server}")) for path in PATHS for server in range(servers)
+        Assignment(InterfaceName(path), NodeName(f"cloud-{server}")) for path in interfaces for server in range(servers)
     )
 
 

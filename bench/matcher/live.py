@@ -1,8 +1,8 @@
 """Section `live`: two servers of the real system swap load, and the mapping follows.
 
-The robot has one interface, so it uses one of two servers; the other is too busy for the deadline. Then that one is
-idle, and the robot's own is busy. In between the sidecar saves the requests: at half the deadline it asks the other
-one too.
+There is one server more than the robot has interfaces, and the one that it does not use is too busy for the deadline.
+Then that one is idle, and one of the robot's own is busy. In between the sidecar saves the requests: another copy is in
+time, or, where there is none, it asks another server at half the deadline.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.dataplane.section import Findings, Table
+from bench.dataplane.section import Figure, Findings, Table
 from bench.netlab import Lab, LabConfig, LinkProfile
 from bench.system import System, read_json
 from protos.errors import DecodeError
@@ -27,11 +27,13 @@ if TYPE_CHECKING:
     from protos.explanation import Explanation
 
 SERVICE = "/echo"
-CLOUDS = ("cloud_a", "cloud_b")
+CLOUDS = ("cloud_a", "cloud_b", "cloud_c")
 DEADLINE_MS = 150
 RATE_HZ = 20
 BURDEN_MS = 250.0
-LINKS = {"wlan0": LinkProfile(delay_ms=5, jitter_ms=2)}
+LINKS = {"wlan0": LinkProfile(delay_ms=5, jitter_ms=2), "wwan0": LinkProfile(delay_ms=15, jitter_ms=5)}
+INTERFACES = (1, 2)
+"""With so many in turn, and one server more."""
 BEFORE_S = 20.0
 """So long the other server is busy before they swap."""
 FOLLOW_S = 60.0
@@ -55,50 +57,60 @@ class Followed:
 
 
 def measure(say: Callable[[str], None]) -> Findings:
-    """Swap the load once."""
-    say("live: two servers swap load")
-    with tempfile.TemporaryDirectory(prefix="plr-live-") as folder:
-        followed = swap_load(Path(folder))
-    findings = Findings(notes=[f"live: {followed.reason}"])
-    findings.figures = {"live_follow_s": followed.seconds, "live_lost": followed.lost}
-    row = (followed.seconds, followed.sent, followed.lost, followed.late)
-    findings.tables = [Table("two servers swap load", ("followed after s", "sent", "lost", "late"), (row,))]
+    """Swap the load once with each number of interfaces; the figures are the worst."""
+    rows: list[tuple[str | Figure, ...]] = []
+    findings = Findings()
+    found: list[Followed] = []
+    for interfaces in INTERFACES:
+        say(f"live: two servers of {interfaces + 1} swap load")
+        with tempfile.TemporaryDirectory(prefix="plr-live-") as folder:
+            followed = swap_load(Path(folder), interfaces=interfaces)
+        findings.notes.append(f"live: {followed.reason}")
+        rows.append((f"{interfaces} x {interfaces + 1}", followed.seconds, followed.sent, followed.lost, followed.late))
+        found.append(followed)
+    findings.figures = {
+        "live_follow_s": max(followed.seconds for followed in found),
+        "live_lost": sum(followed.lost for followed in found),
+    }
+    columns = ("interfaces x servers", "followed after s", "sent", "lost", "late")
+    findings.tables = [Table("two servers swap load", columns, tuple(rows))]
     return findings
 
 
-def swap_load(folder: Path, *, before_s: float = BEFORE_S) -> Followed:
-    """Bring the system up, swap the load of its two servers after so many seconds, wait until the mapping followed."""
-    with Lab(LabConfig.of(interfaces=tuple(LINKS), clouds=len(CLOUDS)), seed=1) as lab:
-        for name, profile in LINKS.items():
+def swap_load(folder: Path, *, interfaces: int, before_s: float = BEFORE_S) -> Followed:
+    """Bring the system up, swap the load of two servers after so many seconds, wait until the mapping followed."""
+    links, clouds = dict(list(LINKS.items())[:interfaces]), CLOUDS[: interfaces + 1]
+    with Lab(LabConfig.of(interfaces=tuple(links), clouds=len(clouds)), seed=1) as lab:
+        for name, profile in links.items():
             lab.link(name).set(profile)
         system = System(lab, folder)
         try:
-            return _swap(system, before_s)
+            return _swap(system, tuple(links), clouds, before_s)
         finally:
             system.close()
 
 
-def _swap(system: System, before_s: float) -> Followed:
-    _burden(system, busy="")
+def _swap(system: System, links: tuple[str, ...], clouds: tuple[str, ...], before_s: float) -> Followed:
+    _burden(system, clouds, busy="")
     system.start_control_plane()
-    for cloud in CLOUDS:
+    for cloud in clouds:
         argv = ["-m", "bench.echo", "serve", "--burden", str(_burden_file(system, cloud))]
         system.start_node(f"{cloud}.server", cloud, argv)
         system.start_cloud(cloud, [{"name": SERVICE}])
     rule = {"name": SERVICE, "deadline_ms": DEADLINE_MS, "lifetime_ms": 30_000, "idempotent": True}
-    system.wait_for_offer(system.start_robot([rule], interfaces=tuple(LINKS)))
+    system.wait_for_offer(system.start_robot([rule], interfaces=links))
     out = system.folder / "call.json"
     argv = ["-m", "bench.echo", "call", "--rate", str(RATE_HZ), "--duration", "600", "--grace-s", "25"]
     client = system.start_node("client", "robot", [*argv, "--deadline-ms", str(DEADLINE_MS), "--json", str(out)])
-    system.wait("the mapping", lambda: bool(_mapped(system)))
-    (own,) = _mapped(system)
-    (other,) = (cloud for cloud in CLOUDS if _named(cloud) != own)
-    _burden(system, busy=other)
+    system.wait("the mapping", lambda: len(_mapped(system)) == len(links))
+    (idle,) = (cloud for cloud in clouds if _named(cloud) not in _mapped(system))
+    _burden(system, clouds, busy=idle)
     time.sleep(before_s)
-    system.wait(f"the mapping to name {own}", lambda: _mapped(system) == {own})
+    system.wait(f"the mapping to avoid {idle}", lambda: _avoids(system, idle, links), FOLLOW_S)
+    own = next(cloud for cloud in clouds if cloud != idle)
     swapped = time.monotonic()
-    _burden(system, busy=next(cloud for cloud in CLOUDS if cloud != other))
-    system.wait(f"the mapping to name {other}", lambda: _mapped(system) == {_named(other)}, FOLLOW_S)
+    _burden(system, clouds, busy=own)
+    system.wait(f"the mapping to avoid {own}", lambda: _avoids(system, own, links), FOLLOW_S)
     explanation = system.explain("robot", SERVICE)
     seconds = time.monotonic() - (explanation.in_force_s or 0.0) - swapped
     time.sleep(AFTER_S)
@@ -121,8 +133,13 @@ def _burden_file(system: System, cloud: str) -> Path:
     return system.folder / f"{cloud}.burden"
 
 
-def _burden(system: System, *, busy: str) -> None:
-    for cloud in CLOUDS:
+def _avoids(system: System, cloud: str, links: tuple[str, ...]) -> bool:
+    mapped = _mapped(system)
+    return _named(cloud) not in mapped and len(mapped) == len(links)
+
+
+def _burden(system: System, clouds: tuple[str, ...], *, busy: str) -> None:
+    for cloud in clouds:
         new = system.folder / f"{cloud}.new"
         new.write_text(f"{BURDEN_MS if cloud == busy else 0.0}")
         new.replace(_burden_file(system, cloud))

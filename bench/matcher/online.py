@@ -17,45 +17,20 @@ import numpy as np
 
 from bench.matcher.choosing import RTT_MEMORY
 from bench.matcher.crossed import pairs_of
-from bench.matcher.feed import REPORT_INTERVAL_S, ROBOT, SERVICE, Reporter
+from bench.matcher.feed import REPORT_INTERVAL_S, Reporter
+from bench.matcher.plane import Plane
 from bench.matcher.races import ANSWER_BYTES, PATHS
-from controlplane.core.control import ControlCore
-from controlplane.core.control_events import Send, Settings
-from controlplane.core.registry import Refusal
-from controlplane.matcher import Matcher
-from protos.model import (
-    PROTOCOL_VERSION,
-    Candidate,
-    CandidateKind,
-    CandidateSet,
-    InterfaceId,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    Registration,
-    Role,
-    ServiceMapping,
-    ServiceOffer,
-    ServiceSet,
-    ServiceUse,
-    SessionId,
-)
 from sidecar.core.copies import OBSERVED_ONE_IN
 from sidecar.core.exploration import ExplorationBudget
 from sidecar.service_config import DEFAULT_EXPLORATION
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from bench.matcher.races import Races
-    from controlplane.core.registry import StreamId
-    from protos.model import SidecarMessage
+    from protos.model import Assignment, ServiceMapping
 
 RIVALS = ("best fixed", "random", "round robin", "lowest mean RTT")
-FOREVER_S = 1e9
-JOINED_S = -2.0
-"""When all have come, before the first request."""
-SOLVER_LIMIT_S = 1.0
-TYPE = "bench/srv/Detect"
-
 Mapping = tuple[int, ...]
 """For each interface the server."""
 
@@ -75,74 +50,37 @@ class Online:
     """Copies sent to explore."""
 
 
-class _Plane:
-    """A control plane with one robot and its servers."""
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """What went on between two reports."""
 
-    def __init__(self, servers: int, deadline_s: float) -> None:
-        settings = Settings(lease_s=FOREVER_S, warm_up_s=0.0, report_interval_s=REPORT_INTERVAL_S)
-        self._core = ControlCore(settings, version_epoch=1, now=JOINED_S)
-        self._matcher = Matcher()
-        for server in range(servers):
-            services = ServiceSet(offers=(ServiceOffer(SERVICE, TYPE),))
-            self._join(NodeName(f"cloud-{server}"), Role.CLOUD, ("eth0",), services)
-        services = ServiceSet(uses=(ServiceUse(SERVICE, TYPE, deadline_s, True),))
-        self._robot = self._join(ROBOT, Role.ROBOT, PATHS, services)
-        self.mapping: ServiceMapping | None = None
-        self._advance(JOINED_S / 2)
-
-    def _join(self, name: NodeName, role: Role, interfaces: tuple[str, ...], services: ServiceSet) -> StreamId:
-        session = SessionId(zlib.crc32(name.encode()))
-        stream = self._core.register(
-            Registration(PROTOCOL_VERSION, name, role, session, name.encode().ljust(16, b"*"), 1, "bench"), JOINED_S
-        )
-        if isinstance(stream, Refusal):
-            raise TypeError(stream)
-        candidates = tuple(
-            Candidate(InterfaceId(number), InterfaceName(interface), CandidateKind.HOST, ("10.0.0.1", 4000 + number))
-            for number, interface in enumerate(interfaces)
-        )
-        self._core.receive(stream, CandidateSet(candidates), JOINED_S)
-        self._core.receive(stream, services, JOINED_S)
-        return stream
-
-    def take(self, message: SidecarMessage, now: float) -> None:
-        """The robot says this; the mapping that follows is in force at once."""
-        self._core.receive(self._robot, message, now)
-        self._advance(now)
-
-    def _advance(self, now: float) -> None:
-        self._core.handle_timer(now)
-        picture = self._core.start_solving(now)
-        if picture is not None:
-            plan = self._matcher.solve(picture.problem, time_limit_s=SOLVER_LIMIT_S, hint=self._core.plan)
-            self._core.solved(picture, plan, now)
-        while (event := self._core.next_event()) is not None:
-            if isinstance(event, Send) and event.stream == self._robot and isinstance(event.message, MappingSet):
-                self.mapping = next(iter(event.message.services), None)
+    at_s: float
+    mapping: ServiceMapping | None
+    carried: tuple[int, ...]
+    """The pairs that carried each request, by number."""
+    missed: int
+    """Requests all of whose copies were late."""
+    explored: int
 
 
-def follow(races: Races, deadline_s: float, servers: int) -> Online:
-    """Replay the requests with whatever mapping the control plane has told by then, and by its rivals' choices."""
-    pairs = pairs_of(servers)
+def replayed(races: Races, deadline_s: float, pairs: Sequence[Assignment]) -> Iterator[Tick]:
+    """Replay the requests with whatever mapping the control plane has told by then."""
     number_of = {pair: number for number, pair in enumerate(pairs)}
+    servers = len({pair.server for pair in pairs})
     rng = random.Random(zlib.crc32(f"{races.trace} {servers}".encode()))
     size = races.workload.size + ANSWER_BYTES
-    reporter, plane = Reporter(deadline_s, rng, size=size, pairs=pairs), _Plane(servers, deadline_s)
+    reporter, plane = Reporter(deadline_s, rng, size=size, pairs=tuple(pairs)), Plane(pairs, deadline_s)
     probes, waiting = iter(races.probes), iter(races.races)
     probe, race = next(probes, None), next(waiting, None)
-    carried: tuple[int, ...] = ()
     budget = ExplorationBudget(0.0)
     rtts: dict[int, float] = {}
     """Of the last probe of each path: a request in trouble takes the best one."""
-    missed = 0.0
-    switches = explored = 0
     for tick in range(math.ceil(races.duration_s / REPORT_INTERVAL_S)):
         now = tick * REPORT_INTERVAL_S
+        missed = explored = 0
         plane.take(reporter.take(now), now)
         mapping = plane.mapping
-        before = carried
         carried = tuple(number_of[pair] for pair in mapping.assignments) if mapping is not None else ()
-        switches += bool(before) and set(before) != set(carried)
         explore = number_of[mapping.explore] if mapping is not None and mapping.explore is not None else None
         while probe is not None and probe.at_s < now + REPORT_INTERVAL_S:
             reporter.probed(probe)
@@ -164,7 +102,18 @@ def follow(races: Races, deadline_s: float, servers: int) -> Online:
                 if idle:
                     reporter.rescued(race, min(idle, key=lambda path: rtts[path]))
             race = next(waiting, None)
-    misses = {"matcher": missed} | _rivals(races, deadline_s, servers)
+        yield Tick(now, mapping, carried, missed, explored)
+
+
+def follow(races: Races, deadline_s: float, servers: int) -> Online:
+    """Replay the requests over both interfaces to so many servers, and by the rivals' choices."""
+    ticks = list(replayed(races, deadline_s, pairs_of(servers)))
+    switches = sum(
+        bool(before.carried) and set(before.carried) != set(after.carried)
+        for before, after in itertools.pairwise(ticks)
+    )
+    misses = {"matcher": float(sum(tick.missed for tick in ticks))} | _rivals(races, deadline_s, servers)
+    explored = sum(tick.explored for tick in ticks)
     return Online(races.trace, servers, len(races.races), races.duration_s, misses, switches, explored)
 
 

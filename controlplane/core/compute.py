@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.distribution import Distribution
-from controlplane.core.fading import FadedHistogram
+from controlplane.core.fading import FadedCount, FadedHistogram
+from controlplane.core.regime import ChangeWatch
 from controlplane.core.silence import HeardClock
 from protos.histogram import Histogram
 
@@ -14,73 +16,152 @@ if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
 
 MAX_PROCESSING = 8192
-"""Processing histograms kept, one for each (server, service); the least recently reported goes. So for services."""
+"""Processing histograms kept, one for each (server, service); the least recently reported goes."""
 
-OTHERS_REQUESTS = 2.0
+OTHERS_REQUESTS = 1.0
 """What the other servers of a service are worth, in requests to a server itself: machines are not alike."""
 
 ENOUGH_REQUESTS = 50.0
 """Requests from which on a server's own times stand alone."""
 
+DOUBTED_REQUESTS = 0.25
+"""What a server's times are still worth when another one has changed, and it was heard of ..."""
 
-class _OfService(NamedTuple):
-    """What is known of a service whichever server."""
+HEARD_REQUESTS, LATELY_HALF_LIFE_S = 1.6, 2.0
+"""... less often than this lately, fading with this half-life: by exploration alone, not by use."""
+
+
+class ServerTimes(NamedTuple):
+    """What a server is thought to need."""
+
+    times: Distribution | None
+    """None as long as nobody has asked any server."""
+    requests: float
+    """How many of its own requests that rests on."""
+
+
+@dataclass(slots=True)
+class _OfServer:
+    """What a server needs for a service."""
 
     times: FadedHistogram
+    lately: FadedCount
+    watch: ChangeWatch = field(default_factory=ChangeWatch)
+    changes: int = 0
+    before: Distribution | None = None
+    """What it needed before the last change."""
+
+
+@dataclass(slots=True)
+class _OfService:
+    """What is known of a service whichever server."""
+
     clock: HeardClock
+    servers: dict[NodeName, FadedHistogram] = field(default_factory=dict)
+    usual: Distribution | None = None
+    """Of all servers, each as one; None as long as it has to be worked out."""
 
 
 class ComputeTimes:
-    """Processing times, fading, of every server and, for those not heard of, of all servers of a service together."""
+    """Processing times, fading, of every server and, for those not heard of, what a service's servers usually need.
+
+    A server that has changed is known by what came since alone.
+    """
 
     def __init__(self, half_life_s: float) -> None:
         self._half_life_s = half_life_s
-        self._servers: OrderedDict[tuple[NodeName, ServiceName], FadedHistogram] = OrderedDict()
-        self._services: OrderedDict[ServiceName, _OfService] = OrderedDict()
+        self._servers: OrderedDict[tuple[NodeName, ServiceName], _OfServer] = OrderedDict()
+        self._services: dict[ServiceName, _OfService] = {}
+        """Of the servers kept."""
         self.dropped = 0
         """Entries evicted because a table was full."""
 
-    def merge(self, server: NodeName, service: ServiceName, processing: Histogram, now: float) -> None:
-        """Add what a server needed."""
+    def merge(self, server: NodeName, service: ServiceName, processing: Histogram, now: float) -> bool:
+        """Add what a server needed; True if that is not what it needed before."""
         if not processing.total:
-            return
+            return False
         of_service = self._services.get(service)
         if of_service is None:
-            clock = HeardClock(now)
-            of_service = self._services[service] = _OfService(FadedHistogram(self._half_life_s, now), clock)
-        self._services.move_to_end(service)
-        if len(self._services) > MAX_PROCESSING:
-            self._services.popitem(last=False)
-            self.dropped += 1
+            of_service = self._services[service] = _OfService(HeardClock(now))
         of_service.clock.hear(now)
+        of_service.usual = None
         of_server = self._servers.get((server, service))
         if of_server is None:
-            of_server = FadedHistogram(self._half_life_s, now, of_service.clock)
+            of_server = _OfServer(
+                FadedHistogram(self._half_life_s, now, of_service.clock), FadedCount(LATELY_HALF_LIFE_S, now)
+            )
             self._servers[server, service] = of_server
+            of_service.servers[server] = of_server.times
         self._servers.move_to_end((server, service))
         if len(self._servers) > MAX_PROCESSING:
-            self._servers.popitem(last=False)
-            self.dropped += 1
-        of_server.add(processing, now)
-        of_service.times.add(processing, now)
+            self._forget(*self._servers.popitem(last=False)[0])
+        of_server.lately.add(processing.total, 0.0, now)
+        since = of_server.times.held_against(processing, of_server.watch, now)
+        if since is None:
+            of_server.times.add(processing, now)
+            return False
+        of_server.changes += 1
+        of_server.before = of_server.times.distribution()
+        of_server.times = FadedHistogram(self._half_life_s, now, of_service.clock)
+        of_server.times.add(since, now)
+        of_service.servers[server] = of_server.times
+        self._doubt_others(service, of_service, now)
+        return True
+
+    def _doubt_others(self, service: ServiceName, of_service: _OfService, now: float) -> None:
+        """Load moved, and nobody knows where from or to: servers hardly heard of lately are hardly known any more."""
+        for name, times in of_service.servers.items():
+            of_server = self._servers[name, service]
+            if of_server.lately.weight(now) < HEARD_REQUESTS:
+                of_server.changes += 1
+                of_server.before = times.distribution()
+                times.forget(DOUBTED_REQUESTS / max(times.weight(now), DOUBTED_REQUESTS))
+
+    def _forget(self, server: NodeName, service: ServiceName) -> None:
+        of_service = self._services[service]
+        del of_service.servers[server]
+        if not of_service.servers:
+            del self._services[service]
+        self.dropped += 1
+
+    def changes(self, server: NodeName, service: ServiceName) -> tuple[int, Distribution | None]:
+        """How often a server changed, and what it needed before it did so last."""
+        of_server = self._servers.get((server, service))
+        return (of_server.changes, of_server.before) if of_server is not None else (0, None)
 
     def requests(self, server: NodeName, service: ServiceName, now: float, *, sample: int) -> Histogram:
         """What the server itself needed; a sample that has not faded counts `sample`."""
         of_server = self._servers.get((server, service))
-        return of_server.scaled(now, sample) if of_server is not None else Histogram()
+        return of_server.times.scaled(now, sample) if of_server is not None else Histogram()
 
-    def times(self, server: NodeName, service: ServiceName, now: float) -> tuple[Distribution | None, float]:
-        """What the server is thought to need, and how many of its own requests that rests on.
-
-        None as long as nobody has asked any server.
-        """
+    def times(self, server: NodeName, service: ServiceName, now: float) -> ServerTimes:
+        """What the server is thought to need: less of its own times, and more of the usual, the fewer these are."""
         of_server = self._servers.get((server, service))
-        own = of_server.distribution() if of_server is not None else None
-        requests = of_server.weight(now) if of_server is not None else 0.0
+        own = of_server.times.distribution() if of_server is not None else None
+        requests = of_server.times.weight(now) if of_server is not None else 0.0
         if own is not None and requests >= ENOUGH_REQUESTS:
-            return own, requests
+            return ServerTimes(own, requests)
+        usual = self._usual(service, now)
+        if own is None or usual is None:
+            return ServerTimes(own or usual, requests)
+        share = requests / (requests + OTHERS_REQUESTS)
+        return ServerTimes(Distribution.mixed(own, share, usual), requests)
+
+    def _usual(self, service: ServiceName, now: float) -> Distribution | None:
+        """What a server of the service needs whose name is not known: of each server as much as is known of it."""
         of_service = self._services.get(service)
-        all_servers = of_service.times.distribution() if of_service is not None else None
-        if own is None or all_servers is None:
-            return own or all_servers, requests
-        return Distribution.mixed(own, requests / (requests + OTHERS_REQUESTS), all_servers), requests
+        if of_service is None:
+            return None
+        if of_service.usual is None:
+            total = 0.0
+            mixed: Distribution | None = None
+            for times in of_service.servers.values():
+                found = times.distribution()
+                if found is None:
+                    continue
+                requests = times.weight(now)
+                share = requests / (requests + OTHERS_REQUESTS)
+                total += share
+                mixed = Distribution.mixed(found, share / total, mixed) if mixed is not None else found
+            of_service.usual = mixed
+        return of_service.usual

@@ -12,9 +12,10 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from controlplane.core.compute import ComputeTimes
+from controlplane.core.compute import ComputeTimes, ServerTimes
 from controlplane.core.fading import FadedCount, FadedShares
 from controlplane.core.network import RobotNetwork
+from controlplane.core.parts import Asked, from_parts
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
 from controlplane.core.silence import HeardClock
 from protos.explanation import SAMPLE
@@ -32,17 +33,12 @@ if TYPE_CHECKING:
 K = TypeVar("K")
 V = TypeVar("V")
 
-MODEL_REQUESTS = 5.0
-"""What an estimate from parts (network and processing) is worth in real requests of the very service ..."""
+CHANGE_MATTERS = 0.1
+"""A pair's outcomes are those of another server if, by its parts, the server's change moves its miss probability so
+far."""
 
-SHARED_REQUESTS = 15.0
-"""... and at most more, if the path carried other services' requests of the same size ..."""
-
-STRANGE_SERVER_REQUESTS = 2.0
-"""... but at most this, if the server's own processing times are not known yet."""
-
-MODEL_MAX_SAMPLES = 100.0
-"""Probes or requests beyond which more of them do not bring the estimate from parts any nearer to 0 or 1."""
+CHANGE_KEEPS_REQUESTS = 1.0
+"""As many of them still count then."""
 
 USUAL_SIZE_SHARE = 0.1
 """Size classes that make up less of a service's requests are left out of its estimate."""
@@ -85,6 +81,16 @@ class _Service:
         self.clock = HeardClock(now)
 
 
+class _Pair:
+    """Requests of a service over a path, and how often its server had changed when that was looked at last."""
+
+    __slots__ = ("changes", "trials")
+
+    def __init__(self, trials: FadedTrials, changes: int) -> None:
+        self.trials = trials
+        self.changes = changes
+
+
 class _Robot:
     """Tables fed by one robot."""
 
@@ -92,7 +98,7 @@ class _Robot:
 
     def __init__(self, half_life_s: float) -> None:
         self.network = RobotNetwork(half_life_s)
-        self.trials: OrderedDict[Pair, FadedTrials] = OrderedDict()
+        self.trials: OrderedDict[Pair, _Pair] = OrderedDict()
         self.joints: OrderedDict[JointKey, FadedTrials] = OrderedDict()
         self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
@@ -120,7 +126,8 @@ class Estimator:
         return self._dropped + self._compute.dropped
 
     def merge(self, robot: NodeName, report: Report, now: float) -> bool:
-        """Add a report; True if a path went up or down with it, or is reported for the first time."""
+        """Add a report; True if a path went up or down with it, or is reported for the first time, or if a server needs
+        other times than before."""
         tables = self._robots.get(robot)
         if tables is None:
             tables = self._robots[robot] = _Robot(self._half_life_s)
@@ -128,8 +135,9 @@ class Estimator:
         network = tables.network
         self._histograms -= len(network)
         dropped_before = network.dropped
+        changed = False
         for latency in report.latencies:
-            self._merge_latency(tables, latency, now)
+            changed |= self._merge_latency(tables, latency, now)
         for joint in report.joints:
             joint_key = (joint.service, joint.first, joint.second)
             of_service = tables.services.get(joint.service)
@@ -137,7 +145,6 @@ class Estimator:
             together = tables.joints.get(joint_key) or FadedTrials(self._half_life_s, now, clock)
             self._keep(tables.joints, joint_key, together, MAX_JOINTS_PER_ROBOT)
             together.add(joint.requests, joint.both_missed, now)
-        changed = False
         for path in report.paths:
             changed |= network.merge_path(path, now)
         for outcome in report.outcomes:
@@ -153,18 +160,22 @@ class Estimator:
             self._dropped += len(forgotten.network)
         return changed
 
-    def _merge_latency(self, tables: _Robot, latency: LatencyReport, now: float) -> None:
+    def _merge_latency(self, tables: _Robot, latency: LatencyReport, now: float) -> bool:
         tables.network.merge_requests(latency, now)
-        self._compute.merge(latency.server, latency.service, latency.processing, now)
+        changed = self._compute.merge(latency.server, latency.service, latency.processing, now)
         if latency.requests:
             of_service = tables.services.get(latency.service) or _Service(self._half_life_s, now)
             self._keep(tables.services, latency.service, of_service, MAX_OUTCOMES_PER_ROBOT)
             of_service.sizes.add(latency.size_class, latency.requests, now)
             of_service.clock.hear(now)
             pair = (latency.interface, latency.server, latency.service)
-            trials = tables.trials.get(pair) or FadedTrials(self._half_life_s, now, of_service.clock)
-            self._keep(tables.trials, pair, trials, MAX_PAIRS_PER_ROBOT)
-            trials.add(latency.requests, latency.missed, now)
+            found = tables.trials.get(pair)
+            if found is None:
+                changes, _ = self._compute.changes(latency.server, latency.service)
+                found = _Pair(FadedTrials(self._half_life_s, now, of_service.clock), changes)
+            self._keep(tables.trials, pair, found, MAX_PAIRS_PER_ROBOT)
+            found.trials.add(latency.requests, latency.missed, now)
+        return changed
 
     def _keep(self, table: OrderedDict[K, V], key: K, value: V, limit: int) -> None:
         """Put it in, as used last, and evict the least recently used beyond `limit`."""
@@ -218,51 +229,30 @@ class Estimator:
         tables = self._robots.get(robot)
         if tables is None:
             return IGNORANCE
-        trials = tables.trials.get((interface, server, service))
-        carried = trials.counts(now)[0] if trials is not None else 0.0
-        prior = self._from_parts(tables, interface, server, service, deadline_s, carried, now)
-        return trials.posterior(prior, now) if trials is not None else prior
-
-    def _from_parts(
-        self,
-        tables: _Robot,
-        interface: InterfaceName,
-        server: NodeName,
-        service: ServiceName,
-        deadline_s: float,
-        carried: float,
-        now: float,
-    ) -> Estimate:
-        """P(network + processing > deadline), as known without the `carried` requests of the service on this pair."""
-        processing, asked = self._compute.times(server, service, now)
-        miss = samples = shared = 0.0
-        for size_class, share in _usual_sizes(tables, service):
-            missed = worth = 0.0
-            for witness in tables.network.witnesses(interface, server, size_class, now, counted=carried * share):
-                missed += witness.requests * witness.exceeds(processing, deadline_s)
-                worth += witness.requests
-                samples += share * witness.samples
-                shared += witness.requests if witness.itself else 0.0
-            if not worth:
-                return IGNORANCE
-            miss += share * missed / worth
-        samples = min(samples, MODEL_MAX_SAMPLES)
-        mean = (samples * miss + IGNORANCE.misses) / (samples + IGNORANCE.weight)
-        weight = MODEL_REQUESTS + min(shared, SHARED_REQUESTS)
-        if asked < STRANGE_SERVER_REQUESTS:
-            weight = STRANGE_SERVER_REQUESTS
-        return Estimate.of(min(mean, 1.0), min(weight, samples + IGNORANCE.weight))
+        pair = tables.trials.get((interface, server, service))
+        carried = pair.trials.counts(now)[0] if pair is not None else 0.0
+        processing = self._compute.times(server, service, now)
+        asked = Asked(tables.network, interface, server, _usual_sizes(tables, service), deadline_s, carried)
+        prior = from_parts(asked, processing, now)
+        if pair is None:
+            return prior
+        changes, before = self._compute.changes(server, service)
+        if pair.changes != changes:
+            pair.changes = changes
+            if abs(prior.mean - from_parts(asked, ServerTimes(before, processing.requests), now).mean) > CHANGE_MATTERS:
+                pair.trials.forget(CHANGE_KEEPS_REQUESTS / max(carried, CHANGE_KEEPS_REQUESTS))
+        return pair.trials.posterior(prior, now)
 
     def evidence(self, robot: NodeName, path: Assignment, service: ServiceName, now: float) -> Evidence:
         """What was measured on this pair, for the operator."""
         tables = self._robots.get(robot) or _Robot(self._half_life_s)
         state = tables.network.paths.get((path.interface, path.server))
-        trials = tables.trials.get((path.interface, path.server, service))
+        pair = tables.trials.get((path.interface, path.server, service))
         network = Histogram()
         for size_class, _ in _usual_sizes(tables, service):
             network.merge(tables.network.requests(path.interface, path.server, size_class, now, sample=SAMPLE))
         return Evidence(
-            requests=trials.counts(now)[0] if trials is not None else 0.0,
+            requests=pair.trials.counts(now)[0] if pair is not None else 0.0,
             probes=state.rtt.weight(now) if state is not None else 0.0,
             rtt=state.rtt.scaled(now, SAMPLE) if state is not None else Histogram(),
             network=network,

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from controlplane.core.regime import ChangeWatch
     from controlplane.core.silence import HeardClock
 
 _FORGOTTEN = 1e-9
@@ -108,6 +109,20 @@ class FadedHistogram:
                 self._called_off += called_off.counts
         self._total = self._total * factor + histogram.total + ended
         self._distribution = None
+
+    def forget(self, kept: float) -> None:
+        """Only this share of what was counted still counts."""
+        self._counts = self._counts * kept
+        self._lost *= kept
+        self._total *= kept
+        if self._called_off is not None:
+            self._called_off *= kept
+        self._distribution = None
+
+    def held_against(self, new: Histogram, watch: ChangeWatch, now: float) -> Histogram | None:
+        """Let a watch judge samples that are still to be added by what is known now."""
+        kept = math.exp2((self._at - now) / self._half_life_s) * self._silence.kept()
+        return watch.add(new, self._counts, self._lost, max(kept, _FORGOTTEN), now)
 
     def weight(self, now: float) -> float:
         """How many samples it is worth by now, the lost and those called off included."""

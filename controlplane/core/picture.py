@@ -118,5 +118,5 @@ def _lifts(
             continue
         product = epsilon_one * epsilon_other
         both_miss = estimator.both_miss(key.robot, key.service, first, second, product, now).mean
-        lifts[min(one, other), max(one, other)] = both_miss / product
+        lifts[min(one, other), max(one, other)] = max(1.0, both_miss / product)
     return lifts

@@ -151,7 +151,7 @@ class FadedTrials:
         """Count trials, `misses` of them missed."""
         passed_s = now - self._at
         self._at = now
-        self._forget(self._silence.end())
+        self.forget(self._silence.end())
         ratios = self._ratios(IGNORANCE, 0.0)
         predicted, _ = self._average(ratios, 0.0)
         score_fade = math.exp2(-passed_s / (self._half_life_s * SCORE_HALF_LIFE))
@@ -165,7 +165,8 @@ class FadedTrials:
         self._streaks.fade(math.exp2(-passed_s / self._half_life_s))
         self._streaks.add(trials, misses, predicted, now)
 
-    def _forget(self, kept: float) -> None:
+    def forget(self, kept: float) -> None:
+        """Only this share of what was counted still counts."""
         if kept < 1.0:
             for memory in self._memories:
                 memory.trials *= kept

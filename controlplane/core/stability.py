@@ -45,8 +45,15 @@ CHANGE_WINDOW_S = 60.0
 """So often in so long a robot's service moves to something better. What died, or has no room, is left at once."""
 
 HOPELESS = 0.5
-"""Where all copies are expected to miss more often than this, the paths are as good as dead: no number of changes keeps
-a robot there."""
+"""A path expected to miss more often than this is as good as dead where another one over the same interface is clearly
+better, and so are all where every copy misses so often: no number of changes keeps a robot there."""
+
+CLEARLY = 0.8
+"""A path misses at most so many of another one's requests to be clearly better."""
+
+TROUBLE = 1e-3
+"""No path is trusted to miss less often when a gain is weighed: one that has not missed for minutes may go dark now,
+and then the others matter."""
 
 
 class _Difference(NamedTuple):
@@ -106,10 +113,22 @@ class Stability:
         return not spent and _is_worth_it(problem.objective, together)
 
     def _is_spent(self, difference: _Difference, now: float) -> bool:
-        if difference.old is not None and joint_miss(difference.block, difference.old) > HOPELESS:
+        if _leaves_hopeless(difference):
             return False
         times = self._changed.get(difference.block.key, ())
         return sum(now - time < CHANGE_WINDOW_S for time in times) >= MAX_CHANGES
+
+
+def _leaves_hopeless(difference: _Difference) -> bool:
+    block, new, old = difference.block, difference.new, difference.old
+    if old is None or joint_miss(block, old) > HOPELESS:
+        return True
+    for epsilons, server, left in zip(block.epsilon, new, old, strict=True):
+        then = epsilons[left] if left is not None else None
+        now = epsilons[server] if server is not None else None
+        if then is not None and now is not None and then > HOPELESS and now < CLEARLY * then:
+            return True
+    return False
 
 
 def _differences(problem: Problem, new: Plan, old: Mapping[BlockKey, Choice | None]) -> list[_Difference]:
@@ -210,9 +229,14 @@ def _saves_misses(objective: Objective, pairs: Sequence[tuple[Block, Choice, Cho
     if objective is Objective.SUM:
         enough = saved > max(IMPROVEMENT_MIN, IMPROVEMENT_SHARE * then)
     else:
-        fewer = sum(joint_miss(block, old) - joint_miss(block, new) for block, new, old in pairs)
+        fewer = sum(_missed_in_trouble(block, old) - _missed_in_trouble(block, new) for block, new, old in pairs)
         enough = saved > IMPROVEMENT_LOG * len(pairs) and fewer > IMPROVEMENT_MIN_ALL_MISS
     return enough and probability_better(objective, pairs) > SURE_ENOUGH
+
+
+def _missed_in_trouble(block: Block, choice: Choice) -> float:
+    epsilon = tuple(tuple(max(e, TROUBLE) if e is not None else None for e in row) for row in block.epsilon)
+    return joint_miss(replace(block, epsilon=epsilon), choice)
 
 
 def _reason(difference: _Difference) -> str:
