@@ -72,6 +72,14 @@ KINDS = {
         common=0.2,
         blackouts=(Blackout("ab", 0.2, 0.27), Blackout("a", 0.5, 0.65), Blackout("ab", 0.6, 0.65)),
     ),
-    "one_operator": Kind(EVEN_ATT, replace(EVEN_ATT, rtt_ms=50.0), common=0.95, dead_every_s=60.0, dead_s=8.0),
+    "one_operator": Kind(
+        EVEN_ATT,
+        replace(EVEN_ATT, rtt_ms=50.0),
+        common=0.95,
+        dead_every_s=60.0,
+        dead_s=8.0,
+        # Both radios lose their cell, and once one of them alone: what there is to gain is little, but not nothing.
+        blackouts=(Blackout("ab", 0.3, 0.35), Blackout("b", 0.5, 0.55), Blackout("ab", 0.7, 0.75)),
+    ),
 }
 """By the name that scenario files use."""
