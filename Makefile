@@ -54,7 +54,7 @@ lock: setup ## lock dependencies anew from pyproject.toml (LOCK_ARGS=--upgrade f
 bench: setup ## every measurement, reports into bench/results
 	@$(PY) -m bench $(BENCH_ARGS)
 
-bench-quick: setup ## 20 s of a drive with every contender: direct ROS 2, MPTCP, zenoh, ours (5 minutes at most, as root)
+bench-quick: setup ## 15 s of a drive with every contender: direct ROS 2, MPTCP, zenoh, ours (5 minutes at most, as root)
 	@$(PY) -m bench evaluate --quick $(BENCH_ARGS)
 
 bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP, QUIC and zenoh (15 minutes, as root)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 RUNS = "evaluation"
 """Folder of the records, within that of the reports."""
 QUICK_SCENARIO = "drive-1"
-QUICK_SECONDS = 20.0
+QUICK_SECONDS = 15.0
 USUAL = (*IDEALS, *(name for name, contender in CONTENDERS.items() if not contender.ablation))
 _COLUMNS = ("", "missed", "never answered", "mean ms", "P50 ms", "P99 ms", "kB/request", "void")
 
