@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import random
 
     from protos.credential import SessionCredential
-    from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
+    from protos.model import Address, InterfaceId, InterfaceName, NodeName, Role, SessionId
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.paths import Path
     from sidecar.core.send_queue import Run
@@ -54,6 +54,7 @@ class LinkIdentity:
     interface: InterfaceName
     interface_id: InterfaceId
     name: NodeName
+    role: Role
     session: SessionId
     token: bytes = field(repr=False)
     credential: bytes = field(repr=False)
@@ -64,7 +65,8 @@ class LinkIdentity:
         cls, credential: SessionCredential, token: bytes, interface: InterfaceName, interface_id: InterfaceId
     ) -> LinkIdentity:
         """Return who the owner of a credential is on this interface."""
-        return cls(interface, interface_id, credential.name, credential.session, token, credential.encode())
+        name, role, session = credential.name, credential.role, credential.session
+        return cls(interface, interface_id, name, role, session, token, credential.encode())
 
 
 class Batch(NamedTuple):

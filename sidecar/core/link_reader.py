@@ -6,6 +6,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
+from protos.model import Role
 from sidecar.core import frame
 from sidecar.core.frame import (
     FRAGMENT_HEAD,
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 class LinkReader:
     """Reads what one link receives."""
 
-    __slots__ = ("_events", "_keeper", "_mtu", "_opener", "_stats", "_table")
+    __slots__ = ("_events", "_keeper", "_leads", "_mtu", "_opener", "_stats", "_table")
 
     def __init__(self, table: PathTable, keeper: PathKeeper, mtu: LinkMtu) -> None:
         self._table = table
@@ -49,6 +50,9 @@ class LinkReader:
         self._opener = LinkOpener(table)
         self._events = table.events
         self._stats = table.stats
+        self._leads = table.identity.role is Role.ROBOT
+        """Whether this end says which of both ends' addresses a path uses. If each went where the other's newest
+        datagram came from, two that have several addresses each could follow each other in turns for ever."""
 
     def receive_batch(self, data: memoryview, segment: int, source: Address, now: float) -> None:
         """See `Link.receive_batch`."""
@@ -110,7 +114,7 @@ class LinkReader:
 
     def _heard(self, path: Path, source: Address, now: float, *, newest: bool) -> None:
         """An authentic datagram that is no duplicate came; `newest`: sent after all that came before."""
-        if newest and source != path.remote:
+        if newest and source != path.remote and not (self._leads and path.keeps_address(source)):
             self._mtu.moved(path, source, now)
         if path.state is PathState.DOWN:
             path.hasten_probe(now)

@@ -140,6 +140,15 @@ class Path:
         others = dict.fromkeys((self.remote, self._introducer))
         return (*(one for one in others if one and one not in self.candidates), *self.candidates)
 
+    def keeps_address(self, source: Address) -> bool:
+        """Whether an authentic datagram from another of the peer's known addresses is no reason to go there as well.
+
+        It is none while the present one, known as well, answers. An unknown one means that a NAT forgot the peer, or
+        that somebody else passes on what it sends: to be left as soon as a datagram comes from a known one.
+        """
+        known = source in self.candidates and self.remote in self.candidates
+        return known and self.state is PathState.UP and not self._rebound
+
     def note_introduction(self, source: Address, probe_id: int) -> None:
         """The peer introduced itself from here, and wants a probe answered.
 

@@ -56,6 +56,7 @@ class PathMtu:
         "_hole_at",
         "_holes",
         "_out",
+        "_probed_at",
         "_reports",
         "_row",
         "_sizes",
@@ -76,6 +77,7 @@ class PathMtu:
         self._target: int | None = None
         """The size under test; None between two searches."""
         self._tries = 0
+        self._probed_at = float("-inf")
         self._out: dict[int, int] = {}
         """Sizes of the latest probes by their id."""
         self._holes = 0
@@ -125,6 +127,7 @@ class PathMtu:
             self._rest(now)
             return None
         self._tries += 1
+        self._probed_at = now
         self._at = now + max(timeout_s, PROBE_TIMEOUT_S)
         self._out[probe_id] = self._target
         if len(self._out) > PROBES_REMEMBERED:
@@ -148,7 +151,8 @@ class PathMtu:
         self._sizes = sizes
         self._target = None
         self._out.clear()
-        self._at = now
+        # A path that changes again and again must not be filled with large probes.
+        self._at = max(now, self._probed_at + PROBE_TIMEOUT_S)
 
     def _above(self) -> int | None:
         """The next size worth testing."""

@@ -21,7 +21,7 @@ from bench.evaluation.scenario import Scenario, read_scenarios
 from bench.netlab.trace_folder import read_folder
 from controlplane.planning.fifo import FifoLink
 from sidecar.core.redundancy_mode import RedundancyMode
-from tests.sim.mesh import Mesh, Node, rule
+from tests.sim.mesh import IPV6, Mesh, Node, rule
 from tests.sim.test_mesh import mapped
 
 if TYPE_CHECKING:
@@ -73,6 +73,7 @@ class DriveMesh(Mesh):
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(seed=1)
+        self.dual_stack = True  # as the hosts of the lab
         trace = scenario.trace()
         self.begins = self.now + STARTING_S + WARM_S
         self.losses = random.Random(1)
@@ -81,7 +82,7 @@ class DriveMesh(Mesh):
 
     def _carry(self, source: Address, destination: Address, data: bytes) -> None:
         up = source[0].startswith("robot.")
-        name = (source if up else destination)[0].rsplit(".", 1)[1]
+        name = (source if up else destination)[0].removesuffix(IPV6).rsplit(".", 1)[1]
         if self.now < self.begins:
             left = max(self.now, self._warm_busy_until[name, up]) + len(data) / WARM_BYTES_PER_S
             self._warm_busy_until[name, up] = left

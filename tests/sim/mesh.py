@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from sidecar.core.budgets import Budget
 
 SERVICE = ServiceName("/echo")
+IPV6 = ":6"
+"""Ends the host part of an interface's other address, in a mesh with two; both lead over the same wire."""
 TYPE = "plr_test/srv/Echo"
 
 
@@ -121,10 +123,19 @@ class Node:
     def address(self, interface: InterfaceName) -> Address:
         return (f"{self.name}.{interface}", 1)
 
+    def addresses(self, interface: InterfaceName) -> tuple[Address, ...]:
+        address = self.address(interface)
+        return (address, (address[0] + IPV6, address[1])) if self.mesh.dual_stack else (address,)
+
+    def source(self, interface: InterfaceName, destination: Address) -> Address:
+        """Of the destination's family."""
+        return next(one for one in self.addresses(interface) if one[0].endswith(IPV6) == destination[0].endswith(IPV6))
+
     def as_peer(self) -> Peer:
         candidates = tuple(
-            Candidate(InterfaceId(number), interface, CandidateKind.HOST, self.address(interface))
+            Candidate(InterfaceId(number), interface, CandidateKind.HOST, address)
             for number, interface in enumerate(self.interfaces)
+            for address in self.addresses(interface)
         )
         peer = Peer(
             self.name,
@@ -178,6 +189,10 @@ class Mesh:
         """Of robots; set it before they start."""
         self.aeads: dict[str, Aead] = {}
         """What nodes prefer other than AES; set it before they start."""
+        self.dual_stack = False
+        """Whether interfaces have an IPv6 address as well; set it before nodes start."""
+        self.unreachable: set[str] = set()
+        """Host parts of addresses that nothing gets to."""
         self.tap: Callable[[Address, Address, bytes], None] | None = None
         """Sees every datagram that leaves: from where, where to."""
 
@@ -296,7 +311,7 @@ class Mesh:
             while batches := link.batches_to_send(now):
                 for batch in batches:
                     for datagram in batch.cut():
-                        self._carry(node.address(interface), batch.address, bytes(datagram))
+                        self._carry(node.source(interface, batch.address), batch.address, bytes(datagram))
             while (event := link.next_event()) is not None:
                 engine.on_link_event(event, now)
 
@@ -323,7 +338,9 @@ class Mesh:
     def _carry(self, source: Address, destination: Address, data: bytes) -> None:
         if self.tap is not None:
             self.tap(source, destination, data)
-        wire = self.wire(source[0], destination[0])
+        if destination[0] in self.unreachable:
+            return
+        wire = self.wire(source[0].removesuffix(IPV6), destination[0].removesuffix(IPV6))
         wire.carried += len(data)
         copies = 2 if self.rng.random() < wire.duplicate else 1
         for _ in range(copies):
@@ -345,7 +362,7 @@ class Mesh:
         self._arrive(source, destination, data)
 
     def _arrive(self, source: Address, destination: Address, data: bytes) -> None:
-        name, interface = destination[0].rsplit(".", 1)
+        name, interface = destination[0].removesuffix(IPV6).rsplit(".", 1)
         node = self.nodes.get(name)
         if node is None or not node.alive:
             return

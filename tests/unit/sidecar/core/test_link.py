@@ -28,9 +28,11 @@ from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, IDLE_PROBE_S, MAX_PROB
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
 from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import (
+    FIRST,
     OUR_INCARNATION,
     OUR_NAME,
     OUR_SESSION,
+    PEER_ADDRESS,
     WLAN,
     A,
     Bench,
@@ -241,6 +243,18 @@ def test_the_peers_newest_address_is_followed() -> None:
     bench.receive_datagram(bench.datagram(frame.encode_probe(Probe(2)), number=40))
     (batch,) = bench.link.batches_to_send(bench.now)
     assert batch.address == moved
+
+
+def test_a_robot_stays_with_the_address_that_answers_when_the_peer_uses_another_that_is_known() -> None:
+    bench = up()
+    known, unknown = ("192.0.2.2", 4000), ("198.51.100.1", 5)
+    bench.execute(SetPeers((bench.link_peer(addresses=((FIRST, (PEER_ADDRESS, known)),)),)))
+    for number, (source, followed) in enumerate(
+        [(known, PEER_ADDRESS), (unknown, unknown), (known, known), (PEER_ADDRESS, known)], 50
+    ):
+        bench.receive_datagram(bench.datagram(frame.encode_probe(Probe(number)), number=number), source)
+        (batch,) = bench.link.batches_to_send(bench.now)
+        assert batch.address == followed
 
 
 # -- peers ------------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from sidecar.core import frame
 from sidecar.core.frame import Probe, ProbeReply
 from sidecar.core.link_events import FragmentsLost, PathMtuChanged, Send, SetMtu
 from sidecar.core.outbound import OutboundMessage
-from sidecar.core.pmtu import BASE_BYTES
+from sidecar.core.pmtu import BASE_BYTES, PROBE_TIMEOUT_S
 from tests.unit.sidecar.core.builders import PEER_ADDRESS, Bench, message, path
 from tests.unit.sidecar.core.test_link import up
 
@@ -87,8 +87,23 @@ def test_the_kernel_refuses_and_what_waits_is_handed_back() -> None:
 def test_another_port_is_the_same_route_and_another_address_is_not() -> None:
     bench = up()
     search(bench)
+    bench.now += PROBE_TIMEOUT_S
     bench.receive_datagram(bench.datagram(frame.encode_probe(Probe(1))), (PEER_ADDRESS[0], 9))
     assert sizes(bench) == []
     bench.receive_datagram(bench.datagram(frame.encode_probe(Probe(2))), ("192.0.2.77", 9))
     assert sizes(bench) == [BASE_BYTES]
     assert [length for length, _ in size_probes(bench, bench.sent())] == [1252]
+
+
+def test_a_path_that_changes_again_and_again_is_not_filled_with_probes_of_the_size() -> None:
+    bench = up()
+    search(bench)
+    bench.now += PROBE_TIMEOUT_S
+    probes = []
+    for number in range(100):
+        frames = frame.encode_probe(Probe(number))
+        bench.receive_datagram(bench.datagram(frames), (f"192.0.2.{number + 100}", 9))
+        bench.link.handle_timer(bench.now)
+        probes += size_probes(bench, bench.sent())
+        bench.now += 0.01
+    assert 1 <= len(probes) <= 2
