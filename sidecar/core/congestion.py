@@ -104,6 +104,7 @@ class CongestionController:
         "_rate_before",
         "_rate_before_silence",
         "_release_at",
+        "_round_max_rtt",
         "_round_min_rtt",
         "_rtt",
         "_silent_since",
@@ -136,6 +137,7 @@ class CongestionController:
         self._probe_min_rtt = float("inf")
         self._drained_at: float | None = None
         self._round_min_rtt = float("inf")
+        self._round_max_rtt = 0.0
         self._rate_before = 0.0
 
     # -- asking ---------------------------------------------------------------------------------------------------
@@ -223,6 +225,7 @@ class CongestionController:
         self._rate_before_silence = 0.0
         if sample.rtt_s:
             self._round_min_rtt = min(self._round_min_rtt, sample.rtt_s)
+            self._round_max_rtt = max(self._round_max_rtt, sample.rtt_s)
             if self._probed_rtt_at is None or sample.rtt_s <= 1.05 * rtt.minimum + 1e-4:
                 self._probed_rtt_at = now
             if self.phase is Phase.PROBE_RTT:
@@ -291,7 +294,8 @@ class CongestionController:
     def _end_round(self, rtt: RttEstimator, now: float) -> None:
         standing_s = self._round_min_rtt - rtt.minimum if self._round_min_rtt < float("inf") else 0.0
         queued = self._stands(self._round_min_rtt, rtt)
-        self._round_min_rtt = float("inf")
+        round_max_rtt = self._round_max_rtt
+        self._round_min_rtt, self._round_max_rtt = float("inf"), 0.0
         self._phase_rounds += 1
         self.ceiling.end_round(rtt, now)
         if standing_s > rtt.minimum + 2 * END_HOST_S:
@@ -308,6 +312,9 @@ class CongestionController:
         elif self.phase is Phase.DRAIN and self._phase_rounds > DRAIN_ROUNDS:
             self._cruise()
         elif self.phase is Phase.CRUISE:
+            if not self.rate.limited_by_sender and self._is_faster(round_max_rtt, rtt):
+                self._look_for_more()
+                return
             self._next_in_cycle(queued=queued)
             unseen_s = now - (self._probed_rtt_at or now)
             if unseen_s > MINIMUM_STALE_S or (self._standing_rounds > 1 and unseen_s > PROBE_AGAIN_S):
@@ -319,8 +326,10 @@ class CongestionController:
         """Go to the next gain. What was sent at the first is acknowledged by the end of the second round."""
         if self._cycle == 0:
             self._rate_before = self.rate.settled
-        found_more = self._cycle == 1 and self.rate.settled > PROBE_GROWTH * self._rate_before and not queued
-        self._cycle = 0 if found_more else (self._cycle + 1) % len(CYCLE)
+        if self._cycle == 1 and self.rate.settled > PROBE_GROWTH * self._rate_before and not queued:
+            self._look_for_more()
+        else:
+            self._cycle = (self._cycle + 1) % len(CYCLE)
 
     def _probe_rtt(self, sample: RateSample, rtt: RttEstimator, now: float) -> None:
         """With little of ours in flight for a round trip, what remains of the queue is others'."""
@@ -335,6 +344,21 @@ class CongestionController:
             rtt.restart_minimum(self._probe_min_rtt, now)
             self._probed_rtt_at = now
             self._cruise()
+
+    def _is_faster(self, round_max_rtt: float, rtt: RttEstimator) -> bool:
+        """Whether the second datagram of a burst waited for the first for much less time than it takes at our rate.
+
+        On a slow path a round is too few datagrams to measure a quarter more, and its rate may have risen a hundredfold.
+        """
+        waits_s = DATAGRAM_BYTES / self.rate.best if self.rate.best else 0.0
+        return waits_s > END_HOST_S and round_max_rtt < rtt.minimum + waits_s / 2
+
+    def _look_for_more(self) -> None:
+        """The path carries more than we thought: as much as doubling finds."""
+        self._enter(Phase.STARTUP)
+        self._first_window = float(MIN_WINDOW_BYTES)
+        self._full_rate = 0.0
+        self._full_rounds = 0
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase

@@ -39,6 +39,21 @@ def test_bulk_fills_the_path_whatever_it_loses_at_random(
     assert net.mean_queue_s(2.0) < 0.25 * rtt_s + 0.012
 
 
+@pytest.mark.parametrize("rtt_s", [0.020, 0.050, 0.100])
+@pytest.mark.parametrize(("before", "after"), [(20e3, 2e6), (50e3, 1e6), (300e3, 2e6), (1e6, 6e6)])
+def test_a_rate_that_rises_a_hundredfold_is_soon_used(before: float, after: float, rtt_s: float) -> None:
+    net = Bottleneck(before, rtt_s, 1.2e6)
+    flow = OurFlow(net)
+    net.at(0.01, flow.watch)
+    net.run(10.0)
+    assert net.mean_queue_s(5.0) < 4 * 1200 / before, "four datagrams are the least in flight"
+    net.rate = after
+    net.run(12.5)
+    delivered = flow.delivered
+    net.run(13.5)
+    assert flow.delivered - delivered > 0.5 * after
+
+
 @pytest.mark.parametrize("other", ["reno", "cubic"])
 @pytest.mark.parametrize(
     ("rate", "rtt_s", "buffer"),
