@@ -166,8 +166,15 @@ class Dispatching:
         if not insist and any(routes.state(copy.path) is PathState.UP for copy in waiting):
             return
         path = self._next_withheld(request) or self._elsewhere(request, rejected=rejected)
-        if path is not None:
-            self._send(request, path, now, _Why.TROUBLE)
+        if path is None:
+            return
+        if any(copy.path.interface == path.interface and self._is_on_its_way(copy) for copy in waiting):
+            return  # another one behind it would only make it later
+        self._send(request, path, now, _Why.TROUBLE)
+
+    def _is_on_its_way(self, copy: Copy) -> bool:
+        """Whether its server may not have all of it yet, as its path is slow and not dead."""
+        return not copy.message.newest.over and self._parts.routes.state(copy.path) is not PathState.DOWN
 
     def _next_over_another_interface(self, request: Request) -> PathId | None:
         used = {copy.path.interface for copy in request.relied_on()}
