@@ -348,7 +348,7 @@ class CongestionController:
     def _is_faster(self, round_max_rtt: float, rtt: RttEstimator) -> bool:
         """Whether the second datagram of a burst waited for the first for much less time than it takes at our rate.
 
-        On a slow path a round is too few datagrams to measure a quarter more, and its rate may have risen a hundredfold.
+        On a slow path a round is too few datagrams to measure a quarter more, while its rate may be a hundredfold.
         """
         waits_s = DATAGRAM_BYTES / self.rate.best if self.rate.best else 0.0
         return waits_s > END_HOST_S and round_max_rtt < rtt.minimum + waits_s / 2
