@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import fnmatch
 import json
+import multiprocessing
 import sys
 import tempfile
 import traceback
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for the reports (default %(default)s)"
     )
+    parser.add_argument(
+        "--jobs",
+        type=_count,
+        default=1,
+        metavar="N",
+        help="so many runs at once, each in a lab of its own; one takes less than half a core (default %(default)s)",
+    )
     parser.add_argument("--keep-logs", type=Path, metavar="DIR", help="keep configurations and logs here")
 
 
@@ -67,41 +76,55 @@ def run(options: argparse.Namespace) -> int:
         print(error, file=sys.stderr)
         return 2
     console = Console(highlight=False, soft_wrap=True)
+    names = options.contender or USUAL
     failed: list[str] = []
     void = False
-    for scenario in scenarios:
-        console.print(f"{scenario.name} (case {scenario.case}): {scenario.about}, {scenario.duration_s:g} s")
-        for contender in options.contender or USUAL:
-            about = CONTENDERS[contender].about if contender in CONTENDERS else "computed"
-            with console.status(f"{scenario.name}, {contender}: {about}"):
-                try:
-                    outcome = _run(scenario, contender, options.keep_logs)
-                except LabConfigError as error:
-                    print(error, file=sys.stderr)
-                    return 2
-                except Exception as error:  # the other runs are worth having
-                    traceback.print_exc()
-                    failed.append(f"{scenario.name}, {contender}: {error}".splitlines()[0])
-                    continue
-            outcome.write(options.out / RUNS)
-            void |= bool(outcome.disturbances)
-            for why in outcome.disturbances:
-                console.print(f"{contender}: void, {why}")
-            for text in outcome.conditions.get("explained", ()):
-                console.print(f"{contender}: {text}")
+    # Processes: a lab belongs to the process that made it, which waits for its programs.
+    with ProcessPoolExecutor(options.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        runs = {
+            scenario.name: {name: pool.submit(_run, scenario, name, options) for name in names}
+            for scenario in scenarios
+        }
         try:
-            outcomes = [Outcome.read(file) for file in sorted((options.out / RUNS).glob("*/*.json"))]
-        except ValueError as error:
+            for number, scenario in enumerate(scenarios, 1):
+                about = f"{scenario.name} (case {scenario.case}): {scenario.about}, {scenario.duration_s:g} s"
+                console.print(f"{number} of {len(scenarios)}: {about}")
+                for contender, future in runs[scenario.name].items():
+                    about = CONTENDERS[contender].about if contender in CONTENDERS else "computed"
+                    with console.status(f"{scenario.name}, {contender}: {about}"):
+                        try:
+                            outcome = future.result()
+                        except LabConfigError:
+                            raise
+                        except Exception as error:  # the other runs are worth having
+                            traceback.print_exc()
+                            failed.append(f"{scenario.name}, {contender}: {error}".splitlines()[0])
+                            continue
+                    void |= bool(outcome.disturbances)
+                    for why in outcome.disturbances:
+                        console.print(f"{contender}: void, {why}")
+                    for text in outcome.conditions.get("explained", ()):
+                        console.print(f"{contender}: {text}")
+                outcomes = [Outcome.read(file) for file in sorted((options.out / RUNS).glob("*/*.json"))]
+                console.print(rich_table(_table(scenario.name, outcomes)))
+                _write(options.out, outcomes, failed)
+        except (LabConfigError, ValueError) as error:
+            pool.shutdown(wait=False, cancel_futures=True)
             print(error, file=sys.stderr)
             return 2
-        console.print(rich_table(_table(scenario.name, outcomes)))
-        _write(options.out, outcomes, failed)
     costs = mode_costs(outcomes)
     if costs:
         console.print(rich_table(_costs_table(costs)))
     for text in failed:
         console.print(f"failed: {text}")
     return 1 if failed or (void and not options.quick) else 0
+
+
+def _count(text: str) -> int:
+    count = int(text)
+    if count < 1:
+        raise ValueError(text)
+    return count
 
 
 def _chosen(options: argparse.Namespace) -> list[Scenario]:
@@ -114,9 +137,17 @@ def _chosen(options: argparse.Namespace) -> list[Scenario]:
     return [one.shortened(seconds) for one in chosen] if seconds else chosen
 
 
-def _run(scenario: Scenario, contender: str, keep_logs: Path | None) -> Outcome:
-    if contender in IDEALS:
-        return compute(scenario, contender)
+def _run(scenario: Scenario, contender: str, options: argparse.Namespace) -> Outcome:
+    """Run it and keep its record, in a process of the pool."""
+    outcome = (
+        compute(scenario, contender) if contender in IDEALS else _run_in_lab(scenario, contender, options.keep_logs)
+    )
+    outcome.conditions["runs_at_once"] = options.jobs
+    outcome.write(options.out / RUNS)
+    return outcome
+
+
+def _run_in_lab(scenario: Scenario, contender: str, keep_logs: Path | None) -> Outcome:
     with tempfile.TemporaryDirectory(prefix="plr-evaluation-") as name:
         folder = Path(name)
         if keep_logs is not None:
