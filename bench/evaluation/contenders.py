@@ -189,7 +189,7 @@ def _plr(
             world.notes["counters"] = {
                 series: value
                 for series, value in system.metrics(ROBOT).items()
-                if series.startswith(("plr_requests_total", "plr_fallback"))
+                if series.startswith(("plr_requests_total", "plr_copy_bytes_total", "plr_copies_", "plr_fallback"))
             }
     finally:
         system.close()
