@@ -7,24 +7,23 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.table import Table as RichTable
 
 from bench.dataplane import page
-from bench.dataplane.report import Report, machine
+from bench.dataplane.report import Report
 from bench.dataplane.section import Context, Findings
 from bench.dataplane.sections import SECTIONS
 from bench.dataplane.targets import TARGETS
 from bench.pressure import CpuPressure
+from bench.reporting.machine import machine
+from bench.reporting.terminal import rich_table, show_verdicts
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Mapping, Sequence
 
-    from bench.dataplane.section import Figure, Section, Table
-    from bench.dataplane.targets import Target
+    from bench.dataplane.section import Section
 
 DEFAULT_REPEATS = 3
 QUICK_REPEATS = 1
@@ -82,25 +81,3 @@ def _show(console: Console, section: Section, findings: Findings) -> None:
         console.print(rich_table(table))
     for note in findings.notes:
         console.print(f"{section.name}: {note}", soft_wrap=True)
-
-
-def rich_table(table: Table) -> RichTable:
-    """A table for the terminal."""
-    shown = RichTable(title=table.title, title_justify="left")
-    for column in table.columns:
-        shown.add_column(column, justify="right" if column else "left")
-    for row in table.rows:
-        shown.add_row(*(page.text_of(cell) for cell in row))
-    return shown
-
-
-def show_verdicts(console: Console, figures: Mapping[str, Figure], targets: Sequence[Target]) -> None:
-    """Show what is met and what is missed."""
-    table = RichTable(title="targets", title_justify="left")
-    for column in ("figure", "value", "wanted", "verdict"):
-        shape: dict[str, Any] = {"justify": "right"} if column == "value" else {"no_wrap": column != "wanted"}
-        table.add_column(column, **shape)
-    for target in targets:
-        verdict = page.VERDICTS[target.met(figures)]
-        table.add_row(target.key, page.text_of(figures.get(target.key)), target.wanted, verdict)
-    console.print(table)

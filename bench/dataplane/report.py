@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import platform
-import time
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.dataplane.targets import TARGETS
 
 if TYPE_CHECKING:
-    from bench.dataplane.section import Figure, Findings, Section
+    from bench.dataplane.section import Findings, Section
+    from bench.reporting.tables import Figure
 
 
 @dataclass(slots=True)
@@ -46,16 +43,3 @@ class Report:
             "seconds": self.seconds,
             "sections": {name: asdict(findings) for name, findings in self.sections.items()},
         }
-
-
-def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return {
-        "cpu": models[0] if models else platform.machine(),
-        "cpus": os.cpu_count(),
-        "kernel": platform.release(),
-        "python": platform.python_version(),
-        "measured_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from bench.reporting.tables import Table
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from bench.dataplane.statistics import Row
-
-Figure = float | int | None
-"""None: not measured, and a note says why."""
+    from bench.reporting.tables import Figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,21 +29,6 @@ class Context:
     def scaled(self, count: int, at_least: int = 1) -> int:
         """A number of requests, or a fifth of it in a quick run."""
         return max(at_least, count // 5) if self.quick else count
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """Rows of text or numbers for people."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str | Figure, ...], ...]
-
-    @classmethod
-    def of_rows(cls, title: str, rows: Sequence[Row]) -> Table:
-        """The usual table of runs of requests."""
-        columns = ("", "requests", "lost", "P50 ms", "P99 ms", "worst ms")
-        return cls(title, columns, tuple((r.name, r.sent, r.lost, r.p50_ms, r.p99_ms, r.max_ms) for r in rows))
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,3 +61,9 @@ class Section:
     name: str
     title: str
     measure: Callable[[Context], Findings]
+
+
+def table_of(title: str, rows: Sequence[Row]) -> Table:
+    """The usual table of runs of requests."""
+    columns = ("", "requests", "lost", "P50 ms", "P99 ms", "worst ms")
+    return Table(title, columns, tuple((r.name, r.sent, r.lost, r.p50_ms, r.p99_ms, r.max_ms) for r in rows))

@@ -15,9 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bench.dataplane.command import rich_table
-from bench.dataplane.report import machine
-from bench.dataplane.section import Figure, Table
 from bench.evaluation import page
 from bench.evaluation.comparison import compare, gains
 from bench.evaluation.contenders import CONTENDERS
@@ -28,6 +25,9 @@ from bench.evaluation.runner import run as run_in_lab
 from bench.evaluation.scenario import Scenario, read_scenarios
 from bench.netlab import LabConfigError
 from bench.netlab.trace_folder import read_folder
+from bench.reporting.machine import machine
+from bench.reporting.tables import Figure, Table
+from bench.reporting.terminal import rich_table
 from protos.errors import ConfigError
 
 if TYPE_CHECKING:

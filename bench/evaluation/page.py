@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure as Canvas
 
-from bench.dataplane.page import STYLE, table_as_html
+from bench.reporting.web import STYLE, table_as_html
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from bench.dataplane.section import Table
     from bench.evaluation.redundancy_costs import ModeCost
+    from bench.reporting.tables import Table
 
 COLUMNS = ("", "windows", "missed", "kB/request", "of replicate's avoided misses", "extra bytes over single")
 

@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from statistics import fmean
 from typing import TYPE_CHECKING
 
-from bench.dataplane.section import Figure, Findings, Plot, Table
+from bench.dataplane.section import Findings, Plot
 from bench.matcher.calibration import (
     DEADLINES_S,
     FEWEST_MISSES,
@@ -21,6 +21,7 @@ from bench.matcher.calibration import (
 from bench.matcher.choosing import RIVALS, Chosen, choose
 from bench.matcher.races import replay, workloads_for
 from bench.matcher.sources import load
+from bench.reporting.tables import Figure, Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

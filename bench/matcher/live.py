@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.dataplane.section import Figure, Findings, Table
+from bench.dataplane.section import Findings
 from bench.netlab import Lab, LabConfig, LinkProfile
+from bench.reporting.tables import Figure, Table
 from bench.system import System, read_json
 from protos.errors import DecodeError
 from protos.model import NodeName

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.dataplane.section import Figure, Findings, Table
+from bench.dataplane.section import Findings
 from bench.matcher.crowd import Crowd
 from bench.matcher.fleets import ROOM, flow_optimum, in_regions, random_fleet
+from bench.reporting.tables import Figure, Table
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.debounce import URGENT_DELAY_S
 from controlplane.core.plan import relative_gap

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.dataplane.targets import Target
+from bench.reporting.targets import Target
 
 TARGETS = (
     Target("calibration_share", "cells whose observed misses the prediction meets", at_least=0.9),

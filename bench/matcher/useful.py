@@ -6,11 +6,12 @@ import os
 from concurrent.futures import ProcessPoolExecutor
 from typing import TYPE_CHECKING
 
-from bench.dataplane.section import Figure, Findings, Table
+from bench.dataplane.section import Findings
 from bench.matcher.crossed import cross
 from bench.matcher.online import RIVALS, Online, follow
 from bench.matcher.races import workloads_for
 from bench.matcher.sources import load
+from bench.reporting.tables import Figure, Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
-from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import Calls, Row, median, ratio, worst
 from bench.dataplane.steady import awake, realtime
 from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, SilentCut, allow_multipath, cables
@@ -27,8 +27,9 @@ from bench.netlab import Lab
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from bench.dataplane.section import Context, Figure
+    from bench.dataplane.section import Context
     from bench.netlab import Host
+    from bench.reporting.tables import Figure
 
 SIZE = 1_000
 RATE_HZ = 50.0
@@ -88,7 +89,7 @@ def measure(context: Context) -> Findings:
     lines = {NAMES[key]: repeats[-1][0].line(repeats[-1][1]) for key, repeats in runs.items()}
     return Findings(
         figures=figures,
-        tables=[Table.of_rows("requests after the cut", [Row.of_repeats(repeats) for repeats in rows.values()])],
+        tables=[table_of("requests after the cut", [Row.of_repeats(repeats) for repeats in rows.values()])],
         plots=[Plot("last repeat", "seconds after the cut", "latency, ms", lines=lines, log_y=True)],
         notes=notes,
     )

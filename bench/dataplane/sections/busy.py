@@ -13,7 +13,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import Ours
-from bench.dataplane.section import Findings, Section, Table
+from bench.dataplane.section import Findings, Section, table_of
 from bench.dataplane.statistics import Row, median, ratio
 from bench.dataplane.steady import realtime
 from bench.dataplane.topology import cables
@@ -51,7 +51,7 @@ def measure(context: Context) -> Findings:
             "busy_p99_over_realtime": median(ratio(*pair) for pair in zip(ordinary, preferred, strict=True)),
             "busy_lost": sum(row.lost for repeats in rows.values() for row in repeats),
         },
-        tables=[Table.of_rows("1 kB at 50 Hz, all processors busy", [Row.of_repeats(each) for each in rows.values()])],
+        tables=[table_of("1 kB at 50 Hz, all processors busy", [Row.of_repeats(each) for each in rows.values()])],
     )
 
 

@@ -15,10 +15,11 @@ from bench.attacker.junk import JunkKind
 from bench.attacker.wire import Tap
 from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
-from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import Row, median, ratio, worst
 from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, CLOUDS, ROBOT, cables
 from bench.netlab import Lab
+from bench.reporting.tables import Table
 
 if TYPE_CHECKING:
     from bench.attacker.wire import Captured
@@ -130,7 +131,7 @@ def _findings(flood: Flood) -> Findings:
             "flood_least_arrived": min(min(values) for values in flood.arrived.values()),
         },
         tables=[
-            Table.of_rows(
+            table_of(
                 f"1 kB at {RATE_HZ:g} Hz, and {JUNK_HZ:g} datagrams of junk a second", [undisturbed, *rows.values()]
             ),
             Table(

@@ -10,14 +10,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import EVERY_CARRIER, SERVICE, Ours
-from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.section import Findings, Plot, Section
 from bench.dataplane.statistics import Row, difference, median, quantile, ratio
 from bench.dataplane.targets import RTT_MS
 from bench.dataplane.topology import CARRIERS, emulated
 from bench.netlab import Lab, LinkProfile
+from bench.reporting.tables import Table
 
 if TYPE_CHECKING:
-    from bench.dataplane.section import Context, Figure
+    from bench.dataplane.section import Context
+    from bench.reporting.tables import Figure
 
 SIZE = 150_000
 RATE_HZ = 10.0

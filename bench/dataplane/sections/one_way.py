@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
-from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.section import Findings, Plot, Section
 from bench.dataplane.statistics import MS, median, quantile, ratio, worst
 from bench.dataplane.topology import cables, ethernet_loopback
 from bench.netlab import Lab
+from bench.reporting.tables import Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import SERVICE, Ours
-from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import MS, Calls, Row, median, ratio, worst
 from bench.dataplane.topology import CARRIERS, emulated
 from bench.netlab import Lab, LinkProfile
@@ -78,7 +78,7 @@ def measure(context: Context) -> Findings:
             "outage_first_after_up_over_lossfree_p99": _over(after_up, lossfree),
             "outage_lost_after": sum(row.lost for row in after),
         },
-        tables=[Table.of_rows("120 kB at 10 Hz, both paths dark for a while", rows)],
+        tables=[table_of("120 kB at 10 Hz, both paths dark for a while", rows)],
         plots=[
             Plot("last repeat", "seconds after the links are back", "latency, ms", lines={"ours": line}, log_y=True)
         ],

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import EVERY_CARRIER, Ours
-from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import Row, median, ratio, worst
 from bench.dataplane.topology import CARRIERS, emulated
 from bench.netlab import Lab, LinkProfile
@@ -62,7 +62,7 @@ def measure(context: Context) -> Findings:
             "overload_memory_growth_mb": worst(growth),
         },
         tables=[
-            Table.of_rows(
+            table_of(
                 "120 kB at 10 Hz; overloaded: also over a path of 2 Mbit/s",
                 [Row.of_repeats(undisturbed), Row.of_repeats(overloaded)],
             )

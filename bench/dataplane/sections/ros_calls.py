@@ -9,14 +9,16 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import Calls, Row, median, ratio
 from bench.dataplane.topology import CARRIERS, CLOUDS, ROBOT, SilentCut, cables
 from bench.netlab import Lab
+from bench.reporting.tables import Table
 from bench.system import Part, System, read_json
 
 if TYPE_CHECKING:
-    from bench.dataplane.section import Context, Figure
+    from bench.dataplane.section import Context
+    from bench.reporting.tables import Figure
 
 DEADLINE_MS = 500.0
 DIRECT_DOMAIN = 9
@@ -66,7 +68,7 @@ def measure(context: Context) -> Findings:
     figures["blackhole_ros_lost"] = after.lost
     figures["blackhole_ros_p99_ms"] = after.p99_ms
     figures["blackhole_ros_max_ms"] = after.max_ms
-    table = Table.of_rows("calls of a ROS 2 client", [*(Row.of_repeats(repeats) for repeats in rows.values()), after])
+    table = table_of("calls of a ROS 2 client", [*(Row.of_repeats(repeats) for repeats in rows.values()), after])
     lines = {"proxied": calls.line(cut)}
     return Findings(
         figures=figures,

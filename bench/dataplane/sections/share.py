@@ -11,10 +11,11 @@ import time
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import EVERY_CARRIER, SERVICE, Ours
-from bench.dataplane.section import Findings, Plot, Section, Table
+from bench.dataplane.section import Findings, Plot, Section
 from bench.dataplane.statistics import median, ratio
 from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, emulated
 from bench.netlab import Lab, LinkProfile
+from bench.reporting.tables import Table
 
 if TYPE_CHECKING:
     from bench.dataplane.section import Context

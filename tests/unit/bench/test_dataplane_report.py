@@ -11,9 +11,11 @@ import pytest
 from bench.dataplane import page
 from bench.dataplane.calling import HEADER, Caller, Plan
 from bench.dataplane.report import Report
-from bench.dataplane.section import Context, Findings, Plot, Section, Table
+from bench.dataplane.section import Context, Findings, Plot, Section
 from bench.dataplane.statistics import Calls, Row, difference, median, quantile, ratio, worst
-from bench.dataplane.targets import TARGETS, Target
+from bench.dataplane.targets import TARGETS
+from bench.reporting.tables import Table
+from bench.reporting.targets import Target
 
 if TYPE_CHECKING:
     from pathlib import Path

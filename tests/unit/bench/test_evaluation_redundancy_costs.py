@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from bench.dataplane.section import Table
 from bench.evaluation import page
 from bench.evaluation.outcome import Outcome, Request
 from bench.evaluation.redundancy_costs import mode_costs
+from bench.reporting.tables import Table
 
 
 def outcome(scenario: str, contender: str, misses: int, megabytes: int = 0, *, void: bool = False) -> Outcome:

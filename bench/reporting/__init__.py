@@ -1,0 +1,1 @@
+"""What all measurements show their findings with: tables, targets with verdicts, pages."""

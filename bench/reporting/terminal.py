@@ -1,0 +1,38 @@
+"""Tables and verdicts on the terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Table as RichTable
+
+from bench.reporting.tables import text_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rich.console import Console
+
+    from bench.reporting.tables import Figure, Table
+    from bench.reporting.targets import Target
+
+
+def rich_table(table: Table) -> RichTable:
+    """A table for the terminal."""
+    shown = RichTable(title=table.title, title_justify="left")
+    for column in table.columns:
+        shown.add_column(column, justify="right" if column else "left")
+    for row in table.rows:
+        shown.add_row(*(text_of(cell) for cell in row))
+    return shown
+
+
+def show_verdicts(console: Console, figures: Mapping[str, Figure], targets: Sequence[Target]) -> None:
+    """Show what is met and what is missed."""
+    table = RichTable(title="targets", title_justify="left")
+    for column in ("figure", "value", "wanted", "verdict"):
+        shape: dict[str, Any] = {"justify": "right"} if column == "value" else {"no_wrap": column != "wanted"}
+        table.add_column(column, **shape)
+    for target in targets:
+        table.add_row(target.key, text_of(figures.get(target.key)), target.wanted, target.verdict(figures))
+    console.print(table)
