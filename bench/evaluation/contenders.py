@@ -105,7 +105,7 @@ class Contender:
     carriers: tuple[str, ...] = CARRIERS
     """Interfaces that the robot has."""
     ablation: bool = False
-    """Ours with less of something: run only when asked for by name."""
+    """A variant of another one: run only when asked for by name."""
 
     def lab(self) -> LabConfig:
         """The lab that it needs."""
@@ -137,7 +137,7 @@ def _mptcp(world: World) -> Iterator[Clients]:
         yield (client,)
 
 
-def _zenoh(world: World) -> Iterator[Clients]:
+def _zenoh(world: World, *, drop: bool = False) -> Iterator[Clients]:
     common = {"max_links": 1, "lease_ms": ZENOH_LEASE_MS}
     with contextlib.ExitStack() as stack:
         for cloud in world.clouds:
@@ -147,7 +147,8 @@ def _zenoh(world: World) -> Iterator[Clients]:
         clients = []
         for cloud, carrier in zip(world.clouds, CARRIERS, strict=True):
             client = stack.enter_context(world.remote("zenoh", world.robot))
-            client.ask("connect", sessions=[[f"tcp/{cloud.address()}:{ZENOH_PORT}#iface={carrier}"]], **common)
+            endpoint = f"tcp/{cloud.address()}:{ZENOH_PORT}#iface={carrier}"
+            client.ask("connect", sessions=[[endpoint]], **common, drop=drop)
             clients.append(client)
         yield tuple(clients)
 
@@ -251,6 +252,12 @@ _ALL = (
         "plr-fallback",
         "plr-replicate, and a slower server on the robot for what the network misses",
         contextlib.contextmanager(partial(_plr, fallback=True)),
+    ),
+    Contender(
+        "zenoh-drop",
+        "the same, but a query that finds its session's queue full is dropped",
+        contextlib.contextmanager(partial(_zenoh, drop=True)),
+        ablation=True,
     ),
     *(_plr_within_budget(redundancy) for redundancy in ("adaptive", "hedge")),
     *(_plr_of(interfaces, servers) for interfaces, servers in ((1, 1), (1, 2), (2, 1))),

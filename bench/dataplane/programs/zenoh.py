@@ -28,6 +28,7 @@ class ZenohProgram:
         self._caller = Caller(self._send)
         self._answer_bytes = HEADER.size
         self._compute = Compute()
+        self._when_full = zenoh.CongestionControl.BLOCK
 
     def listen(
         self,
@@ -45,8 +46,13 @@ class ZenohProgram:
             session.declare_queryable(KEY, self._on_query, complete=True)
             self._sessions.append(session)
 
-    def connect(self, sessions: list[list[str]], max_links: int, lease_ms: int) -> None:
-        """Open a session for each list of endpoints; returns when each has all its links."""
+    def connect(self, sessions: list[list[str]], max_links: int, lease_ms: int, *, drop: bool = False) -> None:
+        """Open a session for each list of endpoints; returns when each has all its links.
+
+        `drop`: a query that finds its session's queue full is dropped; else, as by default, it waits there.
+        """
+        if drop:
+            self._when_full = zenoh.CongestionControl.DROP
         self._sessions = [_open(max_links, lease_ms, connect=endpoints) for endpoints in sessions]
         end = time.monotonic() + LINKS_TIMEOUT_S
         while any(
@@ -84,6 +90,7 @@ class ZenohProgram:
                 timeout=QUERY_TIMEOUT_S,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=self._when_full,
             )
 
     def _on_reply(self, reply: zenoh.Reply) -> None:
