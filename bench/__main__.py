@@ -6,6 +6,7 @@ examples:
   make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
   make bench-quick                                         20 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
+  python -m bench report --out bench/results               verdicts, page and summary anew from the records of runs
   python -m bench scenarios --traces ~/traces              what the evaluation replays
   make bench-matcher BENCH_ARGS='--traces ~/traces'        are the matcher's predictions true?
 """
@@ -18,6 +19,7 @@ import sys
 from bench.churn import command as churn
 from bench.dataplane import command as dataplane
 from bench.evaluation import command as evaluate
+from bench.evaluation import report_command as report
 from bench.evaluation import scenarios_command as scenarios
 from bench.matcher import command as matcher
 
@@ -33,12 +35,14 @@ def main() -> int:
     matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
     scenarios.add_arguments(commands.add_parser("scenarios", help="what is replayed; the generator beside traces"))
     evaluate.add_arguments(commands.add_parser("evaluate", help="the system beside others on replayed networks"))
+    report.add_arguments(commands.add_parser("report", help="what the records of the evaluation say, without a run"))
     options = parser.parse_args(sys.argv[1:] or ["dataplane"])
     runs = {
         "churn": churn.run,
         "dataplane": dataplane.run,
         "evaluate": evaluate.run,
         "matcher": matcher.run,
+        "report": report.run,
         "scenarios": scenarios.run,
     }
     return runs[options.command](options)

@@ -3,43 +3,37 @@
 from __future__ import annotations
 
 import fnmatch
-import json
 import multiprocessing
 import sys
 import tempfile
 import traceback
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from bench.evaluation import page
-from bench.evaluation.comparison import compare, gains
+from bench.evaluation import report_command
 from bench.evaluation.contenders import CONTENDERS
 from bench.evaluation.ideal import IDEALS, compute
-from bench.evaluation.outcome import Outcome
-from bench.evaluation.redundancy_costs import ModeCost, mode_costs
+from bench.evaluation.redundancy_costs import mode_costs
+from bench.evaluation.report import RUNS, modes_table, read_records, window_table
 from bench.evaluation.runner import run as run_in_lab
 from bench.evaluation.scenario import Scenario, read_scenarios
 from bench.netlab import LabConfigError
 from bench.netlab.trace_folder import read_folder
 from bench.reporting.machine import machine
-from bench.reporting.tables import Figure, Table
 from bench.reporting.terminal import rich_table
 from protos.errors import ConfigError
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Mapping, Sequence
 
-RUNS = "evaluation"
-"""Folder of the records, within that of the reports."""
+    from bench.evaluation.outcome import Outcome
+
 QUICK_SCENARIO = "drive-1"
 QUICK_SECONDS = 15.0
 USUAL = (*IDEALS, *(name for name, contender in CONTENDERS.items() if not contender.ablation))
-_COLUMNS = ("", "missed", "never answered", "mean ms", "P50 ms", "P99 ms", "kB/request", "void")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -105,16 +99,20 @@ def run(options: argparse.Namespace) -> int:
                         console.print(f"{contender}: void, {why}")
                     for text in outcome.conditions.get("explained", ()):
                         console.print(f"{contender}: {text}")
-                outcomes = [Outcome.read(file) for file in sorted((options.out / RUNS).glob("*/*.json"))]
-                console.print(rich_table(_table(scenario.name, outcomes)))
-                _write(options.out, outcomes, failed)
+                of_window = read_records(options.out, scenario.name)
+                if of_window:
+                    console.print(rich_table(window_table(scenario.name, of_window)))
+            outcomes = read_records(options.out)
         except (LabConfigError, ValueError) as error:
             pool.shutdown(wait=False, cancel_futures=True)
             print(error, file=sys.stderr)
             return 2
     costs = mode_costs(outcomes)
     if costs:
-        console.print(rich_table(_costs_table(costs)))
+        console.print(rich_table(modes_table(costs)))
+    # Last: drawing takes a processor from what is measured.
+    if outcomes:
+        report_command.write(options.out, outcomes, machine(), failed)
     for text in failed:
         console.print(f"failed: {text}")
     return 1 if failed or (void and not options.quick) else 0
@@ -154,60 +152,3 @@ def _run_in_lab(scenario: Scenario, contender: str, keep_logs: Path | None) -> O
             folder = keep_logs / scenario.name / contender
             folder.mkdir(parents=True, exist_ok=True)
         return run_in_lab(scenario, CONTENDERS[contender], folder)
-
-
-def _table(scenario: str, outcomes: Sequence[Outcome]) -> Table:
-    rows: list[tuple[str | Figure, ...]] = []
-    title = scenario
-    for outcome in outcomes:
-        if outcome.scenario == scenario:
-            figures = outcome.figures()
-            kilobytes = None if figures.bytes_per_request is None else figures.bytes_per_request / 1e3
-            shares = (f"{figures.miss_ratio:.1%}", f"{figures.unanswered_ratio:.1%}")
-            latencies = (figures.mean_ms, figures.p50_ms, figures.p99_ms)
-            void = "void" if outcome.disturbances else ""
-            rows.append((outcome.contender, *shares, *latencies, kilobytes, void))
-            title = f"{scenario}: {figures.requests} requests, deadline {outcome.deadline_ms:g} ms"
-    return Table(title, _COLUMNS, tuple(rows))
-
-
-def _costs_table(costs: Mapping[str, ModeCost]) -> Table:
-    rows = tuple(
-        (
-            name,
-            cost.windows,
-            f"{cost.miss_ratio:.1%}",
-            cost.bytes_per_request / 1e3,
-            None if cost.avoided is None else f"{cost.avoided:.1%}",
-            f"{cost.extra_bytes:+.1%}",
-        )
-        for name, cost in costs.items()
-    )
-    return Table(
-        "redundancy modes, over the windows where direct-a, direct-b, plr-single and plr-replicate ran",
-        page.COLUMNS,
-        rows,
-    )
-
-
-def _write(folder: Path, outcomes: Sequence[Outcome], failed: Sequence[str]) -> None:
-    """The figures of all runs whose records are in the folder, of this call or an earlier one."""
-    runs: dict[str, dict[str, Any]] = {}
-    compared = compare(outcomes)
-    for outcome in outcomes:
-        comparison = compared.get(outcome.scenario, {}).get(outcome.contender)
-        runs.setdefault(outcome.scenario, {})[outcome.contender] = {
-            **asdict(outcome.figures()),
-            **(asdict(comparison) if comparison else {}),
-            "case": outcome.case,
-            "deadline_ms": outcome.deadline_ms,
-            "explained": outcome.conditions.get("explained", []),
-            "void": list(outcome.disturbances),
-        }
-    medians = {name: asdict(gain) for name, gain in gains(outcomes).items()}
-    costs = mode_costs(outcomes)
-    modes = {name: asdict(cost) for name, cost in costs.items()}
-    tables = [_table(name, outcomes) for name in runs]
-    (folder / "evaluation.html").write_text(page.render(costs, _costs_table(costs), tables), encoding="utf-8")
-    report = {"gains": medians, "redundancy_modes": modes, "runs": runs, "failed": list(failed), "machine": machine()}
-    (folder / "evaluation.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from bench.dataplane.statistics import difference, median, ratio
 from bench.evaluation.ideal import IDEALS
+from bench.evaluation.outcome import figures_by_window
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -44,7 +45,7 @@ def compare(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Comparison]]:
     """Scenario -> contender -> comparison, of runs that are not void."""
     return {
         scenario: {name: _one(of, by_name) for name, of in by_name.items() if name not in IDEALS}
-        for scenario, by_name in _by_scenario(outcomes).items()
+        for scenario, by_name in figures_by_window(outcomes).items()
     }
 
 
@@ -53,7 +54,7 @@ def gains(outcomes: Iterable[Outcome]) -> dict[str, Gains]:
     kept = list(outcomes)
     hard = {
         name
-        for name, by_name in _by_scenario(kept).items()
+        for name, by_name in figures_by_window(kept).items()
         if all(direct in by_name for direct in DIRECT) and any(by_name[direct].miss_ratio > 0 for direct in DIRECT)
     }
     found: dict[str, list[Comparison]] = {}
@@ -65,14 +66,6 @@ def gains(outcomes: Iterable[Outcome]) -> dict[str, Gains]:
         contender: Gains(len(all_of), median(one.mean_gain for one in all_of), median(one.p99_gain for one in all_of))
         for contender, all_of in found.items()
     }
-
-
-def _by_scenario(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Figures]]:
-    found: dict[str, dict[str, Figures]] = {}
-    for outcome in outcomes:
-        if not outcome.disturbances:
-            found.setdefault(outcome.scenario, {})[outcome.contender] = outcome.figures()
-    return found
 
 
 def _one(of: Figures, beside: Mapping[str, Figures]) -> Comparison:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 from bench.dataplane.statistics import MS, quantile
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
 UNANSWERED_S = 10.0
@@ -100,3 +101,27 @@ class Outcome:
             return cls(**fields)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{file}: expected the record of a run, remove it: {error}") from None
+
+
+def together(runs: Sequence[Outcome]) -> Outcome:
+    """All requests of runs with one deadline, as one run."""
+    sent = sum(sum(run.bytes_sent.values()) for run in runs)
+    requests = tuple(request for run in runs for request in run.requests)
+    one = runs[0]
+    return Outcome("", one.case, one.contender, one.deadline_ms, requests, {"": sent} if sent else {})
+
+
+def by_window(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Outcome]]:
+    """Scenario -> contender -> run, without the void ones."""
+    found: dict[str, dict[str, Outcome]] = {}
+    for outcome in outcomes:
+        if not outcome.disturbances:
+            found.setdefault(outcome.scenario, {})[outcome.contender] = outcome
+    return found
+
+
+def figures_by_window(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Figures]]:
+    """Scenario -> contender -> figures, of runs that are not void."""
+    return {
+        scenario: {name: run.figures() for name, run in runs.items()} for scenario, runs in by_window(outcomes).items()
+    }

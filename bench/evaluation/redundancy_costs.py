@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.evaluation.comparison import DIRECT
+from bench.evaluation.outcome import figures_by_window
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 CHEAPEST, SUREST = "plr-single", "plr-replicate"
 MODES = (CHEAPEST, "plr-hedge-10%", "plr-hedge", "plr-adaptive-10%", "plr-adaptive", SUREST)
+NEEDED = frozenset((*DIRECT, CHEAPEST, SUREST))
+"""A window counts when all of these ran in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +35,7 @@ class ModeCost:
 
 def mode_costs(outcomes: Iterable[Outcome]) -> dict[str, ModeCost]:
     """Mode -> cost, of runs that are not void."""
-    windows: dict[str, dict[str, Figures]] = {}
-    for outcome in outcomes:
-        if not outcome.disturbances:
-            windows.setdefault(outcome.scenario, {})[outcome.contender] = outcome.figures()
-    needed = {*DIRECT, CHEAPEST, SUREST}
-    complete = [window for window in windows.values() if needed <= window.keys()]
+    complete = [window for window in figures_by_window(outcomes).values() if window.keys() >= NEEDED]
     found = {mode: _cost(mode, [window for window in complete if mode in window]) for mode in MODES}
     return {mode: cost for mode, cost in found.items() if cost is not None}
 

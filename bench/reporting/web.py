@@ -7,6 +7,8 @@ import html
 import io
 from typing import TYPE_CHECKING
 
+from matplotlib import rc_context
+
 from bench.reporting.tables import text_of
 
 if TYPE_CHECKING:
@@ -72,7 +74,8 @@ def verdicts_as_html(
 def svg_of(canvas: Canvas) -> bytes:
     """The drawing as a file; the same drawing always gives the same bytes."""
     image = io.BytesIO()
-    canvas.savefig(image, format="svg", metadata={"Date": None})
+    with rc_context({"svg.hashsalt": "plr"}):
+        canvas.savefig(image, format="svg", metadata={"Date": None})
     return image.getvalue()
 
 

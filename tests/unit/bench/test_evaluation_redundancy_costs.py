@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from bench.evaluation import page
 from bench.evaluation.outcome import Outcome, Request
 from bench.evaluation.redundancy_costs import mode_costs
-from bench.reporting.tables import Table
 
 
 def outcome(scenario: str, contender: str, misses: int, megabytes: int = 0, *, void: bool = False) -> Outcome:
@@ -50,11 +48,3 @@ def test_a_window_counts_when_everything_ran_and_nothing_was_disturbed() -> None
 def test_nothing_to_avoid() -> None:
     costs = mode_costs(window("one", direct=(0, 0), single=0, adaptive=0, replicate=0))
     assert costs["plr-adaptive"].avoided is None
-
-
-def test_the_page_shows_modes_and_windows() -> None:
-    costs = mode_costs(window("one", direct=(40, 20), single=15, adaptive=1, replicate=0))
-    text = page.render(costs, Table("costs", page.COLUMNS, ()), [Table("window <one>", ("",), (("x",),))])
-    assert "data:image/svg+xml" in text
-    assert "window &lt;one&gt;" in text
-    assert "Redundancy modes" not in page.render({}, Table("costs", page.COLUMNS, ()), [])

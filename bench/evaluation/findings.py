@@ -1,0 +1,154 @@
+"""The figures of `targets`, from the records of runs, each with what it comes from. Void runs count nowhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from bench.dataplane.statistics import MS, median
+from bench.evaluation import counters
+from bench.evaluation.comparison import DIRECT, IDEAL, gains
+from bench.evaluation.outcome import Outcome, by_window, figures_by_window
+from bench.evaluation.redundancy_costs import SUREST, mode_costs
+from bench.evaluation.studies import is_recorded
+from protos.explanation import Correlation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from bench.evaluation.outcome import Figures
+    from bench.reporting.tables import Figure
+
+    Windows = dict[str, dict[str, Figures]]
+
+PATH_IDEALS = ("ideal-a", "ideal-b")
+BELOW_LOAD = 0.1
+"""A path alone that misses a larger share than this is below the offered load for that long."""
+WITH_BUDGET = ("plr-adaptive-10%", "plr-hedge-10%")
+
+
+@dataclass(slots=True)
+class Evidence:
+    """What was found."""
+
+    figures: dict[str, Figure] = field(default_factory=dict)
+    """Without those that could not be had."""
+    notes: dict[str, str] = field(default_factory=dict)
+    """By the same names: what a figure comes from."""
+
+    def add(self, name: str, figure: Figure, note: str) -> None:
+        """Take a figure and where it comes from."""
+        self.figures[name] = figure
+        self.notes[name] = note
+
+
+def gather(outcomes: Sequence[Outcome]) -> Evidence:
+    """All figures."""
+    found = Evidence()
+    recorded = [one for one in outcomes if one.case == "A" and is_recorded(one.scenario)]
+    _drives(found, recorded)
+    windows = figures_by_window(outcomes)
+    _queues(found, windows)
+    _modes(found, outcomes)
+    _fallback(found, [one for one in outcomes if one.case == "F"])
+    _one_operator(found, [one for one in outcomes if one.case == "G"])
+    return found
+
+
+def _drives(found: Evidence, outcomes: Sequence[Outcome]) -> None:
+    windows = figures_by_window(outcomes)
+    complete = {name: runs for name, runs in windows.items() if runs.keys() >= {*DIRECT, SUREST, IDEAL}}
+    recorded = len({one.scenario for one in outcomes})
+    if recorded:
+        found.add("drive_windows", len(complete), f"{recorded} there are; the others are incomplete or void")
+    gain = gains([one for one in outcomes if one.scenario in complete]).get(SUREST)
+    if gain is not None:
+        note = f"{gain.windows} drives on which a direct run misses anything"
+        found.add("mean_gain", gain.mean_gain, note)
+        found.add("p99_gain", gain.p99_gain, note)
+    excess = {name: r[SUREST].miss_ratio - (1.1 * r[IDEAL].miss_ratio + 0.005) for name, r in complete.items()}
+    if excess:
+        worst = max(excess, key=lambda name: excess[name])
+        ours, ideal = complete[worst][SUREST].miss_ratio, complete[worst][IDEAL].miss_ratio
+        above = sum(value > 0 for value in excess.values())
+        note = f"above 0 in {above} of {len(excess)}; worst {worst}: {ours:.1%}, ideal {ideal:.1%}"
+        found.add("miss_excess", excess[worst], note)
+    good = {name: r for name, r in complete.items() if not any(r[direct].miss_ratio for direct in DIRECT)}
+    above_ms = {name: r[SUREST].p99_ms - (1.05 * r[IDEAL].p99_ms + 10) for name, r in good.items()}
+    if above_ms:
+        worst = max(above_ms, key=lambda name: above_ms[name])
+        ours, ideal = good[worst][SUREST].p99_ms, good[worst][IDEAL].p99_ms
+        note = f"{len(good)} such drives; worst {worst}: {ours:.0f} ms, ideal {ideal:.0f} ms"
+        found.add("good_p99_excess_ms", above_ms[worst], note)
+
+
+def _queues(found: Evidence, windows: Windows) -> None:
+    complete = {name: runs for name, runs in windows.items() if runs.keys() >= {*PATH_IDEALS, IDEAL, SUREST}}
+    queues = {n: r for n, r in complete.items() if any(r[path].miss_ratio > BELOW_LOAD for path in PATH_IDEALS)}
+    if queues:
+        below = sorted(name for name, runs in queues.items() if runs[SUREST].p99_ms < runs[IDEAL].p99_ms)
+        found.add("queue_windows_below_ideal", len(below), f"of {len(queues)} such windows: {', '.join(below) or '-'}")
+        found.figures["queue_windows"] = len(queues)
+
+
+def _modes(found: Evidence, outcomes: Sequence[Outcome]) -> None:
+    costs = mode_costs(outcomes)
+    adaptive, hedge = costs.get("plr-adaptive"), costs.get("plr-hedge")
+    if adaptive is not None:
+        avoided, extra = f"{adaptive.windows} windows", f"{adaptive.windows} windows"
+        if hedge is not None:
+            avoided += "" if hedge.avoided is None else f"; plr-hedge {hedge.avoided:.1%} ({hedge.windows} windows)"
+            extra += f"; plr-hedge {hedge.extra_bytes:+.1%}"
+        found.add("adaptive_avoided", adaptive.avoided, avoided)
+        found.add("adaptive_extra_bytes", adaptive.extra_bytes, extra)
+    shares = {
+        (run.contender, run.scenario, interface): share
+        for runs in by_window(outcomes).values()
+        for run in runs.values()
+        if run.contender in WITH_BUDGET
+        for interface, share in counters.extra_share(run).items()
+    }
+    if shares:
+        worst = max(shares, key=lambda key: shares[key])
+        runs = len({key[:2] for key in shares})
+        found.add("budget_extra_share", shares[worst], f"{runs} runs; worst {', '.join(worst)}")
+
+
+def _fallback(found: Evidence, outcomes: Sequence[Outcome]) -> None:
+    runs = [runs["plr-fallback"] for runs in by_window(outcomes).values() if "plr-fallback" in runs]
+    if not runs:
+        return
+    late = sum(one.latency_s * MS > run.deadline_ms for run in runs for one in run.requests)
+    requests = sum(len(run.requests) for run in runs)
+    missed = [counters.missed_by_network(run) for run in runs]
+    known = [count for count in missed if count is not None]
+    missed_text = str(sum(known)) if len(known) == len(runs) else "unknown"
+    note = f"of {requests} in {len(runs)} windows; missed by the network, with those of the warm-up: {missed_text}"
+    found.add("fallback_late", late, note)
+    if len(known) == len(runs):
+        found.figures["fallback_network_missed"] = sum(known)
+
+
+def _one_operator(found: Evidence, outcomes: Sequence[Outcome]) -> None:
+    windows = by_window(outcomes)
+    ours = [runs[SUREST] for runs in windows.values() if SUREST in runs]
+    if ours:
+        named = [run for run in ours if _explains(run, Correlation.TOGETHER, Correlation.LIKELY)]
+        sure = sum(_explains(run, Correlation.TOGETHER) for run in named)
+        note = f"{len(named)} of {len(ours)} windows, {sure} for sure"
+        found.add("one_operator_explained", len(named) / len(ours), note)
+    beside = [runs for runs in windows.values() if runs.keys() >= {*DIRECT, SUREST}]
+    figures = [{name: runs[name].figures() for name in (*DIRECT, SUREST)} for runs in beside]
+    if figures:
+        gain = median(min(one[direct].mean_ms for direct in DIRECT) / one[SUREST].mean_ms for one in figures)
+        alone = median(min(one[direct].miss_ratio for direct in DIRECT) for one in figures) or 0.0
+        missed = median(one[SUREST].miss_ratio for one in figures) or 0.0
+        note = f"median of {len(figures)} windows; missed {missed:.1%}, the better direct run {alone:.1%}"
+        found.add("one_operator_mean_gain", gain, note)
+        found.figures["one_operator_missed"] = missed
+        found.figures["one_operator_direct_missed"] = alone
+
+
+def _explains(run: Outcome, *correlations: Correlation) -> bool:
+    endings = tuple(f": {one.value}" for one in correlations)
+    return any(text.endswith(endings) for text in run.conditions.get("explained", ()))

@@ -1,0 +1,117 @@
+"""Windows that belong together, and what contenders did in the same ones of them.
+
+Recorded windows of a case study are one study, made-up windows of one scenario file another. What is compared is pooled
+over the same windows for everybody: a contender that did not run in most of them is left out, and a window in which one
+of the others is missing, or void, does not count.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from bench.evaluation.comparison import DIRECT
+from bench.evaluation.contenders import CONTENDERS
+from bench.evaluation.ideal import IDEALS
+from bench.evaluation.outcome import Outcome, by_window, together
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+CASES = {
+    "A": "driving with two carriers",
+    "B": "indoors with Wi-Fi and 5G",
+    "C": "two Wi-Fi",
+    "D": "Starlink and cellular",
+    "E": "one carrier's blind spots, handovers, a server that stops",
+    "F": "both carriers poor",
+    "G": "two radios of one operator",
+}
+SHOWN = (*CONTENDERS, "ideal")
+"""In charts; each path's ideal alone stands in the tables only."""
+SHOWN_SHARE = 0.75
+"""Whoever ran in less than this share of the windows in which the most frequent contender did is left out."""
+
+_NAME = re.compile(r"(?P<stem>.+?)(?P<recorded>-at-[\d.]+)?(?P<shortened>-[\d.]+s)?")
+
+
+def is_recorded(scenario: str) -> bool:
+    """Whether a scenario of this name replays a whole window of a recorded trace."""
+    return bool((match := _NAME.fullmatch(scenario)) and match["recorded"] and not match["shortened"])
+
+
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """Contenders in the same windows."""
+
+    runs: dict[str, tuple[Outcome, ...]]
+    """Contender -> its run in each of `windows`."""
+    windows: tuple[str, ...]
+    left_out: dict[str, int]
+    """Contender -> windows in which it ran; too few."""
+
+    def together(self, contender: str) -> Outcome:
+        """All its requests as one run."""
+        return together(self.runs[contender])
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """Windows that belong together."""
+
+    name: str
+    """For files."""
+    title: str
+    case: str
+    recorded: bool
+    windows: dict[str, dict[str, Outcome]]
+    """Scenario -> contender -> run; none is void."""
+
+    def hardest(self, contenders: Sequence[str]) -> str | None:
+        """The window with most misses of the two direct runs together, where all these ran; None: there is none."""
+        able = [name for name, runs in self.windows.items() if {*contenders, *DIRECT} <= runs.keys()]
+        return max(able, key=lambda name: sum(_misses(self.windows[name][one]) for one in DIRECT), default=None)
+
+
+def studies(outcomes: Iterable[Outcome]) -> list[Study]:
+    """In order of case, recorded ones first."""
+    found: dict[tuple[str, bool, str], dict[str, dict[str, Outcome]]] = {}
+    for scenario, runs in by_window(outcomes).items():
+        case = next(iter(runs.values())).case
+        match = _NAME.fullmatch(scenario)
+        assert match is not None
+        stem = "recorded" if match["recorded"] else match["stem"].rstrip("0123456789").rstrip("-")
+        found.setdefault((case, not match["recorded"], stem + (match["shortened"] or "")), {})[scenario] = runs
+    return [
+        Study(f"{case.lower()}-{stem}", f"Case {case}, {CASES[case]}: {stem}", case, not made_up, found[key])
+        for key in sorted(found)
+        for case, made_up, stem in (key,)
+    ]
+
+
+def pool(windows: Mapping[str, Mapping[str, Outcome]], names: Sequence[str] = SHOWN) -> Pool | None:
+    """What the contenders among `names` did in the same windows; None: nobody ran."""
+    ran = Counter(name for runs in windows.values() for name in runs if name in names)
+    most = max(ran.values(), default=0)
+    shown = [name for name in names if ran[name] and ran[name] >= SHOWN_SHARE * most]
+    while shown:
+        shared = tuple(window for window, runs in windows.items() if runs.keys() >= set(shown))
+        if shared:
+            left_out = {name: ran[name] for name in names if ran[name] and name not in shown}
+            runs = {name: tuple(windows[window][name] for window in shared) for name in shown}
+            return Pool(runs, shared, left_out)
+        shown.remove(min(shown, key=lambda name: ran[name]))
+    return None
+
+
+def ranked(names: Iterable[str]) -> list[str]:
+    """Contenders in the order in which tables and charts have them."""
+    order = (*CONTENDERS, *IDEALS)
+    return sorted(names, key=lambda name: order.index(name) if name in order else len(order))
+
+
+def _misses(outcome: Outcome) -> float:
+    figures = outcome.figures()
+    return figures.miss_ratio * figures.requests
