@@ -29,6 +29,7 @@ COLOURS = {
     "direct-b": "#a6a6a6",
     "mptcp": "#8c564b",
     "zenoh": "#9467bd",
+    "zenoh-drop": "#c5a3e0",
     "plr-replicate": "#1f5fbf",
     "plr-adaptive": "#e6701a",
     "plr-adaptive-10%": "#f4b183",
@@ -154,7 +155,7 @@ def deadlines(name: str, pool: Pool) -> Chart:
         shown = missed > 0
         axes.plot(at_ms[shown], missed[shown], label=contender, linewidth=1.4, **_line(contender))
     deadline_ms = next(iter(pool.runs.values()))[0].deadline_ms
-    axes.axvline(deadline_ms, color="#c8202f", linewidth=0.8, linestyle=":", label="the service's")
+    axes.axvline(deadline_ms, color="#c8202f", linewidth=0.8, linestyle=":", label="of the service")
     axes.set(xscale="log", yscale="log", xlabel="deadline, ms", ylabel="missed", ylim=(0.7 / requests, 1.2))
     axes.xaxis.set_major_formatter(_plain())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda share, _place: f"{share * 100:g} %"))
@@ -170,7 +171,7 @@ def modes(name: str, costs: Mapping[str, ModeCost]) -> Chart:
     axes = canvas.add_subplot()
     for mode, cost in costs.items():
         place = (cost.bytes_per_request / 1e3, cost.miss_ratio)
-        axes.plot(*place, "o", color=_colour(mode))
+        axes.plot(*place, "o", color=_colour(mode), clip_on=False)
         axes.annotate(mode, place, textcoords="offset points", xytext=(6, 4), fontsize=8)
     axes.set(xlabel="kB sent for each request", ylabel="missed")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))

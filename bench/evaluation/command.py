@@ -59,6 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="so many runs at once, each in a lab of its own; one takes less than half a core (default %(default)s)",
     )
+    parser.add_argument(
+        "--no-report", action="store_true", help="leave records only; `python -m bench report` makes the reports later"
+    )
     parser.add_argument("--keep-logs", type=Path, metavar="DIR", help="keep configurations and logs here")
 
 
@@ -111,7 +114,7 @@ def run(options: argparse.Namespace) -> int:
     if costs:
         console.print(rich_table(modes_table(costs)))
     # Last: drawing takes a processor from what is measured.
-    if outcomes:
+    if outcomes and not options.no_report:
         report_command.write(options.out, outcomes, machine(), failed)
     for text in failed:
         console.print(f"failed: {text}")

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bench.evaluation import paper, report_command
+from bench.evaluation.charts import COLOURS
+from bench.evaluation.contenders import CONTENDERS
 from bench.evaluation.scenario import read_scenarios
 from bench.evaluation.studies import is_recorded, pool, studies
 from tests.unit.bench.evaluation_records import drive, run
@@ -25,6 +27,11 @@ def reported(folder: Path, *runs: Outcome) -> int:
     parser = argparse.ArgumentParser()
     report_command.add_arguments(parser)
     return report_command.run(parser.parse_args(["--out", str(folder)]))
+
+
+def test_every_contender_has_a_colour_of_its_own() -> None:
+    assert {*CONTENDERS, "ideal"} <= COLOURS.keys()
+    assert len(set(COLOURS.values())) == len(COLOURS)
 
 
 def test_studies_are_recorded_windows_of_a_case_and_scenario_files() -> None:
