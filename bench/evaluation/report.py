@@ -131,8 +131,7 @@ def modes_table(costs: Mapping[str, ModeCost]) -> Table:
 
 def _modes(outcomes: Sequence[Outcome]) -> list[Section]:
     costs = mode_costs(outcomes)
-    complete = {name: runs for name, runs in by_window(outcomes).items() if runs.keys() >= NEEDED}
-    shared = pool(complete, (*DIRECT, *MODES))
+    shared = pool(by_window(outcomes), (*DIRECT, *MODES), NEEDED)
     beside = mode_costs(run for runs in shared.runs.values() for run in runs) if shared else {}
     drawn = (charts.modes("modes", beside),) if beside else ()
     about = "What further copies avoid and what they cost."
@@ -157,7 +156,7 @@ def _study(study: Study, outcomes: Sequence[Outcome]) -> Section:
         about = f"Pooled over the {len(shared.windows)} of {len(study.windows)} windows in which all of these ran."
         if shared.left_out:
             left_out = ", ".join(f"{name} ({count})" for name, count in shared.left_out.items())
-            about += f" Left out, as they ran in fewer: {left_out}."
+            about += f" Left out, as they ran in fewer of them: {left_out}."
         rows = tuple(_row(name, figures[name]) for name in ranked(figures))
         tables = (Table("all these windows together", _COLUMNS, rows),)
     details = tuple(window_table(window, outcomes) for window in study.windows)

@@ -1,8 +1,8 @@
 """Windows that belong together, and what contenders did in the same ones of them.
 
 Recorded windows of a case study are one study, made-up windows of one scenario file another. What is compared is pooled
-over the same windows for everybody: a contender that did not run in most of them is left out, and a window in which one
-of the others is missing, or void, does not count.
+over the same windows for everybody: those in which both direct runs, ours and the ideal ran. Who else did not run in
+most of them is left out, and a window in which one of the others is missing, or void, does not count.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from bench.evaluation.comparison import DIRECT
+from bench.evaluation.comparison import DIRECT, IDEAL
 from bench.evaluation.contenders import CONTENDERS
 from bench.evaluation.ideal import IDEALS
 from bench.evaluation.outcome import Outcome, by_window, together
+from bench.evaluation.redundancy_costs import SUREST
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -29,10 +30,12 @@ CASES = {
     "F": "both carriers poor",
     "G": "two radios of one operator",
 }
-SHOWN = (*CONTENDERS, "ideal")
+SHOWN = (*CONTENDERS, IDEAL)
 """In charts; each path's ideal alone stands in the tables only."""
+ANCHORS = (*DIRECT, SUREST, IDEAL)
+"""Windows are pooled in which these ran, those of them that ran at all."""
 SHOWN_SHARE = 0.75
-"""Whoever ran in less than this share of the windows in which the most frequent contender did is left out."""
+"""Whoever else ran in less than this share of them is left out."""
 
 _NAME = re.compile(r"(?P<stem>.+?)(?P<recorded>-at-[\d.]+)?(?P<shortened>-[\d.]+s)?")
 
@@ -91,8 +94,12 @@ def studies(outcomes: Iterable[Outcome]) -> list[Study]:
     ]
 
 
-def pool(windows: Mapping[str, Mapping[str, Outcome]], names: Sequence[str] = SHOWN) -> Pool | None:
+def pool(
+    windows: Mapping[str, Mapping[str, Outcome]], names: Sequence[str] = SHOWN, anchors: Iterable[str] = ANCHORS
+) -> Pool | None:
     """What the contenders among `names` did in the same windows; None: nobody ran."""
+    needed = {name for name in anchors if any(name in runs for runs in windows.values())}
+    windows = {window: runs for window, runs in windows.items() if runs.keys() >= needed} or windows
     ran = Counter(name for runs in windows.values() for name in runs if name in names)
     most = max(ran.values(), default=0)
     shown = [name for name in names if ran[name] and ran[name] >= SHOWN_SHARE * most]

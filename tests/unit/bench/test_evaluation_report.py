@@ -60,6 +60,15 @@ def test_all_contenders_are_pooled_over_the_same_windows() -> None:
     assert pool({}) is None
 
 
+def test_windows_without_direct_runs_or_ideal_do_not_count_beside_others() -> None:
+    lonely = [run("plr-replicate", scenario=f"a-lonely-{number}-at-30") for number in range(9)]
+    (study,) = studies([*drive(), *lonely])
+    found = pool(study.windows)
+    assert found is not None
+    assert found.windows == ("a-drive-one-two-01-at-30",)
+    assert "ideal" in found.runs
+
+
 def test_contenders_that_never_ran_together_are_not_compared() -> None:
     (study,) = studies([run("direct-a", scenario="drive-1"), run("ideal", scenario="drive-2")])
     found = pool(study.windows)
