@@ -6,8 +6,10 @@ from sidecar.core.frame import MAX_ACK_RANGES
 
 MAX_ACK_DELAY_S = 0.005
 """A lone datagram's acknowledgement may wait this long for something to travel with."""
-ACK_EVERY = 2
-"""Acknowledge at once after this many ack-eliciting datagrams (RFC 9000 section 13.2.2)."""
+ACK_EVERY = 4
+"""Acknowledge at once after this many ack-eliciting datagrams. RFC 9000 (section 13.2.2) says two, and may be departed
+from: each acknowledgement costs both ends about as much processor time as a datagram. With eight, the rate of bursts
+is seen too late, and 17 ms of queue instead of 12 stand in a 20 Mbit/s link."""
 STALE_PACKETS = 1024
 """Ranges this far below the largest are no longer told: the sender has long declared their gaps lost."""
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sidecar.core.frame import MAX_ACK_RANGES
-from sidecar.core.received import MAX_ACK_DELAY_S, STALE_PACKETS, ReceivedPackets
+from sidecar.core.received import ACK_EVERY, MAX_ACK_DELAY_S, STALE_PACKETS, ReceivedPackets
 
 
 def received(*numbers: int) -> ReceivedPackets:
@@ -54,15 +54,17 @@ def test_a_leap_makes_everything_far_below_stale_not_new() -> None:
     assert ranges(packets) == [(3 + STALE_PACKETS + 1,) * 2, (4, 4)]
 
 
-def test_a_lone_datagram_is_acknowledged_soon_the_second_at_once() -> None:
+def test_a_lone_datagram_is_acknowledged_soon_and_several_at_once() -> None:
     assert received(1).ack_at is None
     packets = received(1)
     packets.owe_ack(1.0)
     assert packets.ack_at == 1.0 + MAX_ACK_DELAY_S
-    packets.add(2, 1.001)
-    packets.owe_ack(1.001)
+    for number in range(2, ACK_EVERY + 1):
+        assert packets.ack_at == 1.0 + MAX_ACK_DELAY_S
+        packets.add(number, 1.001)
+        packets.owe_ack(1.001)
     assert packets.ack_at == 1.001
-    assert packets.take_ack(1.003) == ([(1, 2)], 1.003 - 1.001)
+    assert packets.take_ack(1.003) == ([(1, ACK_EVERY)], 1.003 - 1.001)
     assert packets.ack_at is None
 
 
