@@ -28,8 +28,9 @@ MAX_BURST_BYTES = 64 * 1024
 """Largest burst between two pauses: one segmentation offload."""
 BURST_S = 0.001
 """A burst is what the path carries in this time, where that is more than two datagrams."""
-LATE_S = 0.010
-"""A sender woken late makes up for at most this much time: a busy host's threads wait for their turn."""
+LATE_S = 0.025
+"""A sender woken late makes up for at most this much time: a busy host's threads wait for their turn. What it does not
+make up for keeps its pace below the rate it believes in, and asking for a quarter more may then ask for nothing."""
 PAUSE_S = 0.004
 """After a pause, what the path carries in this time may leave at once: on a fast path, a whole small request."""
 END_HOST_S = 0.005
