@@ -60,6 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="so many runs at once, each in a lab of its own; one takes less than half a core (default %(default)s)",
     )
     parser.add_argument(
+        "--resume", action="store_true", help="leave out what has a record in the folder already that is not void"
+    )
+    parser.add_argument(
         "--no-report", action="store_true", help="leave records only; `python -m bench report` makes the reports later"
     )
     parser.add_argument("--keep-logs", type=Path, metavar="DIR", help="keep configurations and logs here")
@@ -78,11 +81,15 @@ def run(options: argparse.Namespace) -> int:
     void = False
     # Processes: a lab belongs to the process that made it, which waits for its programs.
     with ProcessPoolExecutor(options.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        runs = {
-            scenario.name: {name: pool.submit(_run, scenario, name, options) for name in names}
-            for scenario in scenarios
-        }
         try:
+            runs = {
+                scenario.name: {
+                    name: pool.submit(_run, scenario, name, options)
+                    for name in names
+                    if not (options.resume and _is_done(scenario, name, options.out))
+                }
+                for scenario in scenarios
+            }
             for number, scenario in enumerate(scenarios, 1):
                 about = f"{scenario.name} (case {scenario.case}): {scenario.about}, {scenario.duration_s:g} s"
                 console.print(f"{number} of {len(scenarios)}: {about}")
@@ -136,6 +143,10 @@ def _chosen(options: argparse.Namespace) -> list[Scenario]:
         raise LabConfigError(f"no scenario {' or '.join(globs)}; `python -m bench scenarios` lists them")
     seconds = options.seconds or (QUICK_SECONDS if options.quick else None)
     return [one.shortened(seconds) for one in chosen] if seconds else chosen
+
+
+def _is_done(scenario: Scenario, contender: str, out: Path) -> bool:
+    return any(one.contender == contender and not one.disturbances for one in read_records(out, scenario.name))
 
 
 def _run(scenario: Scenario, contender: str, options: argparse.Namespace) -> Outcome:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bench.evaluation import command
+from bench.evaluation.report import RUNS, read_records
 from bench.evaluation.runner import disturbances
 from bench.netlab import DirectionStats, Lateness, LinkProfile, LinkStats
 
@@ -48,3 +49,19 @@ def test_what_cannot_be_read_ends_in_one_line(
     error = capsys.readouterr().err
     assert told in error
     assert error.count("\n") == 1
+
+
+def test_a_run_that_is_resumed_makes_anew_what_is_void_or_not_there(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    common = ["--seconds", "5", "--scenario", "drive-1", "--out", str(tmp_path), "--no-report"]
+    arguments = [*common, "--contender", "ideal", "--contender", "ideal-a"]
+    assert command.run(parser.parse_args([*arguments, "--jobs", "2"])) == 0
+    ideal_a, ideal = read_records(tmp_path)
+    replace(ideal_a, disturbances=("busy",)).write(tmp_path / RUNS)
+    assert command.run(parser.parse_args([*arguments, "--contender", "ideal-b", "--resume"])) == 0
+    again = {one.contender: one for one in read_records(tmp_path)}
+    at_once = {name: one.conditions["runs_at_once"] for name, one in again.items()}
+    assert at_once == {"ideal": 2, "ideal-a": 1, "ideal-b": 1}
+    assert not again["ideal-a"].disturbances
+    assert again["ideal"] == ideal
