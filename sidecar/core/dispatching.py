@@ -173,8 +173,8 @@ class Dispatching:
         self._send(request, path, now, _Why.TROUBLE)
 
     def _is_on_its_way(self, copy: Copy) -> bool:
-        """Whether its server may not have all of it yet, as its path is slow and not dead."""
-        return not copy.message.newest.over and self._parts.routes.state(copy.path) is not PathState.DOWN
+        """Whether its server may not have all of it yet, as its path is slow and not silent."""
+        return not copy.message.newest.over and self._parts.routes.state(copy.path) is PathState.UP
 
     def _next_over_another_interface(self, request: Request) -> PathId | None:
         used = {copy.path.interface for copy in request.relied_on()}

@@ -9,7 +9,7 @@ import pytest
 
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, Peer, PeerSet, ServiceMapping, Version
 from sidecar.core.events import DeadlineMissed, OfferService, RequestFailed, WithdrawService
-from sidecar.core.paths import FIRST_PROBE_S
+from sidecar.core.paths import DOWN_FLOOR_S, FIRST_PROBE_S
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 
 
@@ -320,3 +320,21 @@ def test_the_first_request_after_an_outage_finds_the_path_itself(seed: int) -> N
     robot.submit(bytes(1000))
     mesh.run(FIRST_PROBE_S + 6 * mesh.wire("robot.wlan0", "cloud-a.eth0").delay_s)
     assert len(robot.responses()) == 1
+
+
+def test_over_the_only_interface_another_server_is_asked_once_the_path_to_the_first_is_silent() -> None:
+    mesh = Mesh(seed=1)
+    robot, dead = mesh.robot("wlan0", rules=(rule(deadline_s=1.0),)), mesh.cloud("a")
+    mesh.cloud("b")
+    mesh.push_views()
+    mesh.run(1.0)
+    mapped(mesh, robot, ("wlan0", "a"))
+    call_at(mesh, robot, 10.0, 2.0)
+    dead.alive = False
+    for number in range(5):
+        robot.submit(number.to_bytes(4, "big") + bytes(20_000))
+        mesh.run(0.02)
+    mesh.run(2.0)
+    late = robot.responses()[-5:]
+    assert {response.server for response in late} == {"b"}
+    assert all(response.elapsed_s < DOWN_FLOOR_S for response in late), "before the path counts as down"
