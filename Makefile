@@ -51,7 +51,7 @@ interfaces: setup ## build examples/plr_demo_interfaces into .venv
 lock: setup ## lock dependencies anew from pyproject.toml (LOCK_ARGS=--upgrade for newer versions)
 	@deploy/dev/lock.sh $(LOCK_ARGS)
 
-bench: setup ## every measurement, reports into bench/results
+bench: setup ## every measurement one after the other, reports into bench/results (hours, as root)
 	@$(PY) -m bench $(BENCH_ARGS)
 
 bench-quick: setup ## 15 s of a drive with every contender: direct ROS 2, MPTCP, zenoh, ours (5 minutes at most, as root)
