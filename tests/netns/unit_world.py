@@ -153,11 +153,24 @@ def metrics(name: str) -> dict[str, float]:
     return {key: float(value) for key, _, value in (line.rpartition(" ") for line in lines if not line.startswith("#"))}
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    """Wait for the condition, but not for ever: what has become of it shows in the metrics."""
+def wait_for_metrics(seen: dict[str, Any], condition: Callable[[], bool]) -> None:
+    """Put both programs' metrics in until the condition holds, but not for ever: what is amiss shows in them."""
     patience = time.monotonic() + CONNECTED_S
-    while time.monotonic() < patience and not condition():
+    while True:
+        for name in PROGRAMS:
+            seen[name]["metrics"] = metrics(name)
+        if condition() or time.monotonic() >= patience:
+            return
         time.sleep(0.2)
+
+
+def works(seen: dict[str, Any]) -> bool:
+    measured = seen["controlplane"]["metrics"] | seen["sidecar"]["metrics"]
+    return all(measured.get(name) for name in WORKING)
+
+
+def renewal_taken_up(seen: dict[str, Any]) -> bool:
+    return all(seen[name]["metrics"].get(DAYS_LEFT, 0.0) > FIRST_DAYS for name in PROGRAMS)
 
 
 def main(folder: Path) -> dict[str, Any]:
@@ -169,13 +182,12 @@ def main(folder: Path) -> dict[str, Any]:
     try:
         for name in PROGRAMS:
             running[name] = start(name, folder)
-            seen[name] = {"ready": wait_for(running[name][1], "READY=1", READY_S)}
+            seen[name] = {"ready": wait_for(running[name][1], "READY=1", READY_S), "metrics": {}}
         if all(program["ready"] for program in seen.values()):
-            wait_until(lambda: all((metrics("controlplane") | metrics("sidecar")).get(name) for name in WORKING))
+            wait_for_metrics(seen, lambda: works(seen))
             renew_certificates(folder, authority)
-            wait_until(lambda: all(metrics(name).get(DAYS_LEFT, 0.0) > FIRST_DAYS for name in PROGRAMS))
-        for name in PROGRAMS:
-            seen[name]["metrics"] = metrics(name) if seen[name]["ready"] else {}
+            # The sidecar connects anew with the renewed one: until then it is not connected for a moment.
+            wait_for_metrics(seen, lambda: works(seen) and renewal_taken_up(seen))
         for name in reversed(PROGRAMS):
             process, notify = running[name]
             process.send_signal(signal.SIGTERM)
