@@ -10,9 +10,10 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
+from sidecar.core.bandwidth_search import BandwidthSearch, is_faster
 from sidecar.core.delivery_rate import DeliveryRate
 from sidecar.core.loss_ceiling import LossCeiling
-from sidecar.core.units import DATAGRAM_BYTES
+from sidecar.core.units import DATAGRAM_BYTES, END_HOST_S
 
 if TYPE_CHECKING:
     from sidecar.core.rtt import RttEstimator
@@ -33,9 +34,6 @@ LATE_S = 0.025
 make up for keeps its pace below the rate it believes in, and asking for a quarter more may then ask for nothing."""
 PAUSE_S = 0.004
 """After a pause, what the path carries in this time may leave at once: on a fast path, a whole small request."""
-END_HOST_S = 0.005
-"""Delay in the hosts beyond the path's round trip: delayed acknowledgements, other threads' turns. Also what is never
-taken for a standing queue."""
 WINDOW_GAIN = 2.0
 """Bandwidth-delay products in flight: what acknowledgements that come in clumps need."""
 STARTUP_GAIN = 2.0
@@ -44,15 +42,6 @@ DRAIN_GAIN = 0.5
 """After start-up, until its queue is gone."""
 DRAIN_ROUNDS = 3
 """Draining ends after so many rounds: what still stands then is not ours."""
-CYCLE = (1.25, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-"""Pacing gains round by round: ask for more, drain what that queued, cruise (BBR's ProbeBW)."""
-PROBE_GROWTH = 1.1
-"""Asking for more found that much: ask again at once."""
-FULL_GROWTH = 1.25
-FULL_ROUNDS = 3
-"""The path is full when the rate did not grow by FULL_GROWTH within FULL_ROUNDS ..."""
-QUEUED_ROUNDS = 2
-"""... or when a queue stands for so many: in a single round, all may have waited for a busy host's thread."""
 QUEUE_FACTOR = 0.25
 """A round trip this much above the minimum shows a queue."""
 PROBE_AGAIN_S = 1.0
@@ -92,22 +81,18 @@ class CongestionController:
 
     __slots__ = (
         "_believed_before",
-        "_cycle",
         "_drained_at",
         "_first_window",
-        "_full_rate",
-        "_full_rounds",
         "_phase_rounds",
         "_probe_credit",
         "_probe_min_rtt",
         "_probed_rtt_at",
-        "_queued_rounds",
-        "_rate_before",
         "_rate_before_silence",
         "_release_at",
         "_round_max_rtt",
         "_round_min_rtt",
         "_rtt",
+        "_search",
         "_silent_since",
         "_standing_rounds",
         "_was_down",
@@ -127,10 +112,7 @@ class CongestionController:
         self._was_down = False
         self._silent_since = 0.0
         self._rate_before_silence = 0.0
-        self._cycle = 2
-        self._full_rate = 0.0
-        self._full_rounds = 0
-        self._queued_rounds = 0
+        self._search = BandwidthSearch()
         self._phase_rounds = 0
         self._standing_rounds = 0
         self._believed_before = 0.0
@@ -139,7 +121,6 @@ class CongestionController:
         self._drained_at: float | None = None
         self._round_min_rtt = float("inf")
         self._round_max_rtt = 0.0
-        self._rate_before = 0.0
 
     # -- asking ---------------------------------------------------------------------------------------------------
 
@@ -192,14 +173,14 @@ class CongestionController:
         if not rate or self._rtt is None:
             return None
         if self.phase is Phase.STARTUP:
-            if self._queued_rounds:
+            if self._search.met_queue:
                 return DRAIN_GAIN * rate  # as if it were full; the next round tells
             return max(STARTUP_GAIN * rate, self._first_window / max(self._rtt.smoothed, 1e-4))
         if self.phase is Phase.DRAIN:
             return DRAIN_GAIN * rate
         if self.phase is Phase.PROBE_RTT:
             return rate
-        return CYCLE[self._cycle] * rate
+        return self._search.gain * rate
 
     # -- being told -----------------------------------------------------------------------------------------------
 
@@ -284,8 +265,7 @@ class CongestionController:
         self._was_down = False
         self._enter(Phase.STARTUP)
         self._first_window = float(MIN_WINDOW_BYTES) if self.rate.best else float(INITIAL_WINDOW_BYTES)
-        self._full_rate = 0.0
-        self._full_rounds = 0
+        self._search.restart()
         self._probed_rtt_at = now
         if self._rtt is not None:
             self._rtt.restart_minimum(self._rtt.latest, now)
@@ -307,30 +287,23 @@ class CongestionController:
             self._standing_rounds = 0
             self._believed_before = 0.0
         if self.phase is Phase.STARTUP:
-            self._check_full(queued=queued)
+            if self._search.is_full(self.rate, queued=queued):
+                self._enter(Phase.DRAIN)
             if standing_s > rtt.minimum + 2 * END_HOST_S:
                 self._enter(Phase.DRAIN)  # longer than a busy host makes wait
         elif self.phase is Phase.DRAIN and self._phase_rounds > DRAIN_ROUNDS:
             self._cruise()
         elif self.phase is Phase.CRUISE:
-            if not self.rate.limited_by_sender and self._is_faster(round_max_rtt, rtt):
+            if not self.rate.limited_by_sender and is_faster(self.rate.best, round_max_rtt, rtt.minimum):
                 self._look_for_more()
                 return
-            self._next_in_cycle(queued=queued)
+            if self._search.finds_more(self.rate.settled, queued=queued):
+                self._look_for_more()
             unseen_s = now - (self._probed_rtt_at or now)
             if unseen_s > MINIMUM_STALE_S or (self._standing_rounds > 1 and unseen_s > PROBE_AGAIN_S):
                 self._enter(Phase.PROBE_RTT)
                 self._drained_at = None
                 self._probe_min_rtt = float("inf")
-
-    def _next_in_cycle(self, *, queued: bool) -> None:
-        """Go to the next gain. What was sent at the first is acknowledged by the end of the second round."""
-        if self._cycle == 0:
-            self._rate_before = self.rate.settled
-        if self._cycle == 1 and self.rate.settled > PROBE_GROWTH * self._rate_before and not queued:
-            self._look_for_more()
-        else:
-            self._cycle = (self._cycle + 1) % len(CYCLE)
 
     def _probe_rtt(self, sample: RateSample, rtt: RttEstimator, now: float) -> None:
         """With little of ours in flight for a round trip, what remains of the queue is others'."""
@@ -346,41 +319,19 @@ class CongestionController:
             self._probed_rtt_at = now
             self._cruise()
 
-    def _is_faster(self, round_max_rtt: float, rtt: RttEstimator) -> bool:
-        """Whether the second datagram of a burst waited for the first for much less time than it takes at our rate.
-
-        On a slow path a round is too few datagrams to measure a quarter more, while its rate may be a hundredfold.
-        """
-        waits_s = DATAGRAM_BYTES / self.rate.best if self.rate.best else 0.0
-        return waits_s > END_HOST_S and round_max_rtt < rtt.minimum + waits_s / 2
-
     def _look_for_more(self) -> None:
         """The path carries more than we thought: as much as doubling finds."""
         self._enter(Phase.STARTUP)
         self._first_window = float(MIN_WINDOW_BYTES)
-        self._full_rate = 0.0
-        self._full_rounds = 0
+        self._search.restart()
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
         self._phase_rounds = 0
-        self._queued_rounds = 0
-
-    def _check_full(self, *, queued: bool) -> None:
-        self._queued_rounds = self._queued_rounds + 1 if queued else 0
-        if self.rate.limited_by_sender:
-            return
-        if self.rate.best > FULL_GROWTH * self._full_rate:
-            self._full_rate = self.rate.best
-            self._full_rounds = 0
-        else:
-            self._full_rounds += 1
-        if self._queued_rounds >= QUEUED_ROUNDS or self._full_rounds >= FULL_ROUNDS:
-            self._enter(Phase.DRAIN)
 
     def _cruise(self) -> None:
         self._enter(Phase.CRUISE)
-        self._cycle = 2
+        self._search.begin_cycle()
 
     def _collapse(self, rtt: RttEstimator) -> None:
         """Persistent congestion: begin again with the least (RFC 9002 section 7.6.2), unless it was an outage."""
@@ -389,8 +340,7 @@ class CongestionController:
         self.ceiling.forget()
         self._first_window = float(MIN_WINDOW_BYTES)
         self._enter(Phase.STARTUP)
-        self._full_rate = 0.0
-        self._full_rounds = 0
+        self._search.restart()
 
 
 def burst(pace: float) -> float:
