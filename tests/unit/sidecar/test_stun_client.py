@@ -1,4 +1,4 @@
-"""The STUN client in simulated time: RFC 8489's schedule, failover, refresh, and whom it believes."""
+"""The STUN client in simulated time: RFC 8489's schedule, failover, refresh, servers that come and go."""
 
 from __future__ import annotations
 
@@ -8,86 +8,23 @@ from itertools import pairwise
 
 import pytest
 
-from protos.stun import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun_client import MAX_SERVERS_PER_FAMILY, StunClient
-from sidecar.core.stun_events import Failed, Mapped, MappingChanged, StunDrop, StunEvent
+from sidecar.core.stun_events import Failed, Mapped, MappingChanged, StunEvent
 from sidecar.core.stun_family import MAX_QUEUED_EVENTS, StunClientConfig
 from sidecar.core.stun_transaction import Retransmission
-
-A = ("192.0.2.1", 3478)
-B = ("192.0.2.2", 3478)
-C6 = ("2001:db8::3", 3478)
-OUTSIDE = ("203.0.113.5", 61000)
-MOVED = ("203.0.113.5", 61001)
-OUTSIDE6 = ("2001:db8:ffff::5", 61000)
-
-Address = tuple[str, int]
-
-
-class Network:
-    """Drives a client in simulated time; servers in `answers` reply with that address after `delay_s`."""
-
-    def __init__(self, client: StunClient, answers: dict[Address, Address], delay_s: float = 0.05) -> None:
-        self.client = client
-        self.answers = answers
-        self.delay_s = delay_s
-        self.now = 100.0
-        self.sent: list[tuple[float, bytes, Address]] = []
-        self.events: list[tuple[float, StunEvent]] = []
-        self._arriving: list[tuple[float, bytes, Address]] = []
-        client.start(self.now)
-        self._pump()
-
-    def run(self, seconds: float) -> list[StunEvent]:
-        """Let time pass; the events of that time."""
-        end = self.now + seconds
-        first = len(self.events)
-        self._pump()
-        while True:
-            due = [t for t in (self.client.next_timer(), *(a[0] for a in self._arriving)) if t is not None]
-            following = min(due, default=end)
-            if following > end:
-                break
-            self.now = max(self.now, following)
-            for arrival in [a for a in self._arriving if a[0] <= self.now]:
-                self._arriving.remove(arrival)
-                assert self.client.receive_datagram(arrival[1], arrival[2], self.now)
-            self.client.handle_timer(self.now)
-            self._pump()
-        self.now = end
-        return [event for _, event in self.events[first:]]
-
-    def times_sent_to(self, server: Address) -> list[float]:
-        return [round(when - 100.0, 6) for when, _, address in self.sent if address == server]
-
-    def _pump(self) -> None:
-        for data, server in self.client.datagrams_to_send():
-            self.sent.append((self.now, data, server))
-            if server in self.answers:
-                self._arriving.append((self.now + self.delay_s, reply(data, self.answers[server]), server))
-        while (event := self.client.next_event()) is not None:
-            self.events.append((self.now, event))
-
-
-def reply(request: bytes, address: Address) -> bytes:
-    asked = decode(request)
-    assert asked.message_class is MessageClass.REQUEST
-    return encode(StunMessage(MessageClass.SUCCESS, asked.transaction_id, xor_mapped_address=address, fingerprint=True))
-
-
-def refusal(request: bytes, code: int = 500) -> bytes:
-    return encode(StunMessage(MessageClass.ERROR, decode(request).transaction_id, error_code=code, error_reason="Busy"))
-
-
-def make(*servers: Address, seed: int = 1, config: StunClientConfig | None = None) -> StunClient:
-    return StunClient(servers, random.Random(seed), config)
-
-
-def start(client: StunClient, now: float = 0.0) -> bytes:
-    """Start a client of one server; its request."""
-    client.start(now)
-    ((request, _),) = client.datagrams_to_send()
-    return request
+from tests.unit.sidecar.stun_network import (
+    C6,
+    MOVED,
+    OUTSIDE,
+    OUTSIDE6,
+    A,
+    Address,
+    B,
+    Network,
+    make,
+    reply,
+    start,
+)
 
 
 def test_the_address_the_server_saw_is_told_once() -> None:
@@ -207,78 +144,6 @@ def test_failure_is_told_once_all_servers_have_had_their_schedule() -> None:
     net = Network(make(A, B), {})
     assert net.run(41.4) == []
     assert net.run(0.2) == [Failed(4, "no answer from 192.0.2.2:3478", None)]
-
-
-def test_an_error_response_hands_over_to_the_next_server_at_once() -> None:
-    client = make(A, B)
-    request = start(client)
-    assert client.receive_datagram(refusal(request), A, 0.1)
-    ((second, server),) = client.datagrams_to_send()
-    assert server == B
-    assert second != request
-    client.receive_datagram(refusal(second, 420), B, 0.2)
-    assert client.next_event() == Failed(4, "192.0.2.2:3478 answered 420 Busy", None)
-
-
-def test_strangers_are_counted_and_not_believed() -> None:
-    client = make(A)
-    request = start(client)
-    true_answer = reply(request, OUTSIDE)
-    forged = bytearray(true_answer)
-    forged[-1] ^= 1
-    assert client.receive_datagram(bytes(forged), A, 0.1)
-    assert client.receive_datagram(true_answer, B, 0.1)
-    assert client.receive_datagram(true_answer, (A[0], 3479), 0.1)
-    assert client.receive_datagram(request, A, 0.1)
-    another = StunMessage(MessageClass.SUCCESS, bytes(12), xor_mapped_address=MOVED)
-    assert client.receive_datagram(encode(another), A, 0.1)
-    assert client.next_event() is None
-    assert client.drops == {
-        StunDrop.MALFORMED: 1,
-        StunDrop.WRONG_SOURCE: 2,
-        StunDrop.NOT_A_RESPONSE: 1,
-        StunDrop.UNKNOWN_TRANSACTION: 1,
-    }
-    # None of them spoilt the transaction for the real server.
-    assert client.receive_datagram(true_answer, A, 0.2)
-    assert client.next_event() == Mapped(4, OUTSIDE, A)
-    assert client.receive_datagram(true_answer, A, 0.3), "a duplicate is consumed"
-    assert client.next_event() is None
-    assert client.drops[StunDrop.UNKNOWN_TRANSACTION] == 2
-
-
-@pytest.mark.parametrize(
-    ("address", "drop"),
-    [
-        (None, StunDrop.NO_ADDRESS),
-        (("203.0.113.5", 0), StunDrop.BAD_ADDRESS),
-        (("0.0.0.0", 61000), StunDrop.BAD_ADDRESS),
-        (("224.0.0.1", 61000), StunDrop.BAD_ADDRESS),
-    ],
-)
-def test_an_answer_without_a_usable_address_fails(address: Address | None, drop: StunDrop) -> None:
-    client = make(A)
-    answer = StunMessage(MessageClass.SUCCESS, decode(start(client)).transaction_id, xor_mapped_address=address)
-    client.receive_datagram(encode(answer), A, 0.1)
-    assert client.next_event() == Failed(4, "192.0.2.1:3478 answered without a usable address", None)
-    assert client.drops == {drop: 1}
-
-
-def test_an_answer_with_unknown_required_attributes_fails() -> None:
-    client = make(A)
-    answer = bytearray(encode(StunMessage(MessageClass.SUCCESS, decode(start(client)).transaction_id)))
-    answer[2:] = b"\x00\x04" + answer[4:] + bytes.fromhex("7fff0000")
-    client.receive_datagram(bytes(answer), A, 0.1)
-    assert client.next_event() == Failed(4, "192.0.2.1:3478 answered with unknown attributes", None)
-    assert client.drops == {StunDrop.UNKNOWN_ATTRIBUTE: 1}
-
-
-def test_datagrams_of_the_mesh_are_left_to_others() -> None:
-    client = make(A)
-    start(client)
-    assert not client.receive_datagram(b"\xd1" + bytes(100), A, 0.1)
-    assert not client.receive_datagram(b"", A, 0.1)
-    assert not client.drops
 
 
 def test_a_restart_asks_at_once_and_keeps_the_mapping() -> None:
