@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from controlplane.tls_gate import Caller
     from protos.explanation import Explanation
     from protos.identity import Trust
-    from protos.model import NodeName, Registration, ServiceName, SidecarMessage, SidecarStatus
+    from protos.model import NodeName, Registration, ServiceName, SidecarMessage
+    from protos.status import SidecarStatus
 
 log = logging.getLogger(__name__)
 

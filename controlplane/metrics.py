@@ -17,7 +17,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from controlplane import handshakes, limits, tls_gate
 from protos import identity
 from protos.metrics_server import MetricsServer
-from protos.model import ResourceKind, Role, SyncState
+from protos.model import ResourceKind, Role
+from protos.status import SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -6,12 +6,14 @@ import math
 from typing import TYPE_CHECKING
 
 from controlplane.text_table import columns
-from protos.model import Role, SyncState
+from protos.model import Role
+from protos.status import SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from protos.model import PathReport, ResourceStatus, ServiceMapping, SidecarStatus
+    from protos.model import PathReport, ServiceMapping
+    from protos.status import ResourceStatus, SidecarStatus
 
 _HEADER = ("NAME", "ROLE", "STREAM", "LEASE", "PEERS", "MAPPING", "SERVICES", "SOFTWARE")
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from protos.histogram import Histogram
-    from protos.model import Assignment, NodeName, ResourceStatus, ServiceMapping, ServiceName, Version
+    from protos.model import Assignment, NodeName, ServiceMapping, ServiceName, Version
+    from protos.status import ResourceStatus
 
 SAMPLE = 1000
 """What one sample that has not faded counts in a histogram."""

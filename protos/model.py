@@ -357,39 +357,3 @@ SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack 
 
 ControlMessage = Welcome | PeerSet | MappingSet
 """What the control plane says on a sidecar's stream."""
-
-
-class SyncState(enum.Enum):
-    """Whether a sidecar applied what it was sent last; a nack is never shown as synced."""
-
-    NOT_SENT = "not sent"
-    STALE = "stale"
-    SYNCED = "synced"
-    REJECTED = "rejected"
-
-
-@dataclass(frozen=True, slots=True)
-class ResourceStatus:
-    """How far one resource of one sidecar got; `error` is the detail of the last nack."""
-
-    version_sent: Version = Version(0)
-    version_acked: Version = Version(0)
-    state: SyncState = SyncState.NOT_SENT
-    error: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class SidecarStatus:
-    """What the control plane knows of one sidecar, for the operator; its secret token is left out."""
-
-    peer: Peer
-    connected: bool
-    lease_left_s: float
-    software_version: str
-    uses: tuple[ServiceUse, ...] = ()
-    peers: ResourceStatus = ResourceStatus()
-    mapping: ResourceStatus = ResourceStatus()
-    services: tuple[ServiceMapping, ...] = ()
-    paths: tuple[PathReport, ...] = ()
-    refused_offers: tuple[ServiceName, ...] = ()
-    """What it offers and the policy does not let it."""

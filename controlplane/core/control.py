@@ -61,7 +61,8 @@ if TYPE_CHECKING:
     from controlplane.core.policy import Policy
     from controlplane.core.registry import Sidecar
     from protos.explanation import Explanation
-    from protos.model import NodeName, ServiceName, SidecarMessage, SidecarStatus, SyncState
+    from protos.model import NodeName, ServiceName, SidecarMessage
+    from protos.status import SidecarStatus, SyncState
 
 PUBLISH_DELAY_S = 0.02
 """From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two

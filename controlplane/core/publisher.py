@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
     from controlplane.core.registry import Registry, Sidecar, StreamId
-    from protos.model import Ack, Nack, NodeName, Registration, SyncState
+    from protos.model import Ack, Nack, NodeName, Registration
+    from protos.status import SyncState
 
 MAX_GONE_SNAPSHOTS = MAX_SIDECARS
 """Sidecars that are gone and whose last set is remembered, for the notices when they return; the oldest go."""

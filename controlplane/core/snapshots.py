@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from protos.model import POLICY_PENDING, MappingSet, PeerSet, ResourceStatus, SyncState, Version
+from protos.model import POLICY_PENDING, MappingSet, PeerSet, Version
+from protos.status import ResourceStatus, SyncState
 
 if TYPE_CHECKING:
     from protos.model import Ack, Nack, NodeName, Peer, RemovedPeer, ServiceMapping

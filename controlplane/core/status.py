@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model import SidecarStatus
+from protos.status import SidecarStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
     from controlplane.ca import Issued
-    from protos.model import SidecarStatus, SyncState
+    from protos.status import SidecarStatus, SyncState
 
 Message = TypeVar("Message", bound=ControlMessage)
 

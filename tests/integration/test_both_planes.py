@@ -8,7 +8,14 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
-from protos.model import MappingSet, PeerSet, Report, Role, SyncState, Welcome
+from protos.model import (
+    MappingSet,
+    PeerSet,
+    Report,
+    Role,
+    Welcome,
+)
+from protos.status import SyncState
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud

@@ -17,9 +17,9 @@ from protos.model import (
     Report,
     ResourceKind,
     Role,
-    SyncState,
     Welcome,
 )
+from protos.status import SyncState
 from tests.integration.control_plane_process import ControlPlaneProcess, Stream, cloud, robot
 from tests.unit.controlplane.samples import PLAN, histogram, latency, path, registration
 

@@ -19,8 +19,8 @@ from protos.model import (
     OutcomeReport,
     PeerSet,
     Report,
-    SyncState,
 )
+from protos.status import SyncState
 from protos.stun import MessageClass, StunMessage, decode, encode
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
 from tests.unit.controlplane.samples import PLAN

@@ -27,10 +27,10 @@ from protos.model import (
     ServiceSet,
     ServiceUse,
     SessionId,
-    SyncState,
     Version,
 )
 from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
+from protos.status import SyncState
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import PLAN_TYPE, interfaces, offer, path, registration, use
 

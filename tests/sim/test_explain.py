@@ -22,9 +22,9 @@ from protos.model import (
     Role,
     ServiceName,
     ServiceSet,
-    SyncState,
 )
 from protos.preferences import AT_MOST_EVERY_INTERFACE, InterfaceLabel
+from protos.status import SyncState
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 

@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Heartbeat, NodeName, OutcomeReport, Report, ServiceSet, SyncState, Version
+from protos.model import (
+    Heartbeat,
+    NodeName,
+    OutcomeReport,
+    Report,
+    ServiceSet,
+    Version,
+)
+from protos.status import SyncState
 from tests.sim.control_world import SETTLED_S
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, use
 

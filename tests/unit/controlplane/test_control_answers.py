@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model import Ack, PeerSet, RemovalReason, ResourceKind, SyncState
+from protos.model import Ack, PeerSet, RemovalReason, ResourceKind
+from protos.status import SyncState
 from tests.sim.control_world import SETTLED_S
 
 if TYPE_CHECKING:

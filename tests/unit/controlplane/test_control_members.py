@@ -9,7 +9,14 @@ import pytest
 from controlplane.core.control_events import CloseReason
 from controlplane.core.registry import Refusal
 from protos.errors import DecodeError
-from protos.model import CandidateSet, NodeName, RemovalReason, Role, ServiceSet, SyncState
+from protos.model import (
+    CandidateSet,
+    NodeName,
+    RemovalReason,
+    Role,
+    ServiceSet,
+)
+from protos.status import SyncState
 from tests.sim.control_world import SETTLED_S, World
 from tests.unit.controlplane.samples import interfaces, offer, registration
 

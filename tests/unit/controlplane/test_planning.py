@@ -20,7 +20,8 @@ from controlplane.planning.traces import COLUMNS, RecordedPaths, parse_trace
 from protos.convert import explanation_to_proto
 from protos.explanation import SAMPLE, Belief, Correlation, Explanation, JointExplanation, PairExplanation
 from protos.histogram import Histogram
-from protos.model import Assignment, InterfaceName, NodeName, ResourceStatus, ServiceName
+from protos.model import Assignment, InterfaceName, NodeName, ServiceName
+from protos.status import ResourceStatus
 from tests.unit.controlplane.samples import histogram
 
 if TYPE_CHECKING:

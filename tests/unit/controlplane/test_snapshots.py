@@ -5,7 +5,17 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.snapshots import PeerView, Snapshots, Track, VersionSource
-from protos.model import Ack, Nack, NodeName, Peer, ResourceKind, Role, SessionId, SyncState, Version
+from protos.model import (
+    Ack,
+    Nack,
+    NodeName,
+    Peer,
+    ResourceKind,
+    Role,
+    SessionId,
+    Version,
+)
+from protos.status import SyncState
 
 EPOCH = 1000
 

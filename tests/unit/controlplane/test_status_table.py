@@ -11,15 +11,13 @@ from protos.model import (
     NodeName,
     PathReport,
     Peer,
-    ResourceStatus,
     Role,
     ServiceMapping,
     ServiceName,
     SessionId,
-    SidecarStatus,
-    SyncState,
     Version,
 )
+from protos.status import ResourceStatus, SidecarStatus, SyncState
 from tests.unit.controlplane.samples import PLAN, histogram, offer, use
 
 SYNCED = ResourceStatus(Version(7), Version(7), SyncState.SYNCED)

@@ -51,7 +51,6 @@ from protos.model import (
     RemovedPeer,
     Report,
     ResourceKind,
-    ResourceStatus,
     Role,
     ServiceMapping,
     ServiceName,
@@ -60,13 +59,12 @@ from protos.model import (
     ServiceUse,
     SessionId,
     SidecarMessage,
-    SidecarStatus,
-    SyncState,
     Version,
     Welcome,
 )
 from protos.preferences import Copies, InterfaceLabel
 from protos.size_class import SIZE_CLASSES
+from protos.status import ResourceStatus, SidecarStatus, SyncState
 
 T = TypeVar("T")
 

@@ -43,11 +43,11 @@ from protos.model import (
     Role,
     SessionId,
     SidecarMessage,
-    SidecarStatus,
     Version,
 )
 from protos.names import MAX_STRING_BYTES, clean_text
 from protos.plr.v1 import admin_pb2, control_pb2, types_pb2
+from protos.status import SidecarStatus
 from tests.unit.protos import message_strategies as some
 
 if TYPE_CHECKING:

@@ -1,0 +1,50 @@
+"""What the control plane tells an operator of each sidecar."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from protos.model import Version
+
+if TYPE_CHECKING:
+    from protos.model import PathReport, Peer, ServiceMapping, ServiceName, ServiceUse
+
+_NONE_YET = Version(0)
+
+
+class SyncState(enum.Enum):
+    """Whether a sidecar applied what it was sent last; a nack is never shown as synced."""
+
+    NOT_SENT = "not sent"
+    STALE = "stale"
+    SYNCED = "synced"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceStatus:
+    """How far one resource of one sidecar got; `error` is the detail of the last nack."""
+
+    version_sent: Version = _NONE_YET
+    version_acked: Version = _NONE_YET
+    state: SyncState = SyncState.NOT_SENT
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SidecarStatus:
+    """What the control plane knows of one sidecar, for the operator; its secret token is left out."""
+
+    peer: Peer
+    connected: bool
+    lease_left_s: float
+    software_version: str
+    uses: tuple[ServiceUse, ...] = ()
+    peers: ResourceStatus = ResourceStatus()
+    mapping: ResourceStatus = ResourceStatus()
+    services: tuple[ServiceMapping, ...] = ()
+    paths: tuple[PathReport, ...] = ()
+    refused_offers: tuple[ServiceName, ...] = ()
+    """What it offers and the policy does not let it."""
