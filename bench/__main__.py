@@ -7,6 +7,7 @@ examples:
   make bench-quick                                         15 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
   python -m bench report --out bench/results               verdicts, page and summary anew from the records of runs
+  python -m bench report --out DIR --again DIR2 --publish  compares two evaluations; writes the figures into the docs
   python -m bench scenarios --traces ~/traces              what the evaluation replays
   make bench-matcher BENCH_ARGS='--traces ~/traces'        are the matcher's predictions true?
 """

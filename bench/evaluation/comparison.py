@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from bench.dataplane.statistics import difference, median, ratio
 from bench.evaluation.ideal import IDEALS
-from bench.evaluation.outcome import figures_by_window
+from bench.evaluation.outcome import Outcome, figures_by_window
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from bench.evaluation.outcome import Figures, Outcome
+    from bench.evaluation.outcome import Figures
 
 DIRECT = ("direct-a", "direct-b")
 IDEAL = "ideal"
@@ -39,6 +39,11 @@ class Gains:
     windows: int
     mean_gain: float | None
     p99_gain: float | None
+
+
+def better_direct(runs: Mapping[str, Outcome]) -> Outcome:
+    """Of the two direct runs of one window, the one that missed less; of two alike the one with the lower mean."""
+    return min((runs[name] for name in DIRECT), key=lambda run: (run.figures().miss_ratio, run.figures().mean_ms))
 
 
 def compare(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Comparison]]:

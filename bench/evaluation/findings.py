@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from bench.dataplane.statistics import MS, median
-from bench.evaluation import counters
+from bench.evaluation import counters, repeats
 from bench.evaluation.comparison import DIRECT, IDEAL, gains
 from bench.evaluation.outcome import Outcome, by_window, figures_by_window
 from bench.evaluation.redundancy_costs import SUREST, mode_costs
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from bench.evaluation.outcome import Figures
+    from bench.evaluation.repeats import Repeats
     from bench.reporting.tables import Figure
 
     Windows = dict[str, dict[str, Figures]]
@@ -42,8 +43,8 @@ class Evidence:
         self.notes[name] = note
 
 
-def gather(outcomes: Sequence[Outcome]) -> Evidence:
-    """All figures."""
+def gather(outcomes: Sequence[Outcome], again: Sequence[Outcome] = ()) -> Evidence:
+    """All figures; `again`: another evaluation of the same windows."""
     found = Evidence()
     recorded = [one for one in outcomes if one.case == "A" and is_recorded(one.scenario)]
     _drives(found, recorded)
@@ -52,6 +53,7 @@ def gather(outcomes: Sequence[Outcome]) -> Evidence:
     _modes(found, outcomes)
     _fallback(found, [one for one in outcomes if one.case == "F"])
     _one_operator(found, [one for one in outcomes if one.case == "G"])
+    _reproduced(found, repeats.compare(outcomes, again))
     return found
 
 
@@ -147,6 +149,15 @@ def _one_operator(found: Evidence, outcomes: Sequence[Outcome]) -> None:
         found.add("one_operator_mean_gain", gain, note)
         found.figures["one_operator_missed"] = missed
         found.figures["one_operator_direct_missed"] = alone
+
+
+def _reproduced(found: Evidence, both: Repeats) -> None:
+    if both.largest is not None:
+        worst = both.ratios[both.largest]
+        above = sum(one.difference > 0.2 for one in both.ratios.values())
+        note = f"above 0.2 in {above} of {len(both.ratios)}, {both.runs} runs in {both.windows} windows"
+        note += f"; largest {both.largest}: {worst.first:.3g}, {worst.second:.3g}"
+        found.add("reproduced_difference", worst.difference, note)
 
 
 def _explains(run: Outcome, *correlations: Correlation) -> bool:

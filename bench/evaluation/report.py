@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from bench.evaluation import charts, findings, paper
-from bench.evaluation.comparison import DIRECT, compare, gains
+from bench.evaluation import charts, findings, others, paper, repeats
+from bench.evaluation.comparison import DIRECT, better_direct, compare, gains
 from bench.evaluation.outcome import Outcome, by_window
 from bench.evaluation.redundancy_costs import MODES, NEEDED, mode_costs
 from bench.evaluation.studies import Study, pool, ranked, studies
@@ -55,23 +55,30 @@ def read_records(folder: Path, scenario: str = "*") -> list[Outcome]:
     return [Outcome.read(file) for file in sorted((folder / RUNS).glob(f"{scenario}/*.json"))]
 
 
-def gather(outcomes: Sequence[Outcome], machine: Mapping[str, Any]) -> Report:
-    """Everything, from at least one run."""
+def gather(outcomes: Sequence[Outcome], machine: Mapping[str, Any], again: Sequence[Outcome] = ()) -> Report:
+    """Everything, from at least one run; `again`: another evaluation of the same windows."""
     found = studies(outcomes)
     void = sum(bool(one.disturbances) for one in outcomes)
     windows = len({one.scenario for one in outcomes})
     on = "".join(f", {key}: {value}" for key, value in machine.items())
     return Report(
         about=f"{len(outcomes)} runs in {windows} windows, {void} of them void{on}",
-        evidence=findings.gather(outcomes),
+        evidence=findings.gather(outcomes, again),
         ratios=paper.table(paper.ratios(found)),
-        sections=(*_modes(outcomes), *(_study(study, outcomes) for study in found), *_void(outcomes)),
+        sections=(
+            *_repeats(outcomes, again),
+            *_modes(outcomes),
+            *(_study(study, outcomes) for study in found),
+            *_void(outcomes),
+        ),
     )
 
 
-def as_json(outcomes: Sequence[Outcome], machine: Mapping[str, Any], failed: Sequence[str]) -> dict[str, Any]:
+def as_json(
+    outcomes: Sequence[Outcome], machine: Mapping[str, Any], failed: Sequence[str], again: Sequence[Outcome] = ()
+) -> dict[str, Any]:
     """Every figure of the report."""
-    evidence = findings.gather(outcomes)
+    evidence = findings.gather(outcomes, again)
     found = studies(outcomes)
     runs: dict[str, dict[str, Any]] = {}
     compared = compare(outcomes)
@@ -94,6 +101,8 @@ def as_json(outcomes: Sequence[Outcome], machine: Mapping[str, Any], failed: Seq
         "studies": {study.name: _pooled_as_json(study) for study in found},
         "gains": {name: asdict(gain) for name, gain in gains(outcomes).items()},
         "redundancy_modes": {name: asdict(cost) for name, cost in mode_costs(outcomes).items()},
+        "others": {name: asdict(one) for name, one in others.beside(outcomes).items()},
+        "reproduced": _repeats_as_json(outcomes, again),
         "runs": runs,
         "failed": list(failed),
         "machine": dict(machine),
@@ -127,6 +136,16 @@ def modes_table(costs: Mapping[str, ModeCost]) -> Table:
     )
     title = "redundancy modes, over the windows where direct-a, direct-b, plr-single and plr-replicate ran"
     return Table(title, _MODE_COLUMNS, rows)
+
+
+def _repeats(outcomes: Sequence[Outcome], again: Sequence[Outcome]) -> list[Section]:
+    if not again:
+        return []
+    return [
+        Section(
+            "Repeated", "Two evaluations of the same windows.", (), (repeats.table(repeats.compare(outcomes, again)),)
+        )
+    ]
 
 
 def _modes(outcomes: Sequence[Outcome]) -> list[Section]:
@@ -179,5 +198,17 @@ def _pooled_as_json(study: Study) -> dict[str, Any]:
     shared = pool(study.windows)
     if shared is None:
         return {"windows": []}
-    contenders = {name: asdict(shared.together(name).figures()) for name in shared.runs}
+    pools = {name: others.pooled(runs) for name, runs in shared.runs.items()}
+    if shared.runs.keys() >= {*DIRECT}:
+        better = [better_direct(study.windows[window]) for window in shared.windows]
+        pools = {others.BETTER_DIRECT: others.pooled(better), **pools}
+    contenders = {name: {**asdict(one.figures), "median_p99_ms": one.median_p99_ms} for name, one in pools.items()}
     return {"windows": list(shared.windows), "contenders": contenders}
+
+
+def _repeats_as_json(outcomes: Sequence[Outcome], again: Sequence[Outcome]) -> dict[str, Any] | None:
+    if not again:
+        return None
+    found = repeats.compare(outcomes, again)
+    ratios = {name: {**asdict(one), "difference": one.difference} for name, one in found.ratios.items()}
+    return {"windows": found.windows, "runs": found.runs, "ratios": ratios}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bench.evaluation import page, report, summary
+from bench.evaluation import page, publish, report, summary
 from bench.evaluation.targets import TARGETS
 from bench.reporting.terminal import show_verdicts
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from bench.evaluation.outcome import Outcome
 
-DATA, PAGE, SUMMARY = "evaluation.json", "evaluation.html", "evaluation.md"
+DATA, PAGE, SUMMARY = publish.DATA, "evaluation.html", publish.SUMMARY
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,40 +30,75 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path("bench/results"),
         help="folder with the records of `python -m bench evaluate`; the reports go there too (default %(default)s)",
     )
+    parser.add_argument(
+        "--again",
+        type=Path,
+        metavar="DIR",
+        help="folder with the records of another evaluation of the same windows: how far do the ratios differ?",
+    )
+    parser.add_argument(
+        "--publish",
+        type=Path,
+        nargs="?",
+        const=Path(),
+        metavar="CHECKOUT",
+        help=f"write the figures into a checkout's README.md and docs as well, data and summary into {publish.RESULTS} "
+        "(default: the working directory's)",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the reports; returns the exit code, 2 when there is nothing to report or it is not readable."""
     try:
         outcomes = report.read_records(options.out)
+        again = report.read_records(options.again) if options.again else []
+        if options.again and options.again.resolve() == options.out.resolve():
+            raise ValueError(f"--again {options.again}: expected another evaluation than --out")
         before = _before(options.out / DATA)
+        for folder, records in ((options.out, outcomes), (options.again, again)):
+            if folder and not records:
+                raise ValueError(f"{folder / report.RUNS}: no records; `python -m bench evaluate` makes them")
+        write(options.out, outcomes, before.get("machine", {}), before.get("failed", []), again, options.publish)
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
-    if not outcomes:
-        print(f"{options.out / report.RUNS}: no records; `python -m bench evaluate` makes them", file=sys.stderr)
-        return 2
-    write(options.out, outcomes, before.get("machine", {}), before.get("failed", []))
     return 0
 
 
-def write(folder: Path, outcomes: Sequence[Outcome], machine: Mapping[str, Any], failed: Sequence[str]) -> None:
-    """Write the reports of at least one run to the folder, and show the verdicts."""
-    whole = report.gather(outcomes, machine)
-    content = report.as_json(outcomes, machine, failed)
+def write(
+    folder: Path,
+    outcomes: Sequence[Outcome],
+    machine: Mapping[str, Any],
+    failed: Sequence[str],
+    again: Sequence[Outcome] = (),
+    checkout: Path | None = None,
+) -> None:
+    """Write the reports of at least one run to the folder, and to the checkout if one is given; show the verdicts.
+
+    Raises ValueError: the checkout has no places for the figures.
+    """
+    whole = report.gather(outcomes, machine, again)
+    content = report.as_json(outcomes, machine, failed, again)
+    text = summary.render(whole)
+    drawn = {f"{summary.CHARTS}/{chart.name}.svg": chart.svg for section in whole.sections for chart in section.charts}
     (folder / DATA).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     (folder / PAGE).write_text(page.render(whole), encoding="utf-8")
-    (folder / SUMMARY).write_text(summary.render(whole), encoding="utf-8")
+    (folder / SUMMARY).write_text(text, encoding="utf-8")
     charts = folder / summary.CHARTS
     charts.mkdir(exist_ok=True)
     for old in charts.glob("*.svg"):
         old.unlink()
-    for section in whole.sections:
-        for chart in section.charts:
-            (charts / f"{chart.name}.svg").write_bytes(chart.svg)
+    for name, svg in drawn.items():
+        (folder / name).write_bytes(svg)
     console = Console(highlight=False, soft_wrap=True)
     show_verdicts(console, whole.evidence.figures, TARGETS)
+    missing = [target.key for target in TARGETS if whole.evidence.figures.get(target.key) is None]
+    if missing:
+        console.print(f"not measured: {', '.join(missing)}")
     console.print(f"written: {', '.join(str(folder / name) for name in (DATA, PAGE, SUMMARY))}")
+    if checkout is not None:
+        for one in publish.publish(checkout, content, text, drawn):
+            console.print(f"published: {one.file}: {one.about}")
 
 
 def _before(file: Path) -> dict[str, Any]:

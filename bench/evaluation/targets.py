@@ -41,4 +41,9 @@ TARGETS = (
         "share of those windows after which `plr explain` says that the paths fail together",
         at_least=1,
     ),
+    Target(
+        "reproduced_difference",
+        "largest difference of any ratio between this evaluation and another one of the same windows",
+        at_most=0.2,
+    ),
 )

@@ -1,0 +1,117 @@
+"""Figures in README and docs: written from an evaluation's data, and what stands there now is just that."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from bench.evaluation import publish
+from bench.evaluation.blocks import NOTHING, all_blocks
+from bench.evaluation.report import as_json
+from tests.unit.bench.evaluation_records import drive, run
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from bench.evaluation.outcome import Outcome
+
+ROOT = Path(__file__).parents[3]
+RESULTS = ROOT / publish.RESULTS
+SVG = {"evaluation-charts/modes.svg": b"<svg/>"}
+
+
+def committed() -> dict[str, Any]:
+    """The data that the repository keeps; empty before the first evaluation."""
+    file = RESULTS / publish.DATA
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    return found
+
+
+def evaluation() -> list[Outcome]:
+    runs = drive(1, direct=20, ours=1, megabytes=20)
+    beside = {"plr-single": 10, "plr-adaptive": 12, "mptcp": 15}
+    return [*runs, *(run(name, scenario=runs[0].scenario, late=3, megabytes=size) for name, size in beside.items())]
+
+
+def content(*outcomes: Outcome, again: tuple[Outcome, ...] = ()) -> Mapping[str, Any]:
+    found: dict[str, Any] = json.loads(json.dumps(as_json(outcomes, {"cpus": 2}, [], again)))
+    return found
+
+
+def checkout(folder: Path, page: str | None = None) -> Path:
+    """A checkout whose pages have a place for every block, or one page alone."""
+    (folder / "docs").mkdir()
+    blocks = "".join(f"<!-- evaluation: {name} -->\nold\n<!-- end -->\n" for name in all_blocks({}))
+    (folder / "README.md").write_text(blocks if page is None else page)
+    return folder
+
+
+def test_figures_in_readme_and_docs_are_those_of_the_published_data() -> None:
+    blocks = all_blocks(committed())
+    stale = [file.name for file, text in publish.pages(ROOT).items() if publish.filled(text, blocks) != text]
+    assert stale == [], "run `python -m bench report --publish`; never edit a figure by hand"
+
+
+def test_published_files_are_as_they_were_written() -> None:
+    files: dict[str, str] = committed().get(publish.FILES, {})
+    assert {name: hashlib.sha256((RESULTS / name).read_bytes()).hexdigest() for name in files} == files
+
+
+def test_the_pages_have_a_place_for_every_figure(tmp_path: Path) -> None:
+    for file, text in publish.pages(ROOT).items():
+        (tmp_path / file.relative_to(ROOT)).parent.mkdir(exist_ok=True)
+        (tmp_path / file.relative_to(ROOT)).write_text(text)
+    written = publish.publish(tmp_path, content(*evaluation()), "summary", SVG)
+    about = {one.file.relative_to(tmp_path).as_posix(): one.about for one in written}
+    assert about["README.md"].endswith("figures in drives")
+    assert about["docs/results/evaluation.md"] == "1 charts beside it, 0 kB"
+    assert publish.publish(tmp_path, content(*evaluation()), "summary", SVG) == written
+
+
+def test_blocks_show_the_figures_of_the_data() -> None:
+    again = [run("plr-replicate", late=2) if one.contender == "plr-replicate" else one for one in evaluation()]
+    blocks = all_blocks(content(*evaluation(), again=tuple(again)))
+    drives = blocks["drives"]
+    assert "1 drives, 100 requests each" in drives
+    assert "| ROS 2 over the better carrier of each drive, chosen afterwards | 20.0 % | 480 ms | 2.0 s |" in drives
+    assert "| `plr-replicate` | 1.0 % | 119 ms | 100 ms | 200 |" in drives
+    assert "is 4.03 times lower than that of the better direct run, its P99 20 times" in drives
+    assert "zenoh" not in drives, "who did not run has no row"
+    assert "multipath TCP | 1 | 3.0 % | 157 ms | 2.0 s | 150 | 1.0 % | 119 ms | 100 ms | 200 |" in blocks["others"]
+    assert "| `adaptive` | 1 | 3.0 % | 89 % | 20 % |" in blocks["modes"]
+    assert "| `mean_gain` | 4.03 | ≥ 1.9 | met |" in blocks["verdicts"]
+    assert "| `fallback_late` | not measured | ≤ 0 | not measured |" in blocks["verdicts"]
+    assert "| driving, mean | 2.73, 1.9 | 7.23, 4.03 | 1 |" in blocks["paper"]
+    assert "| plr-replicate: mean gain | 4.03 | 3.48 | 14 % |" in blocks["reproduced"]
+    assert blocks["budgets"] == blocks["fallback"] == NOTHING
+
+
+@pytest.mark.parametrize(
+    ("page", "told"),
+    [
+        ("<!-- evaluation: drives -->\n", "in turn"),
+        ("<!-- evaluation: drives -->\n<!-- evaluation: modes -->\n<!-- end -->\n<!-- end -->\n", "in turn"),
+        ("<!-- evaluation: speed -->\n<!-- end -->\n", "speed"),
+        ("no marks\n", "expected a checkout whose README.md or docs show drives"),
+    ],
+)
+def test_nothing_is_published_where_the_marks_are_wrong(tmp_path: Path, page: str, told: str) -> None:
+    root = checkout(tmp_path, page)
+    with pytest.raises(ValueError, match=told):
+        publish.publish(root, content(*evaluation()), "summary", {})
+    assert (root / "README.md").read_text() == page
+    assert not (root / publish.RESULTS).exists()
+
+
+def test_charts_that_are_no_more_are_removed(tmp_path: Path) -> None:
+    root = checkout(tmp_path)
+    publish.publish(root, content(*evaluation()), "summary", {"evaluation-charts/old.svg": b"", **SVG})
+    publish.publish(root, content(*evaluation()), "summary", SVG)
+    assert [file.name for file in (root / publish.RESULTS).glob("*/*")] == ["modes.svg"]
+    data = json.loads((root / publish.RESULTS / publish.DATA).read_text())
+    assert data[publish.FILES]["evaluation.md"] == hashlib.sha256(b"summary").hexdigest()
+    assert all_blocks(data)["drives"] in (root / "README.md").read_text()
