@@ -122,7 +122,7 @@ def run(options: argparse.Namespace) -> int:
         console.print(rich_table(modes_table(costs)))
     # Last: drawing takes a processor from what is measured.
     if outcomes and not options.no_report:
-        report_command.write(options.out, outcomes, machine(), failed)
+        report_command.write(options.out, outcomes, failed)
     for text in failed:
         console.print(f"failed: {text}")
     return 1 if failed or (void and not options.quick) else 0
@@ -155,6 +155,8 @@ def _run(scenario: Scenario, contender: str, options: argparse.Namespace) -> Out
         compute(scenario, contender) if contender in IDEALS else _run_in_lab(scenario, contender, options.keep_logs)
     )
     outcome.conditions["runs_at_once"] = options.jobs
+    if contender not in IDEALS:
+        outcome.conditions["machine"] = machine()
     outcome.write(options.out / RUNS)
     return outcome
 

@@ -55,12 +55,12 @@ def read_records(folder: Path, scenario: str = "*") -> list[Outcome]:
     return [Outcome.read(file) for file in sorted((folder / RUNS).glob(f"{scenario}/*.json"))]
 
 
-def gather(outcomes: Sequence[Outcome], machine: Mapping[str, Any], again: Sequence[Outcome] = ()) -> Report:
+def gather(outcomes: Sequence[Outcome], again: Sequence[Outcome] = ()) -> Report:
     """Everything, from at least one run; `again`: another evaluation of the same windows."""
     found = studies(outcomes)
     void = sum(bool(one.disturbances) for one in outcomes)
     windows = len({one.scenario for one in outcomes})
-    on = "".join(f", {key}: {value}" for key, value in machine.items())
+    on = "".join(f", {key}: {value}" for key, value in machine_of(outcomes).items())
     return Report(
         about=f"{len(outcomes)} runs in {windows} windows, {void} of them void{on}",
         evidence=findings.gather(outcomes, again),
@@ -74,9 +74,13 @@ def gather(outcomes: Sequence[Outcome], machine: Mapping[str, Any], again: Seque
     )
 
 
-def as_json(
-    outcomes: Sequence[Outcome], machine: Mapping[str, Any], failed: Sequence[str], again: Sequence[Outcome] = ()
-) -> dict[str, Any]:
+def machine_of(outcomes: Iterable[Outcome]) -> dict[str, Any]:
+    """What the newest run was measured on, and when; empty: no record says."""
+    known: list[dict[str, Any]] = [one.conditions["machine"] for one in outcomes if "machine" in one.conditions]
+    return max(known, key=lambda machine: str(machine.get("measured_at", "")), default={})
+
+
+def as_json(outcomes: Sequence[Outcome], failed: Sequence[str], again: Sequence[Outcome] = ()) -> dict[str, Any]:
     """Every figure of the report."""
     evidence = findings.gather(outcomes, again)
     found = studies(outcomes)
@@ -105,7 +109,7 @@ def as_json(
         "reproduced": _repeats_as_json(outcomes, again),
         "runs": runs,
         "failed": list(failed),
-        "machine": dict(machine),
+        "machine": machine_of(outcomes),
     }
 
 

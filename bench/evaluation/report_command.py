@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -15,7 +15,7 @@ from bench.reporting.terminal import show_verdicts
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from bench.evaluation.outcome import Outcome
 
@@ -54,11 +54,11 @@ def run(options: argparse.Namespace) -> int:
         again = report.read_records(options.again) if options.again else []
         if options.again and options.again.resolve() == options.out.resolve():
             raise ValueError(f"--again {options.again}: expected another evaluation than --out")
-        before = _before(options.out / DATA)
+        failed = _failed_before(options.out / DATA)
         for folder, records in ((options.out, outcomes), (options.again, again)):
             if folder and not records:
                 raise ValueError(f"{folder / report.RUNS}: no records; `python -m bench evaluate` makes them")
-        write(options.out, outcomes, before.get("machine", {}), before.get("failed", []), again, options.publish)
+        write(options.out, outcomes, failed, again, options.publish)
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
@@ -68,7 +68,6 @@ def run(options: argparse.Namespace) -> int:
 def write(
     folder: Path,
     outcomes: Sequence[Outcome],
-    machine: Mapping[str, Any],
     failed: Sequence[str],
     again: Sequence[Outcome] = (),
     checkout: Path | None = None,
@@ -77,8 +76,8 @@ def write(
 
     Raises ValueError: the checkout has no places for the figures.
     """
-    whole = report.gather(outcomes, machine, again)
-    content = report.as_json(outcomes, machine, failed, again)
+    whole = report.gather(outcomes, again)
+    content = report.as_json(outcomes, failed, again)
     text = summary.render(whole)
     drawn = {f"{summary.CHARTS}/{chart.name}.svg": chart.svg for section in whole.sections for chart in section.charts}
     (folder / DATA).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -101,12 +100,12 @@ def write(
             console.print(f"published: {one.file}: {one.about}")
 
 
-def _before(file: Path) -> dict[str, Any]:
-    """What the file says of the machine and of runs that failed, which no record does."""
+def _failed_before(file: Path) -> list[str]:
+    """What the file says of runs that failed, which no record does."""
     if not file.exists():
-        return {}
+        return []
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{file}: expected a report, remove it: {error}") from None
-    return content if isinstance(content, dict) else {}
+    return list(content.get("failed", [])) if isinstance(content, dict) else []

@@ -38,7 +38,7 @@ def evaluation() -> list[Outcome]:
 
 
 def content(*outcomes: Outcome, again: tuple[Outcome, ...] = ()) -> Mapping[str, Any]:
-    found: dict[str, Any] = json.loads(json.dumps(as_json(outcomes, {"cpus": 2}, [], again)))
+    found: dict[str, Any] = json.loads(json.dumps(as_json(outcomes, [], again)))
     return found
 
 

@@ -93,9 +93,12 @@ def test_ratios_stand_beside_the_papers() -> None:
 
 
 def test_the_reports_are_made_from_records_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "evaluation.json").write_text('{"machine": {"cpus": 2}, "failed": ["one"]}')
+    (tmp_path / "evaluation.json").write_text('{"failed": ["one"]}')
     megabytes = {"plr-single": 10, "plr-adaptive": 12}
-    modes = [run(name, scenario=drive()[0].scenario, megabytes=size) for name, size in megabytes.items()]
+    machine = {"cpus": 2, "measured_at": "2026-01-02"}
+    modes = [
+        run(name, scenario=drive()[0].scenario, megabytes=size, machine=machine) for name, size in megabytes.items()
+    ]
     assert reported(tmp_path, *drive(ours=1, megabytes=20), *modes) == 0
     assert "drive_windows" in capsys.readouterr().out
     content = json.loads((tmp_path / "evaluation.json").read_text())
@@ -104,7 +107,7 @@ def test_the_reports_are_made_from_records_alone(tmp_path: Path, capsys: pytest.
     assert content["verdicts"]["fallback_late"] is content["fallback_late"] is None
     assert content["studies"]["a-recorded"]["contenders"]["direct-a"]["miss_ratio"] == pytest.approx(0.4)
     assert content["redundancy_modes"]["plr-adaptive"]["extra_bytes"] == pytest.approx(0.2)
-    assert (content["machine"], content["failed"]) == ({"cpus": 2}, ["one"])
+    assert (content["machine"], content["failed"]) == (machine, ["one"])
     page = (tmp_path / "evaluation.html").read_text()
     summary = (tmp_path / "evaluation.md").read_text()
     for text in (page, summary):
