@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from controlplane.text_table import columns
-from protos.explanation import AlternativeKind
+from protos.explanation import AlternativeKind, Correlation
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 LEAST_SHOWN = 1e-9
 """No smaller probability is worth telling: it would take years to see one miss."""
+
+LITTLE_GAIN = 0.5
+"""Share of what the better interface misses that the other misses as well, from which on that one gains little."""
 
 _PAIR_HEADER = (
     *("", "INTERFACE", "SERVER", "STATE", "MISS", "90 % BETWEEN", "REQUESTS", "PROBES"),
@@ -33,7 +36,10 @@ def render(explanation: Explanation) -> str:
     for title, section in (
         ("mapping in force", list(_mapping(found))),
         ("pairs (times in ms, * in force)", list(_pairs(found))),
-        ("paths that carried copies of the same requests", list(columns([_joint(joint) for joint in found.joints]))),
+        (
+            "interfaces that carried copies of the same requests",
+            list(columns([_joint(joint) for joint in found.joints])),
+        ),
         ("what other mappings would give", list(columns([_alternative(other) for other in found.alternatives]))),
         ("changes, the last first", list(columns([_change(change) for change in found.changes]))),
     ):
@@ -98,13 +104,23 @@ def _quantile(histogram: Histogram, q: float) -> str:
 
 
 def _joint(joint: JointExplanation) -> tuple[str, ...]:
+    to = f", both to {joint.server}" if joint.server else ""
     shared = f" (they share {', '.join(joint.shared)})" if joint.shared else ""
     return (
-        f"{_path(joint.first)} and {_path(joint.second)}:",
+        f"{joint.first} and {joint.second}{to}:",
         f"both missed {joint.both_missed:.0f} of {joint.requests:.0f},",
-        f"{joint.lift:.2g} times chance:",
-        f"{joint.correlation.value}{shared}",
+        f"{joint.expected:.2g} expected by chance",
+        f"({joint.lift:.2g} times):",
+        f"{joint.correlation.value}{_gain(joint)}{shared}",
     )
+
+
+def _gain(joint: JointExplanation) -> str:
+    """What failing together means for a copy over the second interface."""
+    if joint.correlation is Correlation.INDEPENDENT:
+        return ""
+    rarer = min(joint.first_missed, joint.second_missed)
+    return f": a second copy gains {'little' if joint.both_missed >= LITTLE_GAIN * rarer else 'less than it could'}"
 
 
 def _alternative(other: Alternative) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from protos.histogram import Histogram
-    from protos.model import Assignment, NodeName, ServiceMapping, ServiceName, Version
+    from protos.model import Assignment, InterfaceName, NodeName, ServiceMapping, ServiceName, Version
     from protos.status import ResourceStatus
 
 SAMPLE = 1000
@@ -55,33 +55,39 @@ class PairExplanation:
 
 
 class Correlation(enum.Enum):
-    """Whether two paths miss together."""
+    """Whether two interfaces miss together."""
 
     TOGETHER = "fail together"
     LIKELY = "seem to fail together, but too little was seen to be sure"
     INDEPENDENT = "no sign that one failing says anything of the other"
-    APART = "seldom fail together"
 
 
 @dataclass(frozen=True, slots=True)
 class JointExplanation:
-    """What became of requests that went over two paths at once."""
+    """What became of requests that went over two interfaces at once."""
 
-    first: Assignment
-    second: Assignment
+    first: InterfaceName
+    second: InterfaceName
+    server: NodeName | None
+    """Of both copies; None for those to two servers, whichever these were."""
     requests: float
+    first_missed: float
+    """Of these requests; estimated, above 0."""
+    second_missed: float
     both_missed: float
-    both_miss: Belief
-    product: float
-    """What the probability that both miss would be if they were independent."""
     correlation: Correlation
     shared: tuple[str, ...] = ()
     """What the two have in common, in words."""
 
     @property
+    def expected(self) -> float:
+        """How many requests would have missed on both if the interfaces failed independently."""
+        return self.first_missed * self.second_missed / self.requests
+
+    @property
     def lift(self) -> float:
-        """How many times as often as by chance both miss."""
-        return self.both_miss.mean / self.product
+        """How many times as often as by chance both missed."""
+        return self.both_missed / self.expected
 
 
 class AlternativeKind(enum.Enum):

@@ -55,7 +55,7 @@ MAX_LATENCIES = 4096
 """Pairs (interface, server) in one report, counted anew for each service and size class that they carried."""
 
 MAX_JOINTS = 1024
-"""Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers."""
+"""Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers. As many of interfaces."""
 
 
 class Role(enum.Enum):
@@ -343,6 +343,26 @@ class JointReport:
 
 
 @dataclass(frozen=True, slots=True)
+class InterfaceJointReport:
+    """Requests that went over two interfaces at once since the last report, and how many missed the deadline on both.
+
+    An interface over which no path is up counts as missed. Which one alone a request missed is known of full `races`
+    only, in which no copy is called off before the deadline.
+    """
+
+    service: ServiceName
+    first: InterfaceName
+    second: InterfaceName
+    server: NodeName | None
+    """Of both copies; None for all other requests."""
+    requests: int
+    both_missed: int
+    races: int
+    only_first_missed: int
+    only_second_missed: int
+
+
+@dataclass(frozen=True, slots=True)
 class Report:
     """Everything a robot sidecar measured since its last report."""
 
@@ -350,6 +370,7 @@ class Report:
     paths: tuple[PathReport, ...] = ()
     outcomes: tuple[OutcomeReport, ...] = ()
     joints: tuple[JointReport, ...] = ()
+    interface_joints: tuple[InterfaceJointReport, ...] = ()
 
 
 SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain

@@ -197,15 +197,13 @@ def _plr(
 
 
 def _explained(system: System) -> list[str]:
-    """What `plr explain` says of the paths in force that carried copies of the same requests."""
-    explanation = system.explain(ROBOT, SERVICE)
-    chosen = {pair.path for pair in explanation.pairs if pair.chosen}
+    """What `plr explain` says of the interfaces that carried copies of the same requests."""
     return [
-        f"{joint.first.interface} -> {joint.first.server}, {joint.second.interface} -> {joint.second.server}: "
-        f"both missed {joint.both_missed:.0f} of {joint.requests:.0f}, {joint.lift:.2g} times chance: "
-        f"{joint.correlation.value}"
-        for joint in explanation.joints
-        if {joint.first, joint.second} <= chosen
+        f"{joint.first} and {joint.second}{f', both to {joint.server}' if joint.server else ''}: "
+        f"both missed {joint.both_missed:.0f} of {joint.requests:.0f} "
+        f"({joint.first} {joint.first_missed:.0f}, {joint.second} {joint.second_missed:.0f}), "
+        f"{joint.expected:.2g} expected by chance ({joint.lift:.2g} times): {joint.correlation.value}"
+        for joint in system.explain(ROBOT, SERVICE).joints
     ]
 
 

@@ -17,6 +17,7 @@ from controlplane.core.fading import FadedCount, FadedShares
 from controlplane.core.network import RobotNetwork
 from controlplane.core.parts import Asked, from_parts
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
+from controlplane.core.shared_fate import SharedFate
 from controlplane.core.silence import HeardClock
 from protos.explanation import SAMPLE
 from protos.histogram import Histogram
@@ -25,10 +26,21 @@ from protos.size_class import SIZE_CLASSES
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Assignment, InterfaceName, LatencyReport, NodeName, PathReport, Report, ServiceName
+    from controlplane.core.shared_fate import CommonMisses
+    from protos.model import (
+        Assignment,
+        InterfaceName,
+        JointReport,
+        LatencyReport,
+        NodeName,
+        PathReport,
+        Report,
+        ServiceName,
+    )
 
     Pair = tuple[InterfaceName, NodeName, ServiceName]
     JointKey = tuple[ServiceName, Assignment, Assignment]
+    FateKey = tuple[ServiceName, InterfaceName, InterfaceName, NodeName | None]
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -52,6 +64,10 @@ servers, 16 services."""
 
 MAX_JOINTS_PER_ROBOT = 1024
 """Pairs of paths of one robot whose common misses are kept, the least recently reported goes."""
+
+MAX_FATES_PER_ROBOT = 1024
+"""Pairs of interfaces of one robot whose common misses are kept, by service and, for copies to one server, by server;
+the least recently reported goes."""
 
 MAX_OUTCOMES_PER_ROBOT = 1024
 """Services kept of one robot, the least recently reported goes: as many as it can carry."""
@@ -94,12 +110,13 @@ class _Pair:
 class _Robot:
     """Tables fed by one robot."""
 
-    __slots__ = ("joints", "network", "outcomes", "services", "trials")
+    __slots__ = ("fates", "joints", "network", "outcomes", "services", "trials")
 
     def __init__(self, half_life_s: float) -> None:
         self.network = RobotNetwork(half_life_s)
         self.trials: OrderedDict[Pair, _Pair] = OrderedDict()
         self.joints: OrderedDict[JointKey, FadedTrials] = OrderedDict()
+        self.fates: OrderedDict[FateKey, SharedFate] = OrderedDict()
         self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
 
@@ -139,12 +156,12 @@ class Estimator:
         for latency in report.latencies:
             changed |= self._merge_latency(tables, latency, now)
         for joint in report.joints:
-            joint_key = (joint.service, joint.first, joint.second)
-            of_service = tables.services.get(joint.service)
-            clock = of_service.clock if of_service is not None else None
-            together = tables.joints.get(joint_key) or FadedTrials(self._half_life_s, now, clock)
-            self._keep(tables.joints, joint_key, together, MAX_JOINTS_PER_ROBOT)
-            together.add(joint.requests, joint.both_missed, now)
+            self._merge_joint(tables, joint, now)
+        for fate in report.interface_joints:
+            fate_key = (fate.service, fate.first, fate.second, fate.server)
+            shared = tables.fates.get(fate_key) or SharedFate(now)
+            self._keep(tables.fates, fate_key, shared, MAX_FATES_PER_ROBOT)
+            shared.add(fate, now)
         for path in report.paths:
             changed |= network.merge_path(path, now)
         for outcome in report.outcomes:
@@ -176,6 +193,14 @@ class Estimator:
             self._keep(tables.trials, pair, found, MAX_PAIRS_PER_ROBOT)
             found.trials.add(latency.requests, latency.missed, now)
         return changed
+
+    def _merge_joint(self, tables: _Robot, joint: JointReport, now: float) -> None:
+        key = (joint.service, joint.first, joint.second)
+        of_service = tables.services.get(joint.service)
+        clock = of_service.clock if of_service is not None else None
+        together = tables.joints.get(key) or FadedTrials(self._half_life_s, now, clock)
+        self._keep(tables.joints, key, together, MAX_JOINTS_PER_ROBOT)
+        together.add(joint.requests, joint.both_missed, now)
 
     def _keep(self, table: OrderedDict[K, V], key: K, value: V, limit: int) -> None:
         """Put it in, as used last, and evict the least recently used beyond `limit`."""
@@ -259,15 +284,14 @@ class Estimator:
             compute=self._compute.requests(path.server, service, now, sample=SAMPLE),
         )
 
-    def raced_counts(
+    def common_misses(
         self, robot: NodeName, service: ServiceName, now: float
-    ) -> Iterator[tuple[Assignment, Assignment, float, float]]:
-        """The pairs of paths that carried copies of the same requests: how many, and how many missed on both."""
+    ) -> Iterator[tuple[InterfaceName, InterfaceName, NodeName | None, CommonMisses]]:
+        """The pairs of interfaces that carried copies of the same requests: to that server, or if None to two."""
         tables = self._robots.get(robot)
-        if tables is not None:
-            for (of, first, second), together in tables.joints.items():
-                if of == service:
-                    yield (first, second, *together.counts(now))
+        for (of, first, second, server), fate in tables.fates.items() if tables is not None else ():
+            if of == service and (found := fate.common_misses(now)) is not None:
+                yield first, second, server, found
 
     def raced_together(self, robot: NodeName, service: ServiceName) -> Iterator[tuple[Assignment, Assignment]]:
         """The pairs of paths that carried copies of the same requests."""

@@ -12,7 +12,7 @@ from controlplane.core import alternatives
 from controlplane.core.beta import intervals
 from controlplane.core.picture import BlockNotes, interfaces_of
 from controlplane.core.problem import BlockKey
-from protos.explanation import Belief, Correlation, Explanation, JointExplanation, MappingChange, PairExplanation
+from protos.explanation import Belief, Explanation, JointExplanation, MappingChange, PairExplanation
 from protos.model import Assignment, Role
 
 if TYPE_CHECKING:
@@ -26,22 +26,16 @@ if TYPE_CHECKING:
     from controlplane.core.problem import Block
     from controlplane.core.registry import Registry, Sidecar
     from controlplane.core.snapshots import Snapshots
-    from protos.model import NodeName, ServiceMapping, ServiceName, ServiceUse
+    from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
 
 LEVEL = 0.9
 """Of the intervals told with a probability."""
 
+MIN_COMMON_REQUESTS = 20.0
+"""Requests over two interfaces below which nothing is told of these."""
+
 MAX_PAIRS = 1024
 """Pairs told of, those in use and then the best ones: what the estimator keeps of one robot."""
-
-MIN_EXPECTED = 3.0
-"""Common misses that chance would have brought, below which their absence says nothing."""
-
-MIN_TOGETHER = 2.0
-"""Common misses that it takes to say that two paths fail together, or seem to."""
-
-LIKELY_LIFT = 3.0
-"""How many times as often as by chance both must have missed for paths that seem to fail together."""
 
 
 class UnknownNameError(Exception):
@@ -102,7 +96,7 @@ def explain(
         charge=_charge(block, planned),
         pairs=_pairs(paths, picture.notes.get(key) or BlockNotes(), block, estimator, key, mapping, now),
         pairs_left_out=max(0, len(paths) - MAX_PAIRS),
-        joints=_joints(block, estimator, now) if block is not None else (),
+        joints=_joints(robot.name, use.name, block, estimator, now),
         alternatives=alternatives.of(picture.problem, plan, block) if block is not None else (),
         changes=_changes(history, now),
     )
@@ -147,8 +141,8 @@ def _pairs(
                 rtt=evidence.rtt,
                 network=evidence.network,
                 compute=evidence.compute,
-                carrier=_carrier(block, path),
-                region=_region(block, path),
+                carrier=_carrier(block, path.interface),
+                region=_region(block, path.server),
                 barred=(path.interface, path.server) in notes.barred,
             )
         )
@@ -166,67 +160,50 @@ def _beliefs(estimates: list[Estimate]) -> Iterator[Belief]:
         yield Belief(estimate.mean, low, high)
 
 
-def _joints(block: Block, estimator: Estimator, now: float) -> tuple[JointExplanation, ...]:
-    robot, service = block.key
-    raced = []
-    for first, second, requests, both_missed in estimator.raced_counts(robot, service, now):
-        one, other = _estimate(block, first), _estimate(block, second)
-        if one is None or other is None:
-            continue
-        product = one.mean * other.mean
-        estimate = estimator.both_miss(robot, service, first, second, product, now)
-        raced.append((first, second, requests, both_missed, product, estimate))
-    beliefs = _beliefs([estimate for *_, estimate in raced])
+def _joints(
+    robot: NodeName, service: ServiceName, block: Block | None, estimator: Estimator, now: float
+) -> tuple[JointExplanation, ...]:
     return tuple(
         JointExplanation(
             first=first,
             second=second,
-            requests=requests,
-            both_missed=both_missed,
-            both_miss=belief,
-            product=product,
-            correlation=_correlation(belief, product, requests, both_missed),
-            shared=_shared(block, first, second),
+            server=server,
+            requests=found.requests,
+            first_missed=found.first_missed,
+            second_missed=found.second_missed,
+            both_missed=found.both_missed,
+            correlation=found.correlation,
+            shared=_shared(block, first, second, server),
         )
-        for (first, second, requests, both_missed, product, _), belief in zip(raced, beliefs, strict=True)
+        for first, second, server, found in estimator.common_misses(robot, service, now)
+        if found.requests >= MIN_COMMON_REQUESTS
     )
 
 
-def _correlation(both_miss: Belief, product: float, requests: float, both_missed: float) -> Correlation:
-    if both_missed >= MIN_TOGETHER:
-        if both_miss.low > product:
-            return Correlation.TOGETHER
-        if both_miss.mean >= LIKELY_LIFT * product:
-            return Correlation.LIKELY
-    if both_miss.high < product and requests * product >= MIN_EXPECTED:
-        return Correlation.APART
-    return Correlation.INDEPENDENT
-
-
-def _shared(block: Block, first: Assignment, second: Assignment) -> tuple[str, ...]:
-    """What two paths have in common, the narrowest of each end."""
+def _shared(
+    block: Block | None, first: InterfaceName, second: InterfaceName, server: NodeName | None
+) -> tuple[str, ...]:
+    """What copies over two interfaces have in common, the narrowest of each end."""
     shared = []
-    if first.interface == second.interface:
-        shared.append(f"interface {first.interface}")
-    elif (carrier := _carrier(block, first)) and carrier == _carrier(block, second):
+    if (carrier := _carrier(block, first)) and carrier == _carrier(block, second):
         shared.append(f"carrier {carrier}")
-    if first.server == second.server:
-        shared.append(f"server {first.server}")
-    elif (region := _region(block, first)) and region == _region(block, second):
-        shared.append(f"region {region}")
+    if server is not None:
+        shared.append(f"server {server}")
+    elif block is not None and len(regions := {_region(block, server) for server in block.servers}) == 1:
+        shared += [f"region {region}" for region in regions if region]
     return tuple(shared)
 
 
-def _carrier(block: Block | None, path: Assignment) -> str:
-    if block is None or not block.carriers or path.interface not in block.interfaces:
+def _carrier(block: Block | None, interface: InterfaceName) -> str:
+    if block is None or not block.carriers or interface not in block.interfaces:
         return ""
-    return block.carriers[block.interfaces.index(path.interface)]
+    return block.carriers[block.interfaces.index(interface)]
 
 
-def _region(block: Block | None, path: Assignment) -> str:
-    if block is None or not block.regions or path.server not in block.servers:
+def _region(block: Block | None, server: NodeName) -> str:
+    if block is None or not block.regions or server not in block.servers:
         return ""
-    return block.regions[block.servers.index(path.server)]
+    return block.regions[block.servers.index(server)]
 
 
 def _charge(block: Block | None, plan: BlockPlan | None) -> float | None:

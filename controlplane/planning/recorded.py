@@ -21,7 +21,7 @@ from protos.histogram import MIDS
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -109,10 +109,8 @@ class RecordedService:
         for path, (i, j) in index.items():
             epsilon[i][j] = self._epsilon(path, deadline_s)
         lifts = self._lifts_through_servers(index, deadline_s)
-        for joint in found.joints:
-            if joint.first in index and joint.second in index and joint.first.interface != joint.second.interface:
-                one, other = index[joint.first], index[joint.second]
-                lifts[min(one, other), max(one, other)] = joint.lift
+        for pair, lift in self._lifts_between_interfaces(index, epsilon):
+            lifts[pair] = max(lift, lifts.get(pair, 1.0))
         return Block(
             key=BlockKey(found.robot, found.service),
             interfaces=interfaces,
@@ -141,6 +139,21 @@ class RecordedService:
         if of_probes is None:
             raise ValueError("a pair without evidence")
         return of_probes, self._overhead_s
+
+    def _lifts_between_interfaces(
+        self, index: Mapping[Assignment, PathIndex], epsilon: Sequence[Sequence[float | None]]
+    ) -> Iterator[tuple[tuple[PathIndex, PathIndex], float]]:
+        """How much more often than by chance two paths miss together because their interfaces do, whatever the servers.
+
+        Never so much that both would miss more often than the better one alone.
+        """
+        for joint in self._explanation.joints:
+            for (first, one), (second, other) in itertools.product(index.items(), repeat=2):
+                if (first.interface, second.interface) != (joint.first, joint.second):
+                    continue
+                if joint.server in ((None,) if first.server != second.server else (first.server,)):
+                    most = 1.0 / max(epsilon[one[0]][one[1]] or 1.0, epsilon[other[0]][other[1]] or 1.0)
+                    yield (min(one, other), max(one, other)), min(max(1.0, joint.lift), most)
 
     def _lifts_through_servers(
         self, index: Mapping[Assignment, PathIndex], deadline_s: float

@@ -38,7 +38,7 @@ from protos.explanation import (
     PairExplanation,
 )
 from protos.model import MAX_JOINTS
-from protos.names import clean_text, node_name, service_name, text
+from protos.names import clean_text, interface_name, node_name, service_name, text
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
@@ -60,7 +60,6 @@ _CORRELATIONS = {
     admin_pb2.CORRELATION_TOGETHER: Correlation.TOGETHER,
     admin_pb2.CORRELATION_LIKELY: Correlation.LIKELY,
     admin_pb2.CORRELATION_INDEPENDENT: Correlation.INDEPENDENT,
-    admin_pb2.CORRELATION_APART: Correlation.APART,
 }
 _CORRELATION_NUMBERS = {value: number for number, value in _CORRELATIONS.items()}
 _KINDS = {
@@ -196,18 +195,20 @@ def _pair_to_proto(pair: PairExplanation) -> admin_pb2.ExplainedPair:
 
 
 def _joint_from_proto(message: admin_pb2.ExplainedJoint) -> JointExplanation:
-    product = probability(message.product, "product")
-    if product == 0.0:
-        raise DecodeError("product is 0")
+    first, second = (_weight(getattr(message, field), field) for field in ("first_missed", "second_missed"))
+    requests = _weight(message.requests, "requests")
+    if requests == 0.0 or first * second / requests == 0.0:
+        raise DecodeError("requests, first_missed or second_missed is 0")
     if len(message.shared) > MAX_SHARED:
         raise DecodeError(f"shared has {len(message.shared)} elements, more than {MAX_SHARED}")
     return JointExplanation(
-        first=assignment_from_proto(message.first),
-        second=assignment_from_proto(message.second),
-        requests=_weight(message.requests, "requests"),
+        first=interface_name(message.first_interface, "first_interface"),
+        second=interface_name(message.second_interface, "second_interface"),
+        server=node_name(message.server, "server") if message.server else None,
+        requests=requests,
+        first_missed=first,
+        second_missed=second,
         both_missed=_weight(message.both_missed, "both_missed"),
-        both_miss=_belief_from_proto(message.both_miss),
-        product=product,
         correlation=known(message.correlation, _CORRELATIONS, "correlation"),
         shared=tuple(text(shared, "shared") for shared in message.shared),
     )
@@ -215,12 +216,13 @@ def _joint_from_proto(message: admin_pb2.ExplainedJoint) -> JointExplanation:
 
 def _joint_to_proto(joint: JointExplanation) -> admin_pb2.ExplainedJoint:
     return admin_pb2.ExplainedJoint(
-        first=assignment_to_proto(joint.first),
-        second=assignment_to_proto(joint.second),
+        first_interface=joint.first,
+        second_interface=joint.second,
+        server=joint.server or "",
         requests=joint.requests,
+        first_missed=joint.first_missed,
+        second_missed=joint.second_missed,
         both_missed=joint.both_missed,
-        both_miss=_belief_to_proto(joint.both_miss),
-        product=joint.product,
         correlation=_CORRELATION_NUMBERS[joint.correlation],
         shared=map(clean_text, joint.shared),
     )

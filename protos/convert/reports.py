@@ -6,7 +6,16 @@ from protos.convert.fields import MAX_EVENTS, MAX_OUTCOMES, MAX_PATHS, at_most, 
 from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
 from protos.errors import DecodeError
-from protos.model import MAX_JOINTS, MAX_LATENCIES, JointReport, LatencyReport, OutcomeReport, PathReport, Report
+from protos.model import (
+    MAX_JOINTS,
+    MAX_LATENCIES,
+    InterfaceJointReport,
+    JointReport,
+    LatencyReport,
+    OutcomeReport,
+    PathReport,
+    Report,
+)
 from protos.names import interface_name, node_name, service_name
 from protos.plr.v1 import control_pb2
 from protos.size_class import SIZE_CLASSES
@@ -19,6 +28,7 @@ def report_from_proto(message: control_pb2.Report) -> Report:
         paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
         outcomes=each(message.outcomes, MAX_OUTCOMES, "outcomes", _outcome_from_proto),
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
+        interface_joints=each(message.interface_joints, MAX_JOINTS, "interface_joints", _interface_joint_from_proto),
     )
 
 
@@ -29,6 +39,7 @@ def report_to_proto(report: Report) -> control_pb2.Report:
         paths=map(path_to_proto, report.paths),
         outcomes=map(_outcome_to_proto, report.outcomes),
         joints=map(_joint_to_proto, report.joints),
+        interface_joints=map(_interface_joint_to_proto, report.interface_joints),
     )
 
 
@@ -121,4 +132,41 @@ def _joint_to_proto(joint: JointReport) -> control_pb2.JointReport:
         second=assignment_to_proto(joint.second),
         requests=joint.requests,
         both_missed=joint.both_missed,
+    )
+
+
+def _interface_joint_from_proto(message: control_pb2.InterfaceJointReport) -> InterfaceJointReport:
+    first, second = interface_name(message.first, "first"), interface_name(message.second, "second")
+    if not first < second:
+        raise DecodeError("interface_joints: the first interface does not come before the second")
+    requests = at_most(message.requests, MAX_EVENTS, "requests")
+    both_missed = at_most(message.both_missed, requests, "both_missed")
+    races = at_most(message.races, requests, "races")
+    only_first_missed = at_most(message.only_first_missed, min(races, requests - both_missed), "only_first_missed")
+    # No request is counted twice.
+    most = min(races, requests - both_missed) - only_first_missed
+    return InterfaceJointReport(
+        service=service_name(message.service, "service"),
+        first=first,
+        second=second,
+        server=node_name(message.server, "server") if message.server else None,
+        requests=requests,
+        both_missed=both_missed,
+        races=races,
+        only_first_missed=only_first_missed,
+        only_second_missed=at_most(message.only_second_missed, most, "only_second_missed"),
+    )
+
+
+def _interface_joint_to_proto(joint: InterfaceJointReport) -> control_pb2.InterfaceJointReport:
+    return control_pb2.InterfaceJointReport(
+        service=joint.service,
+        first=joint.first,
+        second=joint.second,
+        server=joint.server or "",
+        requests=joint.requests,
+        both_missed=joint.both_missed,
+        races=joint.races,
+        only_first_missed=joint.only_first_missed,
+        only_second_missed=joint.only_second_missed,
     )

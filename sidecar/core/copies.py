@@ -85,6 +85,8 @@ class Request:
     copies: list[Copy] = field(default_factory=list)
     withheld: tuple[PathId, ...] = ()
     """Further paths that its mapping names, the best first: for trouble, or to learn of them."""
+    dark: tuple[InterfaceName, ...] = ()
+    """Interfaces over which no path to any of its servers was up when it was submitted."""
     observed: bool = True
     """All its copies are measured, and none is called off before the deadline."""
     done: bool = False

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import Assignment
 from sidecar.core.copies import CopyState
+from sidecar.core.interface_outcomes import interface_outcomes
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName
@@ -27,6 +28,8 @@ def measure_outcomes(request: Request, measurements: Measurements) -> None:
     if request.outcomes_measured:
         return
     request.outcomes_measured = True
+    for interfaces, outcome in interface_outcomes(request):
+        measurements.judged_interfaces(interfaces, outcome)
     copies = request.started_together()
     accepted = [copy for copy in copies if copy.state is not CopyState.REJECTED]
     if request.observed:

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING
 from protos.histogram import Histogram
 from protos.model import MAX_JOINTS, MAX_LATENCIES, JointReport, LatencyReport, OutcomeReport, PathReport, Report
 from protos.size_class import size_class
+from sidecar.core.interface_outcomes import JointCounts
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
     from protos.model import Assignment, InterfaceName, NodeName, ServiceName
     from sidecar.core.copies import Carried
+    from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
     from sidecar.core.link_events import PathMeasured
     from sidecar.core.messages import ResponseMessage
     from sidecar.core.path_id import PathId
@@ -45,7 +47,7 @@ class _PathCounts:
 
 class Measurements:
     """Times and missed deadlines per (interface, server, service, size class), round-trip times per path, outcomes per
-    service and, joint ones, per pair of paths."""
+    service and, joint ones, per pair of paths and per pair of interfaces."""
 
     def __init__(self, dropped: Counter[str]) -> None:
         self._dropped = dropped
@@ -59,6 +61,7 @@ class Measurements:
         self._outcomes: Counter[tuple[ServiceName, str]] = Counter()
         self._compared: Counter[tuple[ServiceName, Assignment, Assignment]] = Counter()
         self._both_missed: Counter[tuple[ServiceName, Assignment, Assignment]] = Counter()
+        self._interfaces: dict[InterfacePair, JointCounts] = {}
 
     def size_class(self, service: ServiceName, request_bytes: int) -> int:
         """The class of a request before its answer is known: the service's latest one stands for it."""
@@ -124,6 +127,16 @@ class Measurements:
         self._compared[key] += 1
         self._both_missed[key] += both_missed
 
+    def judged_interfaces(self, pair: InterfacePair, outcome: PairOutcome) -> None:
+        """Whether a request missed over two interfaces is known."""
+        counts = self._interfaces.get(pair)
+        if counts is None:
+            if len(self._interfaces) >= MAX_JOINTS:
+                self._dropped["joint_outcomes_full"] += 1
+                return
+            counts = self._interfaces[pair] = JointCounts()
+        counts.add(outcome)
+
     def take(self, routes: Routes, servers: list[NodeName]) -> Report:
         """Return everything since the last call, and the state of every path to these servers."""
         latencies = tuple(
@@ -146,8 +159,9 @@ class Measurements:
             for service in sorted(services)
         )
         joints = tuple(JointReport(*key, count, self._both_missed[key]) for key, count in self._compared.items())
+        interface_joints = tuple(counts.report(pair) for pair, counts in self._interfaces.items())
         self._clear()
-        return Report(latencies, paths, outcomes, joints)
+        return Report(latencies, paths, outcomes, joints, interface_joints)
 
     def _path_report(self, interface: InterfaceName, server: NodeName, routes: Routes) -> PathReport:
         """One report for all paths between the two: the mapping knows interfaces and servers only."""

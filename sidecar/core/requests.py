@@ -84,6 +84,7 @@ class RequestTable:
         self.unanswered += 1
         self._held_bytes += len(payload)
         heapq.heappush(self._timers, (request.deadline_at, request_id))
+        request.dark = self._parts.routes.dark(self._parts.offers.servers(service))
         self._dispatch(request, now)
         self._notice_unreachable(request)
 

@@ -100,6 +100,14 @@ class Routes:
         """Whether any path to the peer is not down."""
         return any(route.state is not PathState.DOWN for route in self._by_peer.get(peer, {}).values())
 
+    def dark(self, peers: Iterable[NodeName]) -> tuple[InterfaceName, ...]:
+        """Return our interfaces over which there are paths to these peers, but none that is up."""
+        up: dict[InterfaceName, bool] = {}
+        for peer in peers:
+            for path, route in self._by_peer.get(peer, {}).items():
+                up[path.interface] = up.get(path.interface, False) or route.state is PathState.UP
+        return tuple(interface for interface, lit in up.items() if not lit)
+
     def usable(self, peers: Iterable[NodeName]) -> list[Route]:
         """Return the paths to these peers that are not down, best first."""
         routes = (route for peer in peers for route in self._by_peer.get(peer, {}).values())

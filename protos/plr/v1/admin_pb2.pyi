@@ -75,8 +75,7 @@ class _CorrelationEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Correlati
     CORRELATION_UNSPECIFIED: _Correlation.ValueType  # 0
     CORRELATION_TOGETHER: _Correlation.ValueType  # 1
     CORRELATION_INDEPENDENT: _Correlation.ValueType  # 2
-    CORRELATION_APART: _Correlation.ValueType  # 3
-    CORRELATION_LIKELY: _Correlation.ValueType  # 4
+    CORRELATION_LIKELY: _Correlation.ValueType  # 3
     """More often together than by chance, in too few streaks to be sure."""
 
 class Correlation(_Correlation, metaclass=_CorrelationEnumTypeWrapper): ...
@@ -84,8 +83,7 @@ class Correlation(_Correlation, metaclass=_CorrelationEnumTypeWrapper): ...
 CORRELATION_UNSPECIFIED: Correlation.ValueType  # 0
 CORRELATION_TOGETHER: Correlation.ValueType  # 1
 CORRELATION_INDEPENDENT: Correlation.ValueType  # 2
-CORRELATION_APART: Correlation.ValueType  # 3
-CORRELATION_LIKELY: Correlation.ValueType  # 4
+CORRELATION_LIKELY: Correlation.ValueType  # 3
 """More often together than by chance, in too few streaks to be sure."""
 Global___Correlation: _TypeAlias = Correlation  # noqa: Y015
 
@@ -354,29 +352,29 @@ Global___ExplainedPair: _TypeAlias = ExplainedPair  # noqa: Y015
 
 @_typing.final
 class ExplainedJoint(_message.Message):
-    """What became of requests that went over two paths at once."""
+    """What became of requests that went over two interfaces at once."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
-    FIRST_FIELD_NUMBER: _builtins.int
-    SECOND_FIELD_NUMBER: _builtins.int
+    FIRST_INTERFACE_FIELD_NUMBER: _builtins.int
+    SECOND_INTERFACE_FIELD_NUMBER: _builtins.int
+    SERVER_FIELD_NUMBER: _builtins.int
     REQUESTS_FIELD_NUMBER: _builtins.int
+    FIRST_MISSED_FIELD_NUMBER: _builtins.int
+    SECOND_MISSED_FIELD_NUMBER: _builtins.int
     BOTH_MISSED_FIELD_NUMBER: _builtins.int
-    BOTH_MISS_FIELD_NUMBER: _builtins.int
-    PRODUCT_FIELD_NUMBER: _builtins.int
     CORRELATION_FIELD_NUMBER: _builtins.int
     SHARED_FIELD_NUMBER: _builtins.int
+    first_interface: _builtins.str
+    second_interface: _builtins.str
+    server: _builtins.str
+    """The server of both copies; empty for those to two servers, whichever these were."""
     requests: _builtins.float
+    first_missed: _builtins.float
+    """Those that missed on either and on both; the first two estimated, each above 0."""
+    second_missed: _builtins.float
     both_missed: _builtins.float
-    product: _builtins.float
-    """What the probability that both miss would be if they were independent; above 0."""
     correlation: Global___Correlation.ValueType
-    @_builtins.property
-    def first(self) -> _control_pb2.Assignment: ...
-    @_builtins.property
-    def second(self) -> _control_pb2.Assignment: ...
-    @_builtins.property
-    def both_miss(self) -> Global___Belief: ...
     @_builtins.property
     def shared(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """What the two have in common, in words."""
@@ -384,18 +382,19 @@ class ExplainedJoint(_message.Message):
     def __init__(
         self,
         *,
-        first: _control_pb2.Assignment | None = ...,
-        second: _control_pb2.Assignment | None = ...,
+        first_interface: _builtins.str = ...,
+        second_interface: _builtins.str = ...,
+        server: _builtins.str = ...,
         requests: _builtins.float = ...,
+        first_missed: _builtins.float = ...,
+        second_missed: _builtins.float = ...,
         both_missed: _builtins.float = ...,
-        both_miss: Global___Belief | None = ...,
-        product: _builtins.float = ...,
         correlation: Global___Correlation.ValueType = ...,
         shared: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["both_miss", b"both_miss", "first", b"first", "second", b"second"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["both_miss", b"both_miss", "both_missed", b"both_missed", "correlation", b"correlation", "first", b"first", "product", b"product", "requests", b"requests", "second", b"second", "shared", b"shared"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["both_missed", b"both_missed", "correlation", b"correlation", "first_interface", b"first_interface", "first_missed", b"first_missed", "requests", b"requests", "second_interface", b"second_interface", "second_missed", b"second_missed", "server", b"server", "shared", b"shared"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

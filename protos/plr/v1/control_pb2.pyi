@@ -326,6 +326,57 @@ class JointReport(_message.Message):
 Global___JointReport: _TypeAlias = JointReport  # noqa: Y015
 
 @_typing.final
+class InterfaceJointReport(_message.Message):
+    """What became of requests that went over two interfaces at once, or were to, as no path over one or both was up: these
+    missed there. Chosen like those of JointReport.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SERVICE_FIELD_NUMBER: _builtins.int
+    FIRST_FIELD_NUMBER: _builtins.int
+    SECOND_FIELD_NUMBER: _builtins.int
+    SERVER_FIELD_NUMBER: _builtins.int
+    REQUESTS_FIELD_NUMBER: _builtins.int
+    BOTH_MISSED_FIELD_NUMBER: _builtins.int
+    RACES_FIELD_NUMBER: _builtins.int
+    ONLY_FIRST_MISSED_FIELD_NUMBER: _builtins.int
+    ONLY_SECOND_MISSED_FIELD_NUMBER: _builtins.int
+    service: _builtins.str
+    first: _builtins.str
+    second: _builtins.str
+    server: _builtins.str
+    """Of both copies; empty for all other requests."""
+    requests: _builtins.int
+    both_missed: _builtins.int
+    races: _builtins.int
+    """Of the requests: those to be full races, in which no copy is called off before the deadline. Only of these it is
+    known which ones missed on the first alone, or on the second alone.
+    """
+    only_first_missed: _builtins.int
+    only_second_missed: _builtins.int
+    def __init__(
+        self,
+        *,
+        service: _builtins.str = ...,
+        first: _builtins.str = ...,
+        second: _builtins.str = ...,
+        server: _builtins.str = ...,
+        requests: _builtins.int = ...,
+        both_missed: _builtins.int = ...,
+        races: _builtins.int = ...,
+        only_first_missed: _builtins.int = ...,
+        only_second_missed: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["both_missed", b"both_missed", "first", b"first", "only_first_missed", b"only_first_missed", "only_second_missed", b"only_second_missed", "races", b"races", "requests", b"requests", "second", b"second", "server", b"server", "service", b"service"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___InterfaceJointReport: _TypeAlias = InterfaceJointReport  # noqa: Y015
+
+@_typing.final
 class PathReport(_message.Message):
     """The state of one path, measured by probes and acknowledgements."""
 
@@ -400,6 +451,7 @@ class Report(_message.Message):
     PATHS_FIELD_NUMBER: _builtins.int
     OUTCOMES_FIELD_NUMBER: _builtins.int
     JOINTS_FIELD_NUMBER: _builtins.int
+    INTERFACE_JOINTS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def latencies(self) -> _containers.RepeatedCompositeFieldContainer[Global___LatencyReport]: ...
     @_builtins.property
@@ -408,6 +460,8 @@ class Report(_message.Message):
     def outcomes(self) -> _containers.RepeatedCompositeFieldContainer[Global___OutcomeReport]: ...
     @_builtins.property
     def joints(self) -> _containers.RepeatedCompositeFieldContainer[Global___JointReport]: ...
+    @_builtins.property
+    def interface_joints(self) -> _containers.RepeatedCompositeFieldContainer[Global___InterfaceJointReport]: ...
     def __init__(
         self,
         *,
@@ -415,10 +469,11 @@ class Report(_message.Message):
         paths: _abc.Iterable[Global___PathReport] | None = ...,
         outcomes: _abc.Iterable[Global___OutcomeReport] | None = ...,
         joints: _abc.Iterable[Global___JointReport] | None = ...,
+        interface_joints: _abc.Iterable[Global___InterfaceJointReport] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["interface_joints", b"interface_joints", "joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

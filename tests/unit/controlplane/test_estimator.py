@@ -12,6 +12,7 @@ from controlplane.core import network as network_module
 from controlplane.core.estimator import Estimator
 from protos.model import (
     Assignment,
+    InterfaceJointReport,
     InterfaceName,
     JointReport,
     LatencyReport,
@@ -135,6 +136,24 @@ def test_paths_fail_independently_until_seen_to_fail_together(estimator: Estimat
     assert estimator.both_miss(ROBOT, PLAN, Assignment(WLAN, B), Assignment(WWAN, A), 0.01, 0.0).mean == 0.01
 
 
+def shared(
+    requests: int, both_missed: int, *, server: NodeName | None = None, over: str = WWAN
+) -> InterfaceJointReport:
+    alone = requests // 2, 1, 0
+    return InterfaceJointReport(PLAN, WLAN, InterfaceName(over), server, requests, both_missed, *alone)
+
+
+def test_what_two_interfaces_have_in_common_is_remembered_for_minutes(estimator: Estimator) -> None:
+    estimator.merge(ROBOT, Report(interface_joints=(shared(20, 2),)), 0.0)
+    estimator.merge(ROBOT, Report(interface_joints=(shared(20, 4), shared(5, 5, server=B))), 120.0)
+    two, one = estimator.common_misses(ROBOT, PLAN, 120.0)
+    kept = 0.5**0.2
+    assert two[:3] == (WLAN, WWAN, None)
+    assert (two[3].requests, two[3].both_missed) == pytest.approx((20 * kept + 20, 2 * kept + 4))
+    assert one[:3] == (WLAN, WWAN, B)
+    assert not list(estimator.common_misses(ROBOT, ServiceName("/other"), 120.0))
+
+
 def test_going_up_or_down_is_news(estimator: Estimator) -> None:
     assert estimator.path_up(ROBOT, WLAN, A) is None
     assert estimator.merge(ROBOT, Report(paths=(path("wlan0", "cloud-a"),)), 0.0)
@@ -161,6 +180,7 @@ def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypa
     monkeypatch.setattr(estimator_module, "MAX_OUTCOMES_PER_ROBOT", 4)
     monkeypatch.setattr(compute_module, "MAX_PROCESSING", 4)
     monkeypatch.setattr(estimator_module, "MAX_JOINTS_PER_ROBOT", 4)
+    monkeypatch.setattr(estimator_module, "MAX_FATES_PER_ROBOT", 4)
     for number in range(6):
         measured = histogram(0.01)
         estimator.merge(
@@ -170,10 +190,11 @@ def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypa
                 paths=(path("wlan0", f"cloud-{number}"),),
                 outcomes=(OutcomeReport(ServiceName(f"/service_{number}"), ok=1),),
                 joints=(together(1, 0, second=f"cloud-{number}"),),
+                interface_joints=(shared(4, 0, over=f"wwan{number}"),),
             ),
             float(number),
         )
-    assert estimator.dropped == 6 * 2
+    assert estimator.dropped == 7 * 2
     assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-1")) is None
     assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-5")) is True
 

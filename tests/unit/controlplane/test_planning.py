@@ -92,7 +92,7 @@ def on(interface: str, server: str) -> Assignment:
 
 
 def explanation(*, idempotent: bool = True) -> Explanation:
-    """Two interfaces to two servers, whose paths to `a` and `b` fail together; a third server was only probed."""
+    """Two interfaces, which fail together, to two servers; a third server was only probed."""
     epsilon = {on("wlan0", "a"): 0.1, on("wlan0", "b"): 0.2, on("wwan0", "a"): 0.2, on("wwan0", "b"): 0.1}
     pairs = [
         PairExplanation(
@@ -112,7 +112,7 @@ def explanation(*, idempotent: bool = True) -> Explanation:
         on("wwan0", "c"), False, None, None, 0.0, 50.0, scaled(0.05, times=5), Histogram(), Histogram()
     )
     joint = JointExplanation(
-        on("wlan0", "a"), on("wwan0", "b"), 100.0, 8.0, Belief(0.08, 0.05, 0.1), 0.01, Correlation.TOGETHER
+        InterfaceName("wlan0"), InterfaceName("wwan0"), None, 100.0, 10.0, 10.0, 8.0, Correlation.TOGETHER
     )
     return Explanation(
         NodeName("robot"),
@@ -133,7 +133,7 @@ def test_of_recorded_pairs_the_best_set_of_each_size_is_found() -> None:
     assert sets[1, 1].joint == pytest.approx(0.5 / 51)
     assert sets[1, 1].paths == "wwan0 -> c"
     assert sets[2, 1].joint == pytest.approx(0.1 * 0.2)
-    assert sets[2, 2].joint == pytest.approx(0.1 * sets[1, 1].joint)
+    assert sets[2, 2].joint == pytest.approx(8 * 0.1 * sets[1, 1].joint)
 
 
 def test_a_measured_lift_counts() -> None:
@@ -142,9 +142,16 @@ def test_a_measured_lift_counts() -> None:
         found.robot, found.service, 0.1, True, "joint", found.sync, pairs=found.pairs[:4], joints=found.joints
     )
     best = RecordedService(without_c).prospects(0.1)[-1]
-    # The better two paths miss together 8 times as often as by chance: 0.08.
-    assert best.paths == "wlan0 -> b, wwan0 -> a"
-    assert best.joint == best.product == pytest.approx(0.04)
+    assert best.paths == "wlan0 -> a, wwan0 -> b"
+    assert best.product == pytest.approx(0.01)
+    assert best.joint == pytest.approx(0.08)
+
+
+def test_a_lift_of_other_times_makes_no_pair_miss_more_often_than_its_better_path() -> None:
+    found = explanation()
+    joints = tuple(replace(joint, first_missed=5.0, second_missed=5.0) for joint in found.joints)
+    best = RecordedService(replace(found, pairs=found.pairs[:4], joints=joints)).prospects(0.1)[-1]
+    assert best.joint == pytest.approx(0.1)
 
 
 def test_one_slow_server_spoils_both_interfaces() -> None:
@@ -228,7 +235,7 @@ def test_it_reads_what_explain_printed(tmp_path: Path, capsys: pytest.CaptureFix
     file = tmp_path / "robot.json"
     message = explanation_to_proto(explanation())
     file.write_text(json_format.MessageToJson(message, preserving_proto_field_name=True))
-    code, text = plan(capsys, "--recorded", str(file), "--target", "0.005")
+    code, text = plan(capsys, "--recorded", str(file), "--target", "0.008")
     assert code == 0
     assert "robot /plan: 5 pairs with evidence" in text
     assert "to miss 100 ms" in text

@@ -36,6 +36,7 @@ from protos.model import (
     Drain,
     Heartbeat,
     InterfaceId,
+    InterfaceJointReport,
     InterfaceName,
     JointReport,
     LatencyReport,
@@ -206,7 +207,26 @@ def joint_reports(draw: st.DrawFn) -> JointReport:
     return JointReport(draw(service_names), first, second, *draw(counts_of))
 
 
-reports = st.builds(Report, _tuples(latencies), _tuples(paths), _tuples(outcomes), _tuples(joint_reports()))
+@st.composite
+def interface_joint_reports(draw: st.DrawFn) -> InterfaceJointReport:
+    first, second = sorted(draw(st.lists(interface_names, min_size=2, max_size=2, unique=True)))
+    requests, both_missed = draw(counts_of)
+    races = draw(st.integers(0, requests))
+    only_first_missed = draw(st.integers(0, min(races, requests - both_missed)))
+    only_second_missed = draw(st.integers(0, min(races, requests - both_missed) - only_first_missed))
+    alone = races, only_first_missed, only_second_missed
+    server = draw(st.none() | node_names)
+    return InterfaceJointReport(draw(service_names), first, second, server, requests, both_missed, *alone)
+
+
+reports = st.builds(
+    Report,
+    _tuples(latencies),
+    _tuples(paths),
+    _tuples(outcomes),
+    _tuples(joint_reports()),
+    _tuples(interface_joint_reports()),
+)
 
 
 @st.composite
@@ -275,12 +295,11 @@ explained_pairs = st.builds(
 )
 explained_joints = st.builds(
     JointExplanation,
-    assignments,
-    assignments,
+    interface_names,
+    interface_names,
+    st.none() | node_names,
+    *[st.floats(1e-3, MAX_EVENTS)] * 3,
     weights,
-    weights,
-    beliefs,
-    probabilities.filter(bool),
     st.sampled_from(Correlation),
     _tuples(texts),
 )

@@ -183,8 +183,23 @@ def joint(**changes: Any) -> control_pb2.SidecarMessage:
     return control_pb2.SidecarMessage(report=report)
 
 
+def interface_joint(**changes: Any) -> control_pb2.SidecarMessage:
+    counts = {"requests": 6, "both_missed": 3, "races": 3, "only_first_missed": 1, "only_second_missed": 2}
+    fields: dict[str, Any] = {"service": "/plan", "first": "wlan0", "second": "wwan0", **counts}
+    report = control_pb2.Report(interface_joints=[control_pb2.InterfaceJointReport(**(fields | changes))])
+    return control_pb2.SidecarMessage(report=report)
+
+
 def test_the_samples_that_the_next_test_breaks_are_good() -> None:
-    for message in (register(), candidates({}), labels({}), services(uses=[use()]), latency(), joint()):
+    for message in (
+        register(),
+        candidates({}),
+        labels({}),
+        services(uses=[use()]),
+        latency(),
+        joint(),
+        interface_joint(),
+    ):
         sidecar_message_from_proto(message)
 
 
@@ -254,6 +269,15 @@ def test_the_samples_that_the_next_test_breaks_are_good() -> None:
         (joint(first=control_pb2.Assignment(interface="wwan0", server="cloud-a")), "joints"),
         (joint(second=control_pb2.Assignment(interface="wwan0")), "server"),
         (joint(both_missed=4), "both_missed"),
+        (interface_joint(first="wwan0"), "interface_joints"),
+        (interface_joint(second="x/y"), "second"),
+        (interface_joint(server="-"), "server"),
+        (interface_joint(both_missed=7), "both_missed"),
+        (interface_joint(both_missed=4), "only_second_missed"),
+        (interface_joint(races=7), "races"),
+        (interface_joint(races=2), "only_second_missed"),
+        (interface_joint(only_first_missed=4), "only_first_missed"),
+        (interface_joint(only_second_missed=3), "only_second_missed"),
         (control_pb2.SidecarMessage(ack=control_pb2.Ack(version=1)), "resource"),
         (control_pb2.SidecarMessage(nack=control_pb2.Nack(resource=PEERS, error="a\nb")), "error"),
     ],

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
-from protos.model import Assignment, JointReport, OutcomeReport, ServiceName
+from protos.model import Assignment, InterfaceJointReport, JointReport, OutcomeReport, ServiceName
 from sidecar.core import measurements as measurements_module
 from sidecar.core.copies import Carried
+from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.measurements import Measurements
 from sidecar.core.messages import ResponseMessage
@@ -104,6 +106,22 @@ def test_joint_outcomes_are_counted_by_pair_of_paths_up_to_a_limit(monkeypatch: 
     assert dropped == {"joint_outcomes_full": 1}
     assert measurements.take(Routes(), []).joints == (JointReport(ECHO, first, second, 3, 1),)
     assert measurements.take(Routes(), []).joints == ()
+
+
+def test_outcomes_by_pair_of_interfaces_are_counted_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurements_module, "MAX_JOINTS", 1)
+    dropped: Counter[str] = Counter()
+    measurements = Measurements(dropped)
+    pair = InterfacePair(ECHO, WLAN, WWAN, None)
+    for missed in ((True, True), (True, False), (True, False), (False, True), (False, False)):
+        for raced in (True, False):
+            measurements.judged_interfaces(pair, PairOutcome(*missed, raced))
+    assert not dropped
+    measurements.judged_interfaces(replace(pair, server=A), PairOutcome(True, True, True))
+    assert dropped == {"joint_outcomes_full": 1}
+    told = InterfaceJointReport(ECHO, WLAN, WWAN, None, 10, 2, 5, 2, 1)
+    assert measurements.take(Routes(), []).interface_joints == (told,)
+    assert measurements.take(Routes(), []).interface_joints == ()
 
 
 def test_what_is_judged_at_the_deadline_is_told_before_its_times_are_known(measurements: Measurements) -> None:
