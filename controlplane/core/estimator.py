@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from controlplane.core.compute import ComputeTimes, ServerTimes
 from controlplane.core.fading import FadedCount, FadedShares
+from controlplane.core.interface_trouble import InterfaceTrouble
 from controlplane.core.network import RobotNetwork
 from controlplane.core.parts import Asked, from_parts
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
@@ -110,7 +111,7 @@ class _Pair:
 class _Robot:
     """Tables fed by one robot."""
 
-    __slots__ = ("fates", "joints", "network", "outcomes", "services", "trials")
+    __slots__ = ("fates", "joints", "network", "outcomes", "services", "trials", "troubles", "troubles_at")
 
     def __init__(self, half_life_s: float) -> None:
         self.network = RobotNetwork(half_life_s)
@@ -119,6 +120,10 @@ class _Robot:
         self.fates: OrderedDict[FateKey, SharedFate] = OrderedDict()
         self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
+        self.troubles: dict[tuple[ServiceName, float], InterfaceTrouble] = {}
+        """Worked out, by service and deadline ..."""
+        self.troubles_at = (0, 0.0)
+        """... from so many reports of all robots, at this time."""
 
 
 def _usual_sizes(tables: _Robot, service: ServiceName) -> tuple[tuple[int, float], ...]:
@@ -136,6 +141,7 @@ class Estimator:
         self._compute = ComputeTimes(half_life_s)
         self._histograms = 0
         self._dropped = 0
+        self._reports = 0
 
     @property
     def dropped(self) -> int:
@@ -145,6 +151,7 @@ class Estimator:
     def merge(self, robot: NodeName, report: Report, now: float) -> bool:
         """Add a report; True if a path went up or down with it, or is reported for the first time, or if a server needs
         other times than before."""
+        self._reports += 1
         tables = self._robots.get(robot)
         if tables is None:
             tables = self._robots[robot] = _Robot(self._half_life_s)
@@ -249,7 +256,8 @@ class Estimator:
     ) -> Estimate:
         """epsilon_ij = P(L_ij > deadline), as the posterior of the requests that ran on this pair.
 
-        The prior is put together from network and processing times, `IGNORANCE` where nothing is known of the network.
+        The prior is put together from network and processing times, `IGNORANCE` where nothing is known of the network,
+        and moved by the trouble that requests to other servers met over the interface.
         """
         tables = self._robots.get(robot)
         if tables is None:
@@ -259,14 +267,34 @@ class Estimator:
         processing = self._compute.times(server, service, now)
         asked = Asked(tables.network, interface, server, _usual_sizes(tables, service), deadline_s, carried)
         prior = from_parts(asked, processing, now)
+        trouble = self._trouble(tables, service, deadline_s, now)
         if pair is None:
-            return prior
+            return trouble.moved(prior, interface, server)
         changes, before = self._compute.changes(server, service)
         if pair.changes != changes:
             pair.changes = changes
             if abs(prior.mean - from_parts(asked, ServerTimes(before, processing.requests), now).mean) > CHANGE_MATTERS:
                 pair.trials.forget(CHANGE_KEEPS_REQUESTS / max(carried, CHANGE_KEEPS_REQUESTS))
-        return pair.trials.posterior(prior, now)
+        return pair.trials.posterior(trouble.moved(prior, interface, server), now)
+
+    def _trouble(self, tables: _Robot, service: ServiceName, deadline_s: float, now: float) -> InterfaceTrouble:
+        """What the robot's requests of the service met beyond what their parts explain."""
+        if tables.troubles_at != (self._reports, now):
+            tables.troubles.clear()
+            tables.troubles_at = (self._reports, now)
+        trouble = tables.troubles.get((service, deadline_s))
+        if trouble is None:
+            trouble = tables.troubles[service, deadline_s] = InterfaceTrouble()
+            sizes = _usual_sizes(tables, service)
+            for (interface, server, of), pair in tables.trials.items():
+                # Outcomes with a server as it was before it changed say nothing of the interface.
+                if of != service or pair.changes != self._compute.changes(server, service)[0]:
+                    continue
+                asked = Asked(tables.network, interface, server, sizes, deadline_s, 0.0)
+                expected = from_parts(asked, self._compute.times(server, service, now), now)
+                requests, _ = pair.trials.counts(now)
+                trouble.note(interface, server, requests, expected, pair.trials.posterior(expected, now))
+        return trouble
 
     def evidence(self, robot: NodeName, path: Assignment, service: ServiceName, now: float) -> Evidence:
         """What was measured on this pair, for the operator."""

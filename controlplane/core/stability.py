@@ -7,6 +7,7 @@ than a few of them in a minute. Every change carries its reason.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter, deque
 from dataclasses import replace
@@ -141,8 +142,31 @@ def _differences(problem: Problem, new: Plan, old: Mapping[BlockKey, Choice | No
         if choice != before:
             change = Counter(limits_used(problem, block, choice))
             change.subtract(limits_used(problem, block, before) if before is not None else [])
-            found.append(_Difference(block, choice, before, {key: count for key, count in change.items() if count}))
+            load = {key: count for key, count in change.items() if count}
+            found.append(_Difference(_with_kept_lifts(block, choice, before), choice, before, load))
     return found
+
+
+def _with_kept_lifts(block: Block, new: Choice, old: Choice | None) -> Block:
+    """Where two interfaces were found to fail together, they do so whichever servers they are mapped to.
+
+    Else a change would win by what nobody has measured: paths that have carried no common request are taken to be
+    independent. Copies to one server may have failed together for its sake; of these nothing is kept.
+    """
+    if old is None or not block.lifts:
+        return block
+    kept = {}
+    for (i, left), (k, also_left) in itertools.combinations(enumerate(old), 2):
+        if left is None or also_left is None or left == also_left:
+            continue
+        taken, also_taken = new[i], new[k]
+        if taken is None or also_taken is None:
+            continue
+        lift = block.lifts.get(((i, left), (k, also_left)), 1.0)
+        pair = (i, taken), (k, also_taken)
+        if lift > block.lifts.get(pair, 1.0):
+            kept[pair] = lift
+    return replace(block, lifts={**block.lifts, **kept}) if kept else block
 
 
 def _said(block: BlockPlan, running: Plan, why: Mapping[BlockKey, str]) -> BlockPlan:

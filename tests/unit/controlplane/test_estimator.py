@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -92,6 +93,25 @@ def test_few_requests_are_blended_with_the_round_trips(estimator: Estimator) -> 
     assert unused < 0.01
     assert few == pytest.approx(10 / (10 + 5), abs=0.15)
     assert many > 0.94
+
+
+@pytest.mark.parametrize(("processing_s", "interface_is_bad"), [(0.01, True), (0.5, False)], ids=["radio", "server"])
+def test_sudden_misses_are_the_interfaces_unless_the_server_explains_them(
+    estimator: Estimator, processing_s: float, interface_is_bad: bool
+) -> None:
+    def report(now: float, missed: int, processing_s: float) -> None:
+        took, needed = histogram(0.05), histogram(processing_s)
+        over_wlan = replace(latency("wlan0", "cloud-a", took, processing=needed), missed=missed)
+        over_wwan = latency("wwan0", "cloud-b", histogram(), processing=histogram(0.01))
+        estimator.merge(ROBOT, Report((over_wlan, over_wwan), (path("wlan0", "cloud-b", rtt=histogram(0.02)),)), now)
+
+    for second in range(30):
+        report(float(second), 0, 0.01)
+    assert miss(estimator, B, 30.0) < 0.05
+    for second in range(30, 40):
+        report(float(second), 1, processing_s)
+    assert miss(estimator, A, 40.0) > 0.5
+    assert (miss(estimator, B, 40.0) > 0.5) == interface_is_bad
 
 
 def test_loss_costs_a_round_trip(estimator: Estimator) -> None:

@@ -88,6 +88,17 @@ def test_a_path_that_got_bad_is_left_though_rare_misses_make_the_good_one_uncert
     assert settled.blocks[part.key].assignments == (("if0", "cloud-1"),)
 
 
+@pytest.mark.parametrize(
+    ("old", "changes"), [((0, 1), False), ((0, 0), True)], ids=["interfaces fail together", "perhaps the server did"]
+)
+def test_a_change_wins_nothing_by_leaving_a_lift_that_the_interfaces_keep(old: tuple[int, int], changes: bool) -> None:
+    part = replace(block([[0.2, 0.2], [0.2, 0.2]]), lifts={((0, old[0]), (1, old[1])): 4.0})
+    problem = Problem((part,), objective=Objective.JOINT)
+    new = make_plan(problem, {part.key: (1, 0)})
+    settled = settled_of(problem, new, make_plan(problem, {part.key: old}))
+    assert (settled.blocks[part.key].assignments == new.blocks[part.key].assignments) == changes
+
+
 def test_a_plan_over_a_dead_path_is_replaced_however_little_is_gained() -> None:
     part = block([[None, 0.5], [0.5, 0.5]])
     problem = Problem((part,), objective=Objective.SUM)
