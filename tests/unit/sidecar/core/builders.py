@@ -79,10 +79,12 @@ def message(
     deadline: float = 10.0,
     expires: float = 20.0,
     over: PathId | None = None,
+    redundant: bool = False,
 ) -> OutboundMessage:
-    data = random.Random(number).randbytes(size)
-    content = Encoded(b"", data)
-    return OutboundMessage(number, over or path(), content, priority=priority, deadline=deadline, expires=expires)
+    content = Encoded(b"", random.Random(number).randbytes(size))
+    return OutboundMessage(
+        number, over or path(), content, priority=priority, deadline=deadline, expires=expires, redundant=redundant
+    )
 
 
 def request_id(number: int) -> RequestId:
