@@ -129,6 +129,11 @@ class ComputeTimes:
         of_server = self._servers.get((server, service))
         return (of_server.changes, of_server.before) if of_server is not None else (0, None)
 
+    def is_odd(self, server: NodeName, service: ServiceName) -> bool:
+        """Whether the server's last answers were odd, so that it may have changed."""
+        of_server = self._servers.get((server, service))
+        return of_server is not None and of_server.watch.suspects
+
     def requests(self, server: NodeName, service: ServiceName, now: float, *, sample: int) -> Histogram:
         """What the server itself needed; a sample that has not faded counts `sample`."""
         of_server = self._servers.get((server, service))

@@ -287,8 +287,10 @@ class Estimator:
             trouble = tables.troubles[service, deadline_s] = InterfaceTrouble()
             sizes = _usual_sizes(tables, service)
             for (interface, server, of), pair in tables.trials.items():
-                # Outcomes with a server as it was before it changed say nothing of the interface.
+                # Outcomes that may be those of a server which changed, or changes now, say nothing of the interface.
                 if of != service or pair.changes != self._compute.changes(server, service)[0]:
+                    continue
+                if self._compute.is_odd(server, service):
                     continue
                 asked = Asked(tables.network, interface, server, sizes, deadline_s, 0.0)
                 expected = from_parts(asked, self._compute.times(server, service, now), now)

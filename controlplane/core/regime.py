@@ -63,6 +63,11 @@ class ChangeWatch:
         self._began = math.inf
         self._since: Histogram | None = None
 
+    @property
+    def suspects(self) -> bool:
+        """Whether the last samples were odd, but too few yet to tell a change."""
+        return self._since is not None
+
     def add(
         self, new: Histogram, known: NDArray[np.float64], known_lost: float, kept: float, now: float
     ) -> Histogram | None:

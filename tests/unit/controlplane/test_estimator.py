@@ -114,6 +114,16 @@ def test_sudden_misses_are_the_interfaces_unless_the_server_explains_them(
     assert (miss(estimator, B, 40.0) > 0.5) == interface_is_bad
 
 
+def test_a_servers_last_answers_are_odd_until_it_answers_as_usual() -> None:
+    times = compute_module.ComputeTimes(half_life_s=60.0)
+    found = []
+    for second, took in enumerate([0.01] * 30 + [0.5] + [0.01] * 5):
+        times.merge(A, PLAN, histogram(took), float(second))
+        found.append(times.is_odd(A, PLAN))
+    assert found[20:31] == [False] * 10 + [True]
+    assert not found[-1]
+
+
 def test_loss_costs_a_round_trip(estimator: Estimator) -> None:
     lossy = PathReport(WLAN, A, up=True, rtt=histogram(0.06, times=400), datagrams_sent=100, datagrams_lost=20)
     estimator.merge(ROBOT, Report(paths=(lossy,)), 0.0)
