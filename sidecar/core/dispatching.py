@@ -59,7 +59,7 @@ class Dispatching:
         servers = self.with_room(self._parts.offers.servers(request.service), len(request.payload or b""))
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
         if rule.redundancy is RedundancyMode.REPLICATE:
-            paths = self._best_first(request, chosen, now)
+            paths = self._best_first(request, chosen, now) if self._budgets else chosen
             request.withheld = tuple(path for path in paths if not self._send(request, path, now, _Why.MAPPED))
         else:
             self._send_best(request, self._best_first(request, chosen, now), now)
@@ -235,7 +235,6 @@ class Dispatching:
             fec=rule.fec,
             deadline=request.deadline_at,
             expires=request.expires_at,
-            redundant=extra and why in (_Why.MAPPED, _Why.EXPLORATION),
         )
         if message is None:
             return False

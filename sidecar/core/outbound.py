@@ -44,7 +44,6 @@ class OutboundMessage:
         "over",
         "path",
         "priority",
-        "redundant",
         "repairs",
         "successor",
         "symbol",
@@ -63,7 +62,6 @@ class OutboundMessage:
         symbol: int = BASE_SYMBOL_BYTES,
         answers: RequestId | None = None,
         repairs: int = 0,
-        redundant: bool = False,
     ) -> None:
         self.number = number
         self.path = path
@@ -75,8 +73,6 @@ class OutboundMessage:
         self.priority = priority
         self.deadline = deadline
         self.expires = expires
-        self.redundant = redundant
-        """Another copy, over another path, is expected to be there sooner."""
         self.count = symbol_count(self.total, symbol)
         """Source symbols."""
         self.repairs = min(repairs, fec.max_repairs(self.count))
@@ -142,7 +138,6 @@ class OutboundMessage:
             symbol=symbol,
             answers=self.answers,
             repairs=-(-self.repairs * symbol_count(self.total, symbol) // self.count),
-            redundant=self.redundant,
         )
         self.successor.generation = self.generation + 1
         return self.successor

@@ -82,13 +82,11 @@ class Outbox:
         expires: float,
         fec: Redundancy = None,
         answers: RequestId | None = None,
-        redundant: bool = False,
     ) -> OutboundMessage | None:
         """Send a message over `path`; None (counted) when there is no room.
 
         `fec`: repair symbols for each source symbol, None: by the path's loss; none at all where they find no room.
         `answers`: the request that it answers, by which `drop_answers` finds it.
-        `redundant`: another copy is expected to be there sooner.
         """
         if not self.has_room(path.peer, content.size):
             self._stats.dropped["outbox_full"] += 1
@@ -108,7 +106,6 @@ class Outbox:
             symbol=symbol,
             repairs=repairs,
             answers=answers,
-            redundant=redundant,
         )
         self._enter(message)
         return message

@@ -4,9 +4,8 @@ Urgent before bulk: a message's priority comes first. Fresh before late: within 
 their deadline go first, earliest deadline first; those that can not go after them, what is begun first and then the
 newest. So a backlog or an overload makes some messages miss, instead of each message make the next one late, and what
 comes late comes as little late as can be. What comes with its deadline over goes last: after an outage the pace is low
-at first, and what is asked then may seem hopeless, but must not wait for the backlog. Late before spare: of a fresh
-copy's turns, if it is redundant and has time to spare, what is late gets some. On a path that just bears its load
-nothing late would ever leave otherwise. No priority starves: while a lower one waits, it gets one symbol in SHARE.
+at first, and what is asked then may seem hopeless, but must not wait for the backlog. No priority starves: while a
+lower one waits, it gets one symbol in SHARE.
 """
 
 from __future__ import annotations
@@ -29,10 +28,6 @@ SHARE = 16
 HASTE = 1.25
 """A message that has not begun to leave is late when this many times its sending time does not fit any more: what is
 begun should also be finished."""
-LATE_SHARE = 2
-"""What is late gets one symbol for so many of redundant copies ..."""
-TO_SPARE = 1.5
-"""... that would make their deadline although they took this many times as long."""
 PURGE_AT = 64
 """Entries before the first look for messages that are over; then whenever their number has doubled."""
 BEGUN = float("-inf")
@@ -92,25 +87,17 @@ class _Entry:
 
     def is_hopeless(self, now: float, pace: float, round_trip_s: float) -> bool:
         """Whether its last symbol can not be answered before the deadline at this pace (bytes a second; 0: unknown)."""
+        message = self.message
         if not pace:
-            return self.message.deadline <= now
-        sending_s = self._sending_s(pace) * (1.0 if self.begun else HASTE)
-        return self.message.deadline <= now + sending_s + round_trip_s
-
-    def gives_way(self, now: float, pace: float, round_trip_s: float) -> bool:
-        """Whether it is redundant and has time to spare."""
-        if not self.message.redundant or not pace:
-            return False
-        return self.message.deadline > now + TO_SPARE * (self._sending_s(pace) + round_trip_s)
-
-    def _sending_s(self, pace: float) -> float:
-        return (len(self.again) + self.message.symbols - self.next) * self.message.symbol / pace
+            return message.deadline <= now
+        sending_s = (len(self.again) + message.symbols - self.next) * message.symbol / pace
+        return message.deadline <= now + sending_s * (1.0 if self.begun else HASTE) + round_trip_s
 
 
 class _Class:
     """Messages of one priority: those that can make their deadline, those that can not, those that came too late."""
 
-    __slots__ = ("fresh", "hopeless", "late_passed_over", "passed_over", "stale")
+    __slots__ = ("fresh", "hopeless", "passed_over", "stale")
 
     def __init__(self) -> None:
         self.fresh: list[tuple[float, int, _Entry]] = []
@@ -118,17 +105,6 @@ class _Class:
         self.stale: list[tuple[float, int, _Entry]] = []
         self.passed_over = 0
         """Symbols of higher priorities that left while something waited here."""
-        self.late_passed_over = 0
-        """Symbols of fresh messages that left while something late waited."""
-
-    def note_run(self, heap: list[tuple[float, int, _Entry]], symbols: int) -> None:
-        """So many symbols of the first message of this heap leave."""
-        if not self.fresh or not (self.hopeless or self.stale):
-            self.late_passed_over = 0
-        elif heap is self.fresh:
-            self.late_passed_over = min(self.late_passed_over + symbols, LATE_SHARE * MAX_RUN)
-        else:
-            self.late_passed_over -= LATE_SHARE * symbols
 
     def heaps(self) -> tuple[list[tuple[float, int, _Entry]], ...]:
         return self.fresh, self.hopeless, self.stale
@@ -221,7 +197,6 @@ class SendQueue:
             run = entry.take(max(1, min(most, budget // size, MAX_RUN_BYTES // size)))
             if run is not None:
                 entry.begun = True
-                chosen.note_run(heap, run[1])
                 if heap is not chosen.fresh:
                     heapq.heapreplace(heap, (BEGUN, heap[0][1], entry))
                 return Run(message, *run)
@@ -231,22 +206,8 @@ class SendQueue:
     def _head(
         self, each: _Class, now: float, pace: float, round_trip_s: float
     ) -> list[tuple[float, int, _Entry]] | None:
-        """Return the heap whose head goes next."""
-        head = self._first_waiting(each, each.heaps(), now, pace, round_trip_s)
-        if head is each.fresh and each.late_passed_over >= LATE_SHARE and head[0][2].gives_way(now, pace, round_trip_s):
-            return self._first_waiting(each, (each.hopeless, each.stale), now, pace, round_trip_s) or head
-        return head
-
-    def _first_waiting(
-        self,
-        each: _Class,
-        heaps: tuple[list[tuple[float, int, _Entry]], ...],
-        now: float,
-        pace: float,
-        round_trip_s: float,
-    ) -> list[tuple[float, int, _Entry]] | None:
-        """Return the first heap that is not empty; heads that are over go, those that became late change places."""
-        for heap in heaps:
+        """Return the heap whose head goes next; heads that are over go, those that became late change places."""
+        for heap in each.heaps():
             while heap:
                 entry = heap[0][2]
                 message = entry.message

@@ -79,12 +79,10 @@ def message(
     deadline: float = 10.0,
     expires: float = 20.0,
     over: PathId | None = None,
-    redundant: bool = False,
 ) -> OutboundMessage:
-    content = Encoded(b"", random.Random(number).randbytes(size))
-    return OutboundMessage(
-        number, over or path(), content, priority=priority, deadline=deadline, expires=expires, redundant=redundant
-    )
+    data = random.Random(number).randbytes(size)
+    content = Encoded(b"", data)
+    return OutboundMessage(number, over or path(), content, priority=priority, deadline=deadline, expires=expires)
 
 
 def request_id(number: int) -> RequestId:

@@ -9,7 +9,6 @@ import pytest
 from sidecar.core.budgets import Budget
 from sidecar.core.copies import HEDGE_AT
 from sidecar.core.events import RejectReason
-from sidecar.core.link_events import Send
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.redundancy_mode import RedundancyMode
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
@@ -181,17 +180,3 @@ def test_extra_copies_and_their_bytes_are_counted() -> None:
     first, extra = table.stats.copy_bytes[WLAN, ECHO, "first"], table.stats.copy_bytes[WWAN, ECHO, "extra"]
     assert first == extra
     assert 1000 < first < 1200
-
-
-@pytest.mark.parametrize(
-    ("mode", "redundant"),
-    [(RedundancyMode.REPLICATE, [False, True]), (RedundancyMode.BACKUP, [False, False])],
-)
-def test_a_copy_is_redundant_when_another_is_expected_sooner(mode: RedundancyMode, redundant: list[bool]) -> None:
-    table = table_with(mode)
-    table.submit()
-    if mode is RedundancyMode.BACKUP:
-        table.change(WLAN_A, PathState.UNSTABLE)
-    messages = [command.message for command in table.commands if isinstance(command, Send)]
-    assert [message.path for message in messages] == [WLAN_A, WWAN_B]
-    assert [message.redundant for message in messages] == redundant

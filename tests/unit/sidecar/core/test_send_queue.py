@@ -2,9 +2,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES
+from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.priority import Priority
-from sidecar.core.send_queue import LATE_SHARE, MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SHARE, SendQueue
+from sidecar.core.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SHARE, SendQueue
 from tests.unit.sidecar.core.builders import message
 
 if TYPE_CHECKING:
@@ -166,34 +166,6 @@ def test_what_is_begun_is_finished_when_it_just_makes_it() -> None:
 
     assert second_taken(begin=True) == 1
     assert second_taken(begin=False) == 2
-
-
-def late_and_fresh(*, redundant: bool, deadline: float) -> list[int]:
-    """The first 30 turns of one message that is late and one of 100 kB, which takes a second."""
-    queue = SendQueue()
-    queue.add(message(1, 100_000, deadline=1.0))
-    queue.add(message(2, 100_000, deadline=deadline, redundant=redundant))
-    return [take(queue, now=5.0 + turn * BASE_SYMBOL_BYTES / PACE, pace=PACE)[0] for turn in range(30)]
-
-
-def test_what_is_late_gets_its_share_of_a_redundant_copy_with_time_to_spare() -> None:
-    turns = late_and_fresh(redundant=True, deadline=9.0)
-    assert turns[:LATE_SHARE] == [2] * LATE_SHARE
-    assert turns.count(1) == len(turns) // (LATE_SHARE + 1)
-
-
-def test_what_is_late_gets_nothing_of_the_only_copy_or_of_one_that_just_makes_it() -> None:
-    assert set(late_and_fresh(redundant=False, deadline=9.0)) == {2}
-    assert set(late_and_fresh(redundant=True, deadline=6.3)) == {2}
-
-
-def test_what_is_late_has_no_claim_from_before_it_waited() -> None:
-    queue = SendQueue()
-    queue.add(message(1, 200_000, deadline=20.0, redundant=True))
-    for _ in range(10 * LATE_SHARE):
-        take(queue, pace=PACE)
-    queue.add(message(2, 10, deadline=1.0))
-    assert [take(queue, now=5.0, pace=PACE)[0] for _ in range(LATE_SHARE + 1)] == [1] * LATE_SHARE + [2]
 
 
 def test_a_higher_priority_goes_before_an_earlier_deadline() -> None:
