@@ -160,12 +160,10 @@ class LinkReader:
                 case frame.ProbeReply(probe_id) if self._mtu.answered(path, probe_id, now):
                     pass
                 case frame.ProbeReply(probe_id):
-                    if not path.answered_probe(probe_id, now):
-                        self._stats.dropped["unasked_probe_reply"] += 1
+                    if path.answered_probe(probe_id, now):
+                        self._keeper.probe_answered(path, now)
                     else:
-                        path.mtu.on_delivered(0)
-                        if path.made_progress(now):
-                            self._keeper.path_up(path, now)
+                        self._stats.dropped["unasked_probe_reply"] += 1
                 case frame.Finished(number):
                     eliciting = True
                     events.append(MessageFinished(path.peer, number))

@@ -56,6 +56,14 @@ class PathKeeper:
             self.path_up(path, now)
         self._detect_lost(path, now)
 
+    def probe_answered(self, path: Path, now: float) -> None:
+        """A probe of liveness was answered."""
+        path.mtu.on_delivered(0)
+        if path.made_progress(now):
+            # What left before the probe may be lost, and fill a window in which nothing else may leave.
+            path.recovery.ask_at_once()
+            self.path_up(path, now)
+
     def path_up(self, path: Path, now: float) -> None:
         """The path answers."""
         path.control.on_path_up(now)

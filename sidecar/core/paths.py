@@ -31,7 +31,8 @@ RETURN_BACKOFF = 1.02
 """A path that was up is likely to come back, and requests may wait for it: its probes are as far apart as a fiftieth of
 the time that it is down, 0.25 s after ten seconds. Both ends probe, so that the wait is mostly half of that or less."""
 DOWN_FACTOR = 4.0
-"""An unstable path is down after this many times the silence that made it unstable ..."""
+"""An unstable path is down after this many times the silence that made it unstable, or the longest that anybody waits
+beyond that, ..."""
 DOWN_FLOOR_S = 0.5
 """... but not before this."""
 MAX_PROBES_OUT = 32
@@ -308,8 +309,11 @@ class Path:
         return self._waiting_since + self._limit()
 
     def _limit(self) -> float:
-        limit = self.recovery.rtt.silence_limit()
-        return limit if self.state is PathState.UP else max(DOWN_FACTOR * limit, DOWN_FLOOR_S)
+        rtt = self.recovery.rtt
+        limit = rtt.silence_limit()
+        if self.state is PathState.UP:
+            return limit
+        return max(min(DOWN_FACTOR * limit, limit + rtt.longest_wait()), DOWN_FLOOR_S)
 
     def check_silence(self, now: float) -> PathState | None:
         """Return the new state when the silence changed it."""

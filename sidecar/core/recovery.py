@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 PTO_DATAGRAMS = 2
 """How many of the oldest datagrams a probe timeout gives up (RFC 9002 section 6.2.4 allows two probes)."""
 MAX_PTO_BACKOFF = 6
-"""Probe timeouts stop doubling here; the path is long down by then."""
+"""Probe timeouts stop doubling here, or when they are as long as anybody waits on this path."""
+
+NEVER_BEFORE = float("-inf")
 
 _first = attrgetter("first")
 
@@ -191,6 +193,11 @@ class Recovery:
             lost.append(part)
         return self._lose(lost, by_threshold=False)
 
+    def ask_at_once(self) -> None:
+        """The path answers again, but not about what is in flight: the probe timeout is now, however long it was."""
+        self._pto_count = 0
+        self.last_eliciting_at = NEVER_BEFORE
+
     def give_up_all(self) -> list[Sent]:
         """The path is dead: everything in flight counts as lost."""
         lost, self.sent = self.sent, []
@@ -220,4 +227,4 @@ class Recovery:
         if not self.sent:
             return None
         timeout = self.rtt.probe_timeout(MAX_ACK_DELAY_S) * (1 << self._pto_count)
-        return self.last_eliciting_at + timeout
+        return self.last_eliciting_at + min(timeout, self.rtt.longest_wait())

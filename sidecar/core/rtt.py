@@ -8,6 +8,10 @@ GRANULARITY_S = 0.001
 """Finest timer that is worth arming."""
 UNSTABLE_FLOOR_S = 0.060
 """A path silent for less than this is never called unstable (SRT's floor)."""
+LONGEST_WAIT_S = 1.0
+"""Beyond two bare round trips, nobody waits longer for a sign of life. A queue makes the round trip long, but what is
+in it still arrives one after the other; where nothing does for so long, the path is dead or as good as that. And what
+left before an outage and arrives after it makes a round trip that says nothing of the path."""
 MINIMUM_MEMORY_S = 10.0
 """A minimum not seen again for this long is forgotten: the route may have become longer (BBR's RTprop filter)."""
 
@@ -81,4 +85,8 @@ class RttEstimator:
         """Seconds of unanswered silence after which the path is unstable."""
         if not self.has_sample:
             return 2 * INITIAL_RTT_S
-        return max(2 * self.smoothed + 4 * self.variation, UNSTABLE_FLOOR_S)
+        return max(min(2 * self.smoothed + 4 * self.variation, self.longest_wait()), UNSTABLE_FLOOR_S)
+
+    def longest_wait(self) -> float:
+        """Seconds after which anything that is awaited of a living path should have come, whatever queue there is."""
+        return LONGEST_WAIT_S + 2 * min(self.minimum, LONGEST_WAIT_S)

@@ -8,7 +8,7 @@ import pytest
 from sidecar.core import frame
 from sidecar.core.frame import AckFrame
 from sidecar.core.received import MAX_ACK_DELAY_S, ReceivedPackets
-from sidecar.core.recovery import MAX_PTO_BACKOFF, PTO_DATAGRAMS, Recovery
+from sidecar.core.recovery import PTO_DATAGRAMS, Recovery
 from sidecar.core.reordering import PACKET_THRESHOLD
 from tests.unit.sidecar.core.builders import message
 
@@ -92,12 +92,13 @@ def test_probe_timeout_doubles_gives_up_the_oldest_and_ends_with_an_acknowledgem
     recovery = with_sent(12)
     recovery.rtt.sample(0.1, 0.0)
     timeout = 0.1 + 4 * 0.05 + MAX_ACK_DELAY_S
+    assert 2 * timeout < recovery.rtt.longest_wait() < 4 * timeout
     assert recovery.pto_timer == pytest.approx(1.0 + timeout)
     assert numbers(recovery.on_probe_timeout(2.0)) == list(range(PTO_DATAGRAMS))
     assert recovery.pto_timer == pytest.approx(2.0 + 2 * timeout)
     recovery.on_probe_timeout(3.0)
-    assert recovery.pto_timer == pytest.approx(3.0 + 4 * timeout)
-    recovery.on_ack(ack((5, 5)), 3.1)
+    assert recovery.pto_timer == pytest.approx(3.0 + recovery.rtt.longest_wait())
+    recovery.on_ack(ack((5, 5)), 1.2)
     assert recovery.pto_timer == pytest.approx(3.0 + recovery.rtt.probe_timeout(MAX_ACK_DELAY_S))
 
 
@@ -106,10 +107,22 @@ def test_probe_timeouts_stop_doubling_and_end_with_the_flight() -> None:
     recovery.rtt.sample(0.1, 0.0)
     for turn in range(20):
         assert recovery.pto_timer is not None
-        assert recovery.pto_timer - recovery.last_eliciting_at <= 0.4 * 2**MAX_PTO_BACKOFF
+        assert recovery.pto_timer - recovery.last_eliciting_at <= recovery.rtt.longest_wait() + 1e-9
         recovery.on_probe_timeout(float(turn + 2))
     assert recovery.pto_timer is None
     assert recovery.in_flight == 0
+
+
+def test_when_the_path_answers_again_the_probe_timeout_is_now() -> None:
+    recovery = with_sent(40)
+    recovery.rtt.sample(0.1, 0.0)
+    for turn in range(3):
+        recovery.on_probe_timeout(float(turn + 2))
+    recovery.ask_at_once()
+    assert recovery.pto_timer is not None
+    assert recovery.pto_timer <= 5.0
+    recovery.on_probe_timeout(5.0)
+    assert recovery.pto_timer == pytest.approx(5.0 + 2 * recovery.rtt.probe_timeout(MAX_ACK_DELAY_S))
 
 
 def test_giving_up_leaves_nothing_in_flight() -> None:

@@ -2,7 +2,14 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.rtt import GRANULARITY_S, INITIAL_RTT_S, MINIMUM_MEMORY_S, UNSTABLE_FLOOR_S, RttEstimator
+from sidecar.core.rtt import (
+    GRANULARITY_S,
+    INITIAL_RTT_S,
+    LONGEST_WAIT_S,
+    MINIMUM_MEMORY_S,
+    UNSTABLE_FLOOR_S,
+    RttEstimator,
+)
 
 
 def test_before_the_first_sample_the_initial_guess_holds() -> None:
@@ -51,6 +58,16 @@ def test_tiny_and_negative_samples_keep_the_timers_above_their_floor() -> None:
     assert rtt.loss_delay() == GRANULARITY_S
     assert rtt.probe_timeout(0.0) >= GRANULARITY_S
     assert rtt.silence_limit() == UNSTABLE_FLOOR_S
+
+
+def test_what_arrives_after_an_outage_makes_nobody_wait_for_long() -> None:
+    rtt = RttEstimator()
+    for tick in range(100):
+        rtt.sample(0.05, tick * 0.01)
+    for late_s in (13.0, 12.9):
+        rtt.sample(late_s, 14.0)
+    assert rtt.probe_timeout(0.0) > 10
+    assert rtt.silence_limit() <= 3 * LONGEST_WAIT_S
 
 
 def test_a_minimum_not_seen_again_is_forgotten() -> None:

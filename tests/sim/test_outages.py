@@ -1,0 +1,51 @@
+"""How soon a path is used again after an outage, whatever happened before it."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.sim.mesh import Mesh, rule
+from tests.sim.test_mesh import mapped
+
+SIZE = 120_000
+EVERY_S = 0.2
+GOOD, SLOW = 2_000_000.0, 60_000.0
+QUEUE = 1_200_000.0
+SLOW_S = 4.0
+
+
+@pytest.mark.parametrize("outage_s", [0.5, 1.5, 4.0, 10.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_an_outage_after_a_slow_spell_is_over_when_the_network_is_back(outage_s: float, seed: int) -> None:
+    """The slow spell fills the network's queue, which makes round trips of seconds; the outage then empties it."""
+    mesh = Mesh(seed)
+    robot = mesh.robot("wlan0", rules=(rule(lifetime_s=60.0),))
+    mesh.cloud("cloud-a")
+    up, down = mesh.both_ways("robot.wlan0", "cloud-a.eth0")
+
+    def carry(bytes_per_s: float) -> None:
+        up.bytes_per_s, up.buffer_bytes, up.busy_until = bytes_per_s, QUEUE, mesh.now
+
+    def ask(seconds: float) -> list[float]:
+        """The latencies of requests that come in this time."""
+        asked = []
+        for _ in range(round(seconds / EVERY_S)):
+            asked.append(robot.submit(bytes(SIZE)))
+            mesh.run(EVERY_S)
+        taken = {answer.request_id: answer.elapsed_s for answer in robot.responses()}
+        return [taken.get(request, 60.0) for request in asked]
+
+    carry(GOOD)
+    mesh.push_views()
+    mesh.run(1.0)
+    mapped(mesh, robot, ("wlan0", "cloud-a"))
+    ask(5.0)
+    up.bytes_per_s = SLOW
+    ask(SLOW_S)
+    up.cut = down.cut = True
+    mesh._due.clear()  # what is under way is lost
+    ask(outage_s)
+    up.cut = down.cut = False
+    carry(GOOD)
+    ask(1.5)
+    assert max(ask(3.0)) < 0.5
