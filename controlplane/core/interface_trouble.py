@@ -14,6 +14,9 @@ from controlplane.core.posterior import Estimate
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName
 
+SUREST = 1e-9
+"""Nothing is taken to be more probable than 1 less this, nor less probable than this."""
+
 
 class InterfaceTrouble:
     """By interface, how much worse its paths do than expected: a difference of logits, 0 where they do not."""
@@ -39,8 +42,10 @@ class InterfaceTrouble:
         worse = sum(requests * worse for requests, worse in others)
         if not worse:
             return expected
-        return Estimate.of(1.0 / (1.0 + math.exp(-_logit(expected.mean) - worse / total)), expected.weight)
+        mean = 1.0 / (1.0 + math.exp(-_logit(expected.mean) - worse / total))
+        return Estimate.of(min(mean, 1.0 - SUREST), expected.weight)
 
 
 def _logit(probability: float) -> float:
-    return math.log(probability / (1.0 - probability))
+    bounded = min(max(probability, SUREST), 1.0 - SUREST)
+    return math.log(bounded / (1.0 - bounded))
