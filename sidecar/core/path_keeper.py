@@ -61,7 +61,7 @@ class PathKeeper:
         path.mtu.on_delivered(0)
         if path.made_progress(now):
             # What left before the probe may be lost, and fill a window in which nothing else may leave.
-            path.recovery.ask_at_once()
+            path.recovery.ask_at_once(now)
             self.path_up(path, now)
 
     def path_up(self, path: Path, now: float) -> None:

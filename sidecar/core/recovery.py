@@ -21,8 +21,6 @@ PTO_DATAGRAMS = 2
 MAX_PTO_BACKOFF = 6
 """Probe timeouts stop doubling here, or when they are as long as anybody waits on this path."""
 
-NEVER_BEFORE = float("-inf")
-
 _first = attrgetter("first")
 
 
@@ -193,10 +191,10 @@ class Recovery:
             lost.append(part)
         return self._lose(lost, by_threshold=False)
 
-    def ask_at_once(self) -> None:
+    def ask_at_once(self, now: float) -> None:
         """The path answers again, but not about what is in flight: the probe timeout is now, however long it was."""
         self._pto_count = 0
-        self.last_eliciting_at = NEVER_BEFORE
+        self.last_eliciting_at = now - self.rtt.longest_wait()
 
     def give_up_all(self) -> list[Sent]:
         """The path is dead: everything in flight counts as lost."""
