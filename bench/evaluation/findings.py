@@ -154,8 +154,8 @@ def _one_operator(found: Evidence, outcomes: Sequence[Outcome]) -> None:
 def _reproduced(found: Evidence, both: Repeats) -> None:
     if both.largest is not None:
         worst = both.ratios[both.largest]
-        above = sum(one.difference > 0.2 for one in both.ratios.values())
-        note = f"above 0.2 in {above} of {len(both.ratios)}, {both.runs} runs in {both.windows} windows"
+        above = sum(one.difference > repeats.ALIKE for one in both.ratios.values())
+        note = f"above {repeats.ALIKE} in {above} of {len(both.ratios)}, {both.runs} runs in {both.windows} windows"
         note += f"; largest {both.largest}: {worst.first:.3g}, {worst.second:.3g}"
         found.add("reproduced_difference", worst.difference, note)
 

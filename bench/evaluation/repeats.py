@@ -20,6 +20,8 @@ from bench.reporting.tables import Table
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+ALIKE = 0.2
+"""Two ratios that differ by no more came out alike."""
 ENOUGH_MISSES = 30
 """A ratio of misses is compared when each of both has so many."""
 

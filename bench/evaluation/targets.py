@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bench.evaluation.repeats import ALIKE
 from bench.reporting.targets import Target
 
 TARGETS = (
@@ -44,6 +45,6 @@ TARGETS = (
     Target(
         "reproduced_difference",
         "largest difference of any ratio between this evaluation and another one of the same windows",
-        at_most=0.2,
+        at_most=ALIKE,
     ),
 )
