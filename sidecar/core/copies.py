@@ -83,6 +83,8 @@ class Request:
     size_class: int = 0
     """Settled when it was submitted (`protos.size_class`)."""
     copies: list[Copy] = field(default_factory=list)
+    messages: list[OutboundMessage] = field(default_factory=list)
+    """What carries those copies that may leave it to each other: siblings."""
     withheld: tuple[PathId, ...] = ()
     """Further paths that its mapping names, the best first: for trouble, or to learn of them."""
     dark: tuple[InterfaceName, ...] = ()

@@ -37,6 +37,11 @@ class _Why(enum.Enum):
     EXPLORATION = enum.auto()
 
 
+_PLANNED = frozenset((_Why.MAPPED, _Why.HEDGE))
+"""Copies that may leave a request to each other, unless it is a full race: that measures what each path does alone.
+What is sent in trouble waits for none, and on what explores nothing relies."""
+
+
 class Dispatching:
     """Sends copies."""
 
@@ -235,6 +240,7 @@ class Dispatching:
             fec=rule.fec,
             deadline=request.deadline_at,
             expires=request.expires_at,
+            siblings=request.messages if why in _PLANNED and not request.is_race() else None,
         )
         if message is None:
             return False

@@ -17,11 +17,15 @@ if TYPE_CHECKING:
     from sidecar.core.path_id import PathId
 
 
+NEVER = float("inf")
+
+
 class OutboundMessage:
     """The bytes of one message and which symbols have arrived.
 
     Links on several threads share it without a lock: `acked` bytes, `begun` and `over` only ever go from 0 to 1, and
-    a link that reads an old value merely sends a symbol that is no longer needed.
+    a link that reads an old value of these or of `expected_at` merely sends a symbol that is no longer needed, or a
+    little later.
 
     The payload is never copied as a whole: a symbol is a view of it (the first ones hold the head and are joined),
     which goes into its datagram in the link's thread. That is the only copy on the way out.
@@ -37,6 +41,7 @@ class OutboundMessage:
         "content",
         "count",
         "deadline",
+        "expected_at",
         "expires",
         "generation",
         "interfaces",
@@ -45,6 +50,7 @@ class OutboundMessage:
         "path",
         "priority",
         "repairs",
+        "siblings",
         "successor",
         "symbol",
         "total",
@@ -62,6 +68,7 @@ class OutboundMessage:
         symbol: int = BASE_SYMBOL_BYTES,
         answers: RequestId | None = None,
         repairs: int = 0,
+        siblings: list[OutboundMessage] | None = None,
     ) -> None:
         self.number = number
         self.path = path
@@ -73,6 +80,13 @@ class OutboundMessage:
         self.priority = priority
         self.deadline = deadline
         self.expires = expires
+        self.expected_at = NEVER
+        """When its answer is expected, as the path that sends it last said; NEVER while none does."""
+        self.siblings = [] if siblings is None else siblings
+        """What carries the same request, this message as well, or nothing: what one is expected to do, others need not
+        hurry to. Whoever shares the list clears it, lest messages hold each other in memory."""
+        if siblings is not None:
+            siblings.append(self)
         self.count = symbol_count(self.total, symbol)
         """Source symbols."""
         self.repairs = min(repairs, fec.max_repairs(self.count))
@@ -128,6 +142,8 @@ class OutboundMessage:
 
         Its symbols do not complete those of this one at the receiver.
         """
+        shared = self in self.siblings
+        self.stand_down()
         self.successor = OutboundMessage(
             number,
             path,
@@ -138,9 +154,15 @@ class OutboundMessage:
             symbol=symbol,
             answers=self.answers,
             repairs=-(-self.repairs * symbol_count(self.total, symbol) // self.count),
+            siblings=self.siblings if shared else None,
         )
         self.successor.generation = self.generation + 1
         return self.successor
+
+    def stand_down(self) -> None:
+        """Whether it gets an answer is uncertain now: its siblings are not to rely on it."""
+        if self in self.siblings:
+            self.siblings.remove(self)
 
     def missing(self) -> tuple[int, ...]:
         """The symbols that did not arrive, as far as is known."""

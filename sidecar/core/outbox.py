@@ -82,11 +82,13 @@ class Outbox:
         expires: float,
         fec: Redundancy = None,
         answers: RequestId | None = None,
+        siblings: list[OutboundMessage] | None = None,
     ) -> OutboundMessage | None:
         """Send a message over `path`; None (counted) when there is no room.
 
         `fec`: repair symbols for each source symbol, None: by the path's loss; none at all where they find no room.
         `answers`: the request that it answers, by which `drop_answers` finds it.
+        `siblings`: what carries the same request already; it becomes one of them.
         """
         if not self.has_room(path.peer, content.size):
             self._stats.dropped["outbox_full"] += 1
@@ -106,6 +108,7 @@ class Outbox:
             symbol=symbol,
             repairs=repairs,
             answers=answers,
+            siblings=siblings,
         )
         self._enter(message)
         return message

@@ -179,6 +179,7 @@ class RequestTable:
         if copy.state is not CopyState.PENDING:
             return
         copy.state = CopyState.REJECTED
+        copy.message.newest.stand_down()
         copy.certainly_not_run = rejection.reason.certainly_not_run
         self._parts.outbox.on_answered(copy.message)
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
@@ -213,6 +214,7 @@ class RequestTable:
             hit = [copy for copy in request.pending() if copy.path.peer == peer]
             for copy in hit:
                 copy.state = CopyState.DEAD
+                copy.message.newest.stand_down()
                 self._lost(request, copy, delivered=True)
             if hit and not request.done:
                 self._dispatching.rescue(request, now)
@@ -226,7 +228,10 @@ class RequestTable:
             if request.done or request.answered_here:
                 continue
             if state is not PathState.UP:
-                if any(copy.path == path for copy in request.pending()):
+                hit = [copy for copy in request.pending() if copy.path == path]
+                for copy in hit:
+                    copy.message.newest.stand_down()
+                if hit:
                     self._dispatching.rescue(request, now)
                 self._notice_unreachable(request)
             elif not request.copies:
@@ -337,4 +342,5 @@ class RequestTable:
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
             self._requests.pop(request.id, None)
+            request.messages.clear()
             self._measure(request, now)

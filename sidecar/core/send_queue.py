@@ -4,19 +4,19 @@ Urgent before bulk: a message's priority comes first. Fresh before late: within 
 their deadline go first, earliest deadline first; those that can not go after them, what is begun first and then the
 newest. So a backlog or an overload makes some messages miss, instead of each message make the next one late, and what
 comes late comes as little late as can be. What comes with its deadline over goes last: after an outage the pace is low
-at first, and what is asked then may seem hopeless, but must not wait for the backlog. No priority starves: while a
-lower one waits, it gets one symbol in SHARE.
+at first, and what is asked then may seem hopeless, but must not wait for the backlog. What another path is sending, and
+in time, comes after all that (`turn`). No priority starves: while a lower one waits, it gets one symbol in SHARE.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.priority import Priority
+from sidecar.core.turn import Turn
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 SHARE = 16
 """A waiting lower priority gets one symbol for so many of the higher ones."""
-HASTE = 1.25
-"""A message that has not begun to leave is late when this many times its sending time does not fit any more: what is
-begun should also be finished."""
 PURGE_AT = 64
 """Entries before the first look for messages that are over; then whenever their number has doubled."""
 BEGUN = float("-inf")
@@ -46,68 +43,22 @@ class Run(NamedTuple):
     symbols: int
 
 
-class _Entry:
-    """One message's turn on one path."""
-
-    __slots__ = ("again", "begun", "message", "next")
-
-    def __init__(self, message: OutboundMessage) -> None:
-        self.message = message
-        self.next = 0
-        self.again: deque[int] = deque()
-        """Symbols to be sent once more."""
-        self.begun = False
-        """Some of what is to be sent has left."""
-
-    def take(self, most: int) -> tuple[int, int] | None:
-        """Remove and return the next consecutive symbols as (first, count), `most` of them; None when none is left."""
-        needs = self.message.needs
-        again = self.again
-        while again:
-            first = again.popleft()
-            if needs(first):
-                end = first + 1
-                while again and again[0] == end and end - first < most and needs(end):
-                    again.popleft()
-                    end += 1
-                return first, end - first
-        last = self.message.symbols
-        first = self.next
-        while first < last and not needs(first):
-            first += 1
-        end = first
-        limit = min(last, first + most)
-        while end < limit and needs(end):
-            end += 1
-        self.next = end
-        return (first, end - first) if end > first else None
-
-    def remaining(self) -> tuple[int, ...]:
-        return tuple(filter(self.message.needs, (*self.again, *range(self.next, self.message.symbols))))
-
-    def is_hopeless(self, now: float, pace: float, round_trip_s: float) -> bool:
-        """Whether its last symbol can not be answered before the deadline at this pace (bytes a second; 0: unknown)."""
-        message = self.message
-        if not pace:
-            return message.deadline <= now
-        sending_s = (len(self.again) + message.symbols - self.next) * message.symbol / pace
-        return message.deadline <= now + sending_s * (1.0 if self.begun else HASTE) + round_trip_s
-
-
 class _Class:
-    """Messages of one priority: those that can make their deadline, those that can not, those that came too late."""
+    """Messages of one priority: in time, late, too late when they came, and those that another path takes care of."""
 
-    __slots__ = ("fresh", "hopeless", "passed_over", "stale")
+    __slots__ = ("covered", "fresh", "hopeless", "passed_over", "stale")
 
     def __init__(self) -> None:
-        self.fresh: list[tuple[float, int, _Entry]] = []
-        self.hopeless: list[tuple[float, int, _Entry]] = []
-        self.stale: list[tuple[float, int, _Entry]] = []
+        self.fresh: list[tuple[float, int, Turn]] = []
+        self.hopeless: list[tuple[float, int, Turn]] = []
+        self.stale: list[tuple[float, int, Turn]] = []
+        self.covered: list[tuple[float, int, Turn]] = []
+        """By when they are to be looked at again."""
         self.passed_over = 0
         """Symbols of higher priorities that left while something waited here."""
 
-    def heaps(self) -> tuple[list[tuple[float, int, _Entry]], ...]:
-        return self.fresh, self.hopeless, self.stale
+    def heaps(self) -> tuple[list[tuple[float, int, Turn]], ...]:
+        return self.fresh, self.hopeless, self.stale, self.covered
 
 
 class SendQueue:
@@ -117,7 +68,7 @@ class SendQueue:
 
     def __init__(self) -> None:
         self._classes = tuple(_Class() for _ in Priority)
-        self._entries: dict[int, _Entry] = {}
+        self._entries: dict[int, Turn] = {}
         self._order = count()
         self._purge_at = PURGE_AT
         self.expired = 0
@@ -129,18 +80,18 @@ class SendQueue:
     def add(self, message: OutboundMessage) -> None:
         """Queue all symbols of a message."""
         if message.number not in self._entries:
-            self._insert(_Entry(message))
+            self._insert(Turn(message))
 
     def resend(self, message: OutboundMessage, indices: Iterable[int]) -> None:
         """Queue these symbols of a message again, before its others."""
         entry = self._entries.get(message.number)
         if entry is None:
-            entry = _Entry(message)
+            entry = Turn(message)
             entry.next = message.symbols
             self._insert(entry)
         entry.again.extend(indices)
 
-    def _insert(self, entry: _Entry) -> None:
+    def _insert(self, entry: Turn) -> None:
         message = entry.message
         if len(self._entries) >= self._purge_at:
             self._purge()
@@ -196,40 +147,50 @@ class SendQueue:
             size = message.symbol + FRAGMENT_OVERHEAD_BYTES
             run = entry.take(max(1, min(most, budget // size, MAX_RUN_BYTES // size)))
             if run is not None:
-                entry.begun = True
-                if heap is not chosen.fresh:
+                entry.goes_on(now, pace, round_trip_s)
+                if heap is chosen.hopeless or heap is chosen.stale:
                     heapq.heapreplace(heap, (BEGUN, heap[0][1], entry))
                 return Run(message, *run)
             self._drop(heap)
         return None
 
-    def _head(
-        self, each: _Class, now: float, pace: float, round_trip_s: float
-    ) -> list[tuple[float, int, _Entry]] | None:
-        """Return the heap whose head goes next; heads that are over go, those that became late change places."""
+    def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[tuple[float, int, Turn]] | None:
+        """Return the heap whose head goes next; heads that are over go, those that change places do so."""
+        covered = each.covered
+        while covered and covered[0][2].covered_until(now, pace, round_trip_s) is None:
+            _, order, entry = heapq.heappop(covered)
+            heapq.heappush(each.fresh, (entry.message.deadline, order, entry))
         for heap in each.heaps():
             while heap:
-                entry = heap[0][2]
+                _, order, entry = heap[0]
                 message = entry.message
                 if message.over:
                     self._drop(heap)
                 elif message.expires <= now:
                     self.expired += 1
                     self._drop(heap)
-                elif heap is each.fresh and entry.is_hopeless(now, pace, round_trip_s):
+                elif heap is not each.fresh:
+                    return heap
+                elif (until := entry.covered_until(now, pace, round_trip_s)) is not None:
+                    entry.waits()
+                    heapq.heappop(heap)
+                    heapq.heappush(covered, (until, order, entry))
+                elif entry.is_hopeless(now, pace, round_trip_s):
                     late = each.hopeless if message.deadline > now else each.stale
-                    deadline, order, _ = heapq.heappop(heap)
-                    heapq.heappush(late, (BEGUN if entry.begun else -deadline, order, entry))
+                    heapq.heappop(heap)
+                    heapq.heappush(late, (BEGUN if entry.begun else -message.deadline, order, entry))
                 else:
                     return heap
         return None
 
-    def _drop(self, heap: list[tuple[float, int, _Entry]]) -> None:
+    def _drop(self, heap: list[tuple[float, int, Turn]]) -> None:
         del self._entries[heapq.heappop(heap)[2].message.number]
 
     def clear(self) -> list[tuple[OutboundMessage, tuple[int, ...]]]:
         """Empty the queue and return each message with its symbols that did not leave."""
         left = [(entry.message, entry.remaining()) for entry in self._entries.values()]
+        for entry in self._entries.values():
+            entry.waits()
         for each in self._classes:
             for heap in each.heaps():
                 heap.clear()

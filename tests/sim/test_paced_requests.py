@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.send_queue import _Entry
+from sidecar.core.turn import Turn
 from tests.sim.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def test_under_twice_the_load_most_that_can_be_in_time_is(deadline_s: float) -> 
 
 
 def test_earliest_deadline_first_alone_would_collapse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_Entry, "is_hopeless", lambda *_: False)
+    monkeypatch.setattr(Turn, "is_hopeless", lambda *_: False)
     assert in_time_under_twice_the_load(0.5) < 0.2
 
 

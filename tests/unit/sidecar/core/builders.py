@@ -79,10 +79,13 @@ def message(
     deadline: float = 10.0,
     expires: float = 20.0,
     over: PathId | None = None,
+    siblings: list[OutboundMessage] | None = None,
 ) -> OutboundMessage:
     data = random.Random(number).randbytes(size)
     content = Encoded(b"", data)
-    return OutboundMessage(number, over or path(), content, priority=priority, deadline=deadline, expires=expires)
+    return OutboundMessage(
+        number, over or path(), content, priority=priority, deadline=deadline, expires=expires, siblings=siblings
+    )
 
 
 def request_id(number: int) -> RequestId:

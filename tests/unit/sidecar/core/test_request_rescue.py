@@ -6,9 +6,9 @@ import pytest
 
 from sidecar.core.dispatching import MAX_COPIES
 from sidecar.core.events import RejectReason, ResponseArrived
-from sidecar.core.path_id import PathState
-from tests.unit.sidecar.core.builders import A, B
-from tests.unit.sidecar.core.request_table import SERVERS, WLAN_A, WWAN_B, Table
+from sidecar.core.path_id import PathId, PathState
+from tests.unit.sidecar.core.builders import A, B, request_id
+from tests.unit.sidecar.core.request_table import RACE, SERVERS, WLAN_A, WWAN_B, Table
 
 
 def test_with_no_path_the_request_waits_for_the_first_one_that_comes_up() -> None:
@@ -118,3 +118,54 @@ def test_a_request_without_any_path_has_the_links_look_for_one() -> None:
         table.routes.set_state(known, PathState.DOWN)
     table.submit(2)
     assert table.sought == [frozenset((A, B))]
+
+
+def siblings(table: Table, number: int = 1) -> list[PathId]:
+    """Over which paths those copies travel that may leave the request to each other."""
+    copy = table.table._requests[request_id(number)].copies[-1]
+    return [message.path for message in copy.message.siblings]
+
+
+def test_copies_of_a_request_may_leave_it_to_each_other_except_in_a_full_race() -> None:
+    table = Table()
+    table.submit()
+    assert siblings(table) == [WLAN_A, WWAN_B]
+    table.submit(RACE)
+    assert siblings(table, RACE) == []
+
+
+def test_nothing_is_left_to_a_copy_that_was_refused_or_whose_server_or_path_is_gone() -> None:
+    def refuse(table: Table) -> None:
+        table.reject(RejectReason.OVERLOADED)
+
+    def leave(table: Table) -> None:
+        table.table.on_peer_gone(A, 0.1)
+
+    def fall_silent(table: Table) -> None:
+        table.change(WLAN_A, PathState.UNSTABLE)
+
+    for happens in (refuse, leave, fall_silent):
+        table = Table()
+        table.submit()
+        happens(table)
+        assert siblings(table) == [WWAN_B], happens.__name__
+
+
+def test_what_is_sent_in_trouble_is_left_to_nobody() -> None:
+    table = Table()
+    table.routes.set_state(WWAN_B, PathState.DOWN)
+    table.submit()
+    table.routes.set_state(WWAN_B, PathState.UP)
+    table.change(WLAN_A, PathState.UNSTABLE)
+    assert siblings(table) == []
+
+
+def test_messages_do_not_hold_each_other_in_memory_when_their_request_is_over() -> None:
+    table = Table()
+    table.submit()
+    shared = table.table._requests[request_id(1)].messages
+    assert len(shared) == 2
+    table.respond(A)
+    table.table.handle_timer(20.0)
+    assert not table.table._requests
+    assert shared == []

@@ -3,9 +3,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
+from sidecar.core.outbound import NEVER
 from sidecar.core.priority import Priority
 from sidecar.core.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SHARE, SendQueue
-from tests.unit.sidecar.core.builders import message
+from tests.unit.sidecar.core.builders import message, path
 
 if TYPE_CHECKING:
     from sidecar.core.outbound import OutboundMessage
@@ -211,3 +212,46 @@ def test_clearing_hands_back_what_did_not_leave_and_only_that() -> None:
 def left(queue: SendQueue) -> list[tuple[int, tuple[int, ...]]]:
     cleared: list[tuple[OutboundMessage, tuple[int, ...]]] = queue.clear()
     return [(outbound.number, indices) for outbound, indices in cleared]
+
+
+def covered(number: int, *, expected_at: float, size: int = 60_000, deadline: float = 4.0) -> OutboundMessage:
+    """A copy whose request another path answers at this time."""
+    sibling = message(100 + number, size, deadline=deadline, over=path("5g0"), siblings=[])
+    sibling.expected_at = expected_at
+    return message(number, size, deadline=deadline, siblings=sibling.siblings)
+
+
+def test_what_another_path_answers_in_time_waits_for_all_else_but_does_not_wait_alone() -> None:
+    queue = SendQueue()
+    queue.add(covered(1, expected_at=0.001))
+    queue.add(message(2, 10, deadline=5.0))
+    queue.add(message(3, 10, deadline=-1.0))
+    assert [take(queue, pace=PACE)[0] for _ in range(3)] == [2, 3, 1]
+
+
+def test_what_another_path_does_not_answer_when_expected_takes_its_turn_again() -> None:
+    queue = SendQueue()
+    queue.add(covered(1, expected_at=0.001))
+    queue.add(covered(2, expected_at=0.004, deadline=3.0))
+    queue.add(message(3, 900_000, deadline=20.0))
+    assert take(queue, pace=PACE)[0] == 3
+    assert take(queue, now=1.4, pace=PACE)[0] == 3
+    assert take(queue, now=1.6, pace=PACE)[0] == 2
+    assert take(queue, now=2.1, pace=PACE)[0] == 2, "its deadline is earlier"
+
+
+def test_nothing_is_expected_of_what_is_put_off_or_cleared() -> None:
+    queue, first = SendQueue(), message(1, 60_000, deadline=4.0, siblings=[])
+    second = message(2, 60_000, deadline=4.0, over=path("5g0"), siblings=first.siblings)
+    queue.add(first)
+    assert take(queue, pace=PACE)[0] == 1
+    assert first.expected_at < 4.0
+    second.expected_at = 0.001
+    queue.add(message(3, 10, deadline=5.0))
+    assert take(queue, pace=PACE)[0] == 3
+    assert first.expected_at == NEVER
+    queue.add(last := message(4))
+    assert take(queue, pace=PACE)[0] == 4
+    assert last.expected_at < NEVER
+    queue.clear()
+    assert last.expected_at == NEVER
