@@ -34,7 +34,7 @@ TARGETS = (
     Target("fallback_late", "requests without an answer by the deadline, with a fallback, case F", at_most=0),
     Target(
         "one_operator_mean_gain",
-        "the mean gain where two radios have one operator: less than what independent carriers have to give",
+        "mean of ours with one radio over that with both, where both radios have one operator: the second gives little",
         at_most=1.9,
     ),
     Target(

@@ -126,7 +126,7 @@ def test_the_fallback_answers_what_the_network_misses(late: int, met: bool) -> N
 
 
 @pytest.mark.parametrize(
-    ("direct_s", "said", "met"),
+    ("one_radio_s", "said", "met"),
     [
         (0.18, "fail together", (True, True)),
         (0.2, "seem to fail together, but too little was seen to be sure", (False, True)),
@@ -134,9 +134,8 @@ def test_the_fallback_answers_what_the_network_misses(late: int, met: bool) -> N
     ],
 )
 def test_one_operator_gains_little_and_the_explanation_says_why(
-    direct_s: float, said: str, met: tuple[bool, bool]
+    one_radio_s: float, said: str, met: tuple[bool, bool]
 ) -> None:
     of = partial(run, scenario="one-operator-1", case="G")
-    runs = [of(name, usual_s=direct_s) for name in ("direct-a", "direct-b")]
-    found = verdicts([*runs, of("plr-replicate", explained=[f"{BOTH_MISSED}{said}"])])
+    found = verdicts([of("plr-1x2", usual_s=one_radio_s), of("plr-replicate", explained=[f"{BOTH_MISSED}{said}"])])
     assert (found["one_operator_mean_gain"], found["one_operator_explained"]) == met
