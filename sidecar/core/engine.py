@@ -359,6 +359,9 @@ class Engine:
     def _update_offers(self, now: float) -> None:
         if self._config.role is Role.ROBOT:
             self._events.extend(self._offers.update(self.routes, now))
+            gained = self._offers.take_gained()
+            if gained:
+                self._requests.on_servers_gained(gained, now)
 
     # -- time -----------------------------------------------------------------------------------------------------
 

@@ -32,6 +32,7 @@ class Offers:
         self._offered: dict[ServiceName, str] = {}
         self._wanted: dict[ServiceName, tuple[str, tuple[NodeName, ...]]] = {}
         """Service -> (type, servers), as the peers offer it."""
+        self._gained: set[ServiceName] = set()
         self._dark_since: dict[ServiceName, float] = {}
         self.conflicts: set[tuple[ServiceName, NodeName, str]] = set()
         """Servers left out because they offer another type than the rest."""
@@ -91,7 +92,7 @@ class Offers:
             for offer in peer.offers:
                 if find_rule(self._rules, offer.name) is not None:
                     by_name.setdefault(offer.name, {}).setdefault(offer.type, []).append(peer)
-        self._wanted = {}
+        before, self._wanted = self._wanted, {}
         self.conflicts = set()
         for name, by_type in by_name.items():
             current = self._offered.get(name)
@@ -101,7 +102,15 @@ class Offers:
                 (name, peer.name, other) for other, others in by_type.items() if other != kind for peer in others
             )
             fresh = [peer.name for peer in by_type[kind] if not peer.draining]
-            self._wanted[name] = (kind, tuple(fresh or [peer.name for peer in by_type[kind]]))
+            servers = tuple(fresh or [peer.name for peer in by_type[kind]])
+            self._wanted[name] = (kind, servers)
+            if name not in before or not set(servers) <= set(before[name][1]):
+                self._gained.add(name)
+
+    def take_gained(self) -> set[ServiceName]:
+        """Return the services that got another server since the last call."""
+        gained, self._gained = self._gained, set()
+        return gained
 
     def next_timer(self) -> float | None:
         """When the oldest darkness ends an offer."""

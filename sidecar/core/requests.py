@@ -37,6 +37,8 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from protos.model import NodeName, ServiceName
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.request_parts import RequestParts
@@ -234,10 +236,21 @@ class RequestTable:
                 if hit:
                     self._dispatching.rescue(request, now)
                 self._notice_unreachable(request)
-            elif not request.copies:
-                self._dispatch(request, now)
-            elif request.withheld or not request.pending():
-                self._dispatching.rescue(request, now)
+            else:
+                self._reconsider(request, now)
+
+    def on_servers_gained(self, services: Collection[ServiceName], now: float) -> None:
+        """Bring requests that wait for a server to one that offers their service from now on."""
+        for request in list(self._requests.values()):
+            if request.service in services and not request.done and not request.answered_here:
+                self._reconsider(request, now)
+
+    def _reconsider(self, request: Request, now: float) -> None:
+        """There is one more way to a server: send what had none, or whose copies are all in trouble."""
+        if request.copies:
+            self._dispatching.rescue(request, now)
+        else:
+            self._dispatch(request, now)
 
     def _notice_unreachable(self, request: Request) -> None:
         if request.rule.fallback is None or request.found_unreachable or request.done:

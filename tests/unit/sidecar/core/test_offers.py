@@ -118,3 +118,16 @@ def test_when_the_type_changes_the_old_offer_goes_and_the_new_one_comes() -> Non
     withdrawn, offered = robot.update()
     assert isinstance(withdrawn, WithdrawService)
     assert offered == OfferService(ECHO, "t/srv/Other")
+
+
+def test_a_service_gains_each_new_server_once() -> None:
+    robot = Robot(peer(A))
+    assert robot.offers.take_gained() == {ECHO}
+    robot.offers.set_peers([peer(A)])
+    assert robot.offers.take_gained() == set()
+    robot.offers.set_peers([peer(A), peer(B, session=2)])
+    assert robot.offers.take_gained() == {ECHO}
+    robot.offers.set_peers([peer(B, session=2)])
+    assert robot.offers.take_gained() == set()
+    robot.offers.set_peers([peer(A, draining=True)])
+    assert robot.offers.take_gained() == {ECHO}

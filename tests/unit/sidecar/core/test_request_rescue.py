@@ -33,6 +33,18 @@ def test_trouble_on_the_only_path_sends_a_copy_elsewhere_if_idempotent(state: Pa
         assert table.sent() == rescued
 
 
+def test_a_request_whose_only_path_died_goes_to_the_first_server_that_comes_within_reach() -> None:
+    table = Table()
+    table.routes.set_state(WWAN_B, PathState.DOWN)
+    table.submit()
+    assert table.sent() == [WLAN_A]
+    table.change(WLAN_A, PathState.DOWN)
+    table.table.handle_timer(1.0)
+    assert table.sent() == []
+    table.change(WWAN_B, PathState.UP, now=2.0)
+    assert table.sent() == [WWAN_B]
+
+
 def test_flapping_paths_do_not_multiply_copies_without_end() -> None:
     table = Table()
     table.submit()

@@ -1,0 +1,52 @@
+"""A request outlives a time without any server: whoever offers its service next gets it."""
+
+from __future__ import annotations
+
+import pytest
+
+from protos.model import ServiceOffer
+from sidecar.core.redundancy_mode import RedundancyMode
+from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
+from tests.sim.test_mesh import call_at, mapped
+
+SERVERLESS_S = 3.0
+
+
+def offer_later(mesh: Mesh, node: Node) -> None:
+    """Its server has started: the control plane tells everyone."""
+    node.offers = (ServiceOffer(SERVICE, TYPE),)
+    node.engine.set_offers(node.offers)
+    mesh.push_views()
+
+
+CALLS = [
+    (mode, idempotent) for mode in RedundancyMode for idempotent in (True, False) if idempotent or not mode.sends_late
+]
+"""Modes that ask several servers one after the other are refused beside a service that is not idempotent."""
+
+
+@pytest.mark.parametrize(("mode", "idempotent"), CALLS)
+@pytest.mark.parametrize("known_dead", [True, False])
+def test_requests_of_a_time_without_servers_are_answered_by_the_first_that_comes(
+    mode: RedundancyMode, idempotent: bool, known_dead: bool
+) -> None:
+    """The only cloud with a server dies while the other one still waits for its server to start."""
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(idempotent=idempotent, redundancy=mode),))
+    starting, dying = mesh.cloud("cloud-a"), mesh.cloud("cloud-b")
+    starting.offers = ()
+    starting.engine.set_offers(())
+    mesh.push_views()
+    mesh.run(1.0)
+    mapped(mesh, robot, ("wlan0", "cloud-b"), ("wwan0", "cloud-b"))
+    call_at(mesh, robot, 20, 1.0)
+    assert len(robot.responses()) == 20
+    dying.alive = False
+    if known_dead:  # no path to it is up any more
+        mesh.run(2.0)
+    waiting = call_at(mesh, robot, 20, SERVERLESS_S)
+    offer_later(mesh, starting)
+    mesh.run(0.5)
+    lost = 0 if known_dead or idempotent else 20  # what the dead one may have run, nobody else may run
+    assert len(robot.responses()) >= 20 + waiting - lost
+    assert len({answer.request_id for answer in robot.responses()}) == len(robot.responses())
