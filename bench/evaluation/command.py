@@ -16,6 +16,7 @@ from rich.console import Console
 from bench.evaluation import report_command
 from bench.evaluation.contenders import CONTENDERS
 from bench.evaluation.ideal import IDEALS, compute
+from bench.evaluation.outcome import figures_by_window
 from bench.evaluation.redundancy_costs import mode_costs
 from bench.evaluation.report import RUNS, modes_table, read_records, window_table
 from bench.evaluation.runner import run as run_in_lab
@@ -117,7 +118,7 @@ def run(options: argparse.Namespace) -> int:
             pool.shutdown(wait=False, cancel_futures=True)
             print(error, file=sys.stderr)
             return 2
-    costs = mode_costs(outcomes)
+    costs = mode_costs(figures_by_window(outcomes))
     if costs:
         console.print(rich_table(modes_table(costs)))
     # Last: drawing takes a processor from what is measured.

@@ -7,25 +7,23 @@ from typing import TYPE_CHECKING
 
 from bench.dataplane.statistics import MS, median
 from bench.evaluation import counters, repeats
-from bench.evaluation.comparison import DIRECT, IDEAL, gains
+from bench.evaluation.comparison import DIRECT, IDEAL, ONE_RADIO, SUREST, gains, one_radio_gain
+from bench.evaluation.measured import Measured
 from bench.evaluation.outcome import Outcome, by_window, figures_by_window
-from bench.evaluation.redundancy_costs import SUREST, mode_costs
+from bench.evaluation.redundancy_costs import mode_costs
 from bench.evaluation.studies import is_recorded
 from protos.explanation import Correlation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from bench.evaluation.outcome import Figures
+    from bench.evaluation.outcome import Windows
     from bench.evaluation.repeats import Repeats
     from bench.reporting.tables import Figure
-
-    Windows = dict[str, dict[str, Figures]]
 
 PATH_IDEALS = ("ideal-a", "ideal-b")
 BELOW_LOAD = 0.1
 """A path alone that misses a larger share than this is below the offered load for that long."""
-ONE_RADIO = "plr-1x2"
 WITH_BUDGET = ("plr-adaptive-10%", "plr-hedge-10%")
 
 
@@ -44,17 +42,19 @@ class Evidence:
         self.notes[name] = note
 
 
-def gather(outcomes: Sequence[Outcome], again: Sequence[Outcome] = ()) -> Evidence:
+def gather(outcomes: Sequence[Outcome], again: Measured | None = None) -> Evidence:
     """All figures; `again`: another evaluation of the same windows."""
     found = Evidence()
     recorded = [one for one in outcomes if one.case == "A" and is_recorded(one.scenario)]
     _drives(found, recorded)
     windows = figures_by_window(outcomes)
     _queues(found, windows)
-    _modes(found, outcomes)
+    _modes(found, windows)
+    _budgets(found, outcomes)
     _fallback(found, [one for one in outcomes if one.case == "F"])
     _one_operator(found, [one for one in outcomes if one.case == "G"])
-    _reproduced(found, repeats.compare(outcomes, again))
+    if again is not None:
+        _reproduced(found, repeats.compare(Measured.of(outcomes), again))
     return found
 
 
@@ -64,7 +64,7 @@ def _drives(found: Evidence, outcomes: Sequence[Outcome]) -> None:
     recorded = len({one.scenario for one in outcomes})
     if recorded:
         found.add("drive_windows", len(complete), f"{recorded} there are; the others are incomplete or void")
-    gain = gains([one for one in outcomes if one.scenario in complete]).get(SUREST)
+    gain = gains(complete).get(SUREST)
     if gain is not None:
         note = f"{gain.windows} drives on which a direct run misses anything"
         found.add("mean_gain", gain.mean_gain, note)
@@ -94,8 +94,8 @@ def _queues(found: Evidence, windows: Windows) -> None:
         found.figures["queue_windows"] = len(queues)
 
 
-def _modes(found: Evidence, outcomes: Sequence[Outcome]) -> None:
-    costs = mode_costs(outcomes)
+def _modes(found: Evidence, windows: Windows) -> None:
+    costs = mode_costs(windows)
     adaptive, hedge = costs.get("plr-adaptive"), costs.get("plr-hedge")
     if adaptive is not None:
         avoided, extra = f"{adaptive.windows} windows", f"{adaptive.windows} windows"
@@ -104,6 +104,9 @@ def _modes(found: Evidence, outcomes: Sequence[Outcome]) -> None:
             extra += f"; plr-hedge {hedge.extra_bytes:+.1%}"
         found.add("adaptive_avoided", adaptive.avoided, avoided)
         found.add("adaptive_extra_bytes", adaptive.extra_bytes, extra)
+
+
+def _budgets(found: Evidence, outcomes: Sequence[Outcome]) -> None:
     shares = {
         (run.contender, run.scenario, interface): share
         for runs in by_window(outcomes).values()
@@ -146,12 +149,11 @@ def _one_operator(found: Evidence, outcomes: Sequence[Outcome]) -> None:
         if runs.keys() >= {ONE_RADIO, SUREST}
     ]
     if beside:
-        gain = median(one.mean_ms / both.mean_ms for one, both in beside)
         alone = median(one.miss_ratio for one, _ in beside) or 0.0
         missed = median(both.miss_ratio for _, both in beside) or 0.0
         found.add(
             "one_operator_mean_gain",
-            gain,
+            one_radio_gain(figures_by_window(outcomes)),
             f"median of {len(beside)} windows; missed {missed:.1%}, with one radio {alone:.1%}",
         )
         found.figures["one_operator_missed"] = missed

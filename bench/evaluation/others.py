@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.dataplane.statistics import median
-from bench.evaluation.comparison import DIRECT, better_direct
+from bench.evaluation.comparison import DIRECT, SUREST, better_direct
 from bench.evaluation.outcome import Figures, by_window, together
-from bench.evaluation.redundancy_costs import SUREST
 from bench.evaluation.studies import is_recorded
 
 if TYPE_CHECKING:

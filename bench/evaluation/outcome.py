@@ -14,8 +14,11 @@ from typing import TYPE_CHECKING, Any, Self
 from bench.dataplane.statistics import MS, quantile
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
+
+    Windows = Mapping[str, Mapping[str, "Figures"]]
+    """Scenario -> contender -> figures, of runs that are not void."""
 
 UNANSWERED_S = 10.0
 
@@ -50,6 +53,11 @@ class Figures:
     p99_ms: float
     bytes_per_request: float | None
     """Bytes of IP packets that the robot sent, over all its interfaces; None: computed, not run."""
+
+    @property
+    def misses(self) -> float:
+        """How many requests."""
+        return self.miss_ratio * self.requests
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from bench.dataplane.statistics import median, ratio
-from bench.evaluation.comparison import DIRECT
+from bench.dataplane.statistics import ratio
+from bench.evaluation.comparison import DIRECT, NO_GAINS, SUREST, gains
 from bench.evaluation.outcome import Outcome, together
-from bench.evaluation.redundancy_costs import SUREST
 from bench.reporting.tables import Table
 
 if TYPE_CHECKING:
@@ -73,15 +72,23 @@ def _ratio(paper: PaperRatio, recorded: bool, windows: Sequence[Mapping[str, Out
     # Beginning with the better direct run of each window, by this figure.
     directs = [sorted((runs[name] for name in DIRECT), key=lambda run: _value(run, paper)) for runs in windows]
     ours = [runs[SUREST] for runs in windows]
-    hard = [number for number, pair in enumerate(directs) if any(direct.figures().miss_ratio > 0 for direct in pair)]
-
-    def middle(rank: int) -> float | None:
-        return median(ratio(_value(directs[number][rank], paper), _value(ours[number], paper)) for number in hard)
+    figures = [{name: run.figures() for name, run in runs.items()} for runs in windows]
+    gain = gains({str(number): one for number, one in enumerate(figures)}).get(SUREST, NO_GAINS)
+    p99 = paper.figure == "p99_ms"
 
     def pooled(rank: int) -> float | None:
         return ratio(_value(together([pair[rank] for pair in directs]), paper), _value(together(ours), paper))
 
-    return OurRatio(paper, recorded, len(windows), len(hard), middle(1), middle(0), pooled(1), pooled(0))
+    return OurRatio(
+        paper,
+        recorded,
+        len(windows),
+        gain.windows,
+        gain.p99_over_worse if p99 else gain.mean_over_worse,
+        gain.p99_gain if p99 else gain.mean_gain,
+        pooled(1),
+        pooled(0),
+    )
 
 
 def _value(run: Outcome, paper: PaperRatio) -> float:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from bench.evaluation.comparison import DIRECT
-from bench.evaluation.outcome import figures_by_window
+from bench.evaluation.comparison import DIRECT, SUREST
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Mapping
 
-    from bench.evaluation.outcome import Figures, Outcome
+    from bench.evaluation.outcome import Figures, Windows
 
-CHEAPEST, SUREST = "plr-single", "plr-replicate"
+CHEAPEST = "plr-single"
 MODES = (CHEAPEST, "plr-hedge-10%", "plr-hedge", "plr-adaptive-10%", "plr-adaptive", SUREST)
 NEEDED = frozenset((*DIRECT, CHEAPEST, SUREST))
 """A window counts when all of these ran in it."""
@@ -33,22 +32,22 @@ class ModeCost:
     """Bytes beyond those of `single`, as a share of them."""
 
 
-def mode_costs(outcomes: Iterable[Outcome]) -> dict[str, ModeCost]:
-    """Mode -> cost, of runs that are not void."""
-    complete = [window for window in figures_by_window(outcomes).values() if window.keys() >= NEEDED]
+def mode_costs(windows: Windows) -> dict[str, ModeCost]:
+    """Mode -> cost."""
+    complete = [window for window in windows.values() if window.keys() >= NEEDED]
     found = {mode: _cost(mode, [window for window in complete if mode in window]) for mode in MODES}
     return {mode: cost for mode, cost in found.items() if cost is not None}
 
 
-def _cost(mode: str, windows: list[dict[str, Figures]]) -> ModeCost | None:
+def _cost(mode: str, windows: list[Mapping[str, Figures]]) -> ModeCost | None:
     sent = sum(_bytes(window[mode]) for window in windows)
     least = sum(_bytes(window[CHEAPEST]) for window in windows)
     if not least:
         return None
     requests = sum(window[mode].requests for window in windows)
-    misses = sum(_misses(window[mode]) for window in windows)
-    alone = sum(min(_misses(window[direct]) for direct in DIRECT) for window in windows)
-    avoidable = alone - sum(_misses(window[SUREST]) for window in windows)
+    misses = sum(window[mode].misses for window in windows)
+    alone = sum(min(window[direct].misses for direct in DIRECT) for window in windows)
+    avoidable = alone - sum(window[SUREST].misses for window in windows)
     return ModeCost(
         windows=len(windows),
         miss_ratio=misses / requests,
@@ -56,10 +55,6 @@ def _cost(mode: str, windows: list[dict[str, Figures]]) -> ModeCost | None:
         avoided=(alone - misses) / avoidable if avoidable > 0 else None,
         extra_bytes=sent / least - 1.0,
     )
-
-
-def _misses(figures: Figures) -> float:
-    return figures.miss_ratio * figures.requests
 
 
 def _bytes(figures: Figures) -> float:

@@ -9,16 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from bench.evaluation import paper
-from bench.evaluation.comparison import IDEAL, gains
+from bench.evaluation.comparison import IDEAL, gains, one_radio_gain
 from bench.evaluation.ideal import IDEALS
-from bench.evaluation.outcome import Outcome, by_window, together
 from bench.evaluation.redundancy_costs import mode_costs
-from bench.evaluation.studies import is_recorded, studies
+from bench.evaluation.studies import is_recorded, study_of
 from bench.reporting.tables import Table
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping
+
+    from bench.evaluation.measured import Measured
+    from bench.evaluation.outcome import Figures, Windows
 
 ALIKE = 0.2
 """Two ratios that differ by no more came out alike."""
@@ -53,48 +54,56 @@ class Repeats:
         return max(self.ratios, key=lambda name: self.ratios[name].difference, default=None)
 
 
-def compare(first: Sequence[Outcome], second: Sequence[Outcome]) -> Repeats:
-    """Compare two evaluations over the runs that both have, none void."""
-    one, other = by_window(first), by_window(second)
-    for window, runs in other.items():
+def compare(first: Measured, second: Measured) -> Repeats:
+    """Compare two evaluations over the runs that both have."""
+    one, other = dict(first.windows), dict(second.windows)
+    runs = {scenario: _measured(one.get(scenario, {}), by_name) for scenario, by_name in other.items()}
+    runs = {scenario: names for scenario, names in runs.items() if names}
+    before, after = {}, {}
+    for scenario, names in runs.items():
         # Computed from the trace, not run: the same whenever it is done.
-        runs.update({name: run for name, run in one.get(window, {}).items() if name in IDEALS and name not in runs})
-    common = {window: [name for name in one.get(window, {}) if name in runs] for window, runs in other.items()}
-    measured = {window: [name for name in names if name not in IDEALS] for window, names in common.items()}
-    common = {window: names for window, names in common.items() if measured[window]}
-    before, after = (
-        _ratios([runs[window][name] for window, names in common.items() for name in names]) for runs in (one, other)
-    )
-    both = {name: Repeat(before[name], after[name]) for name in before if name in after and before[name]}
-    return Repeats(len(common), sum(len(measured[window]) for window in common), both)
+        ideals = {name: of for by in (other, one) for name, of in by[scenario].items() if name in IDEALS}
+        before[scenario] = ideals | {name: one[scenario][name] for name in names}
+        after[scenario] = ideals | {name: other[scenario][name] for name in names}
+    of_first, of_second = (_ratios(windows, first.cases) for windows in (before, after))
+    both = {name: Repeat(of_first[name], of_second[name]) for name in of_first if name in of_second and of_first[name]}
+    return Repeats(len(runs), sum(map(len, runs.values())), both)
 
 
-def _ratios(outcomes: Sequence[Outcome]) -> dict[str, float]:
+def _measured(one: Mapping[str, Figures], other: Mapping[str, Figures]) -> list[str]:
+    return [name for name in one if name in other and name not in IDEALS]
+
+
+def _ratios(windows: Windows, cases: Mapping[str, str]) -> dict[str, float]:
+    studies: dict[str, dict[str, Mapping[str, Figures]]] = {}
+    for scenario, by_name in windows.items():
+        studies.setdefault(study_of(scenario, cases[scenario]), {})[scenario] = by_name
     found: dict[str, float | None] = {}
-    for name, gain in gains(outcomes).items():
-        found[f"{name}: mean gain"] = gain.mean_gain
-        found[f"{name}: P99 gain"] = gain.p99_gain
-    for name, cost in mode_costs(outcomes).items():
+    for study, of_study in sorted(studies.items()):
+        for name, gain in gains(of_study).items():
+            found[f"{study}, {name}: mean gain"] = gain.mean_gain
+            found[f"{study}, {name}: P99 gain"] = gain.p99_gain
+            found[f"{study}, {name}: mean gain over the worse"] = gain.mean_over_worse
+            found[f"{study}, {name}: P99 gain over the worse"] = gain.p99_over_worse
+        found[f"{study}: mean with one radio over that with both"] = one_radio_gain(of_study)
+    for name, cost in mode_costs(windows).items():
         found[f"{name}: avoided"] = cost.avoided
         found[f"{name}: bytes over single"] = 1.0 + cost.extra_bytes
-    for one in paper.ratios(studies(outcomes)):
-        found[f"{one.paper.about}: over the worse"] = one.over_worse
-        found[f"{one.paper.about}: over the better"] = one.over_better
-        found[f"{one.paper.about}, pooled: over the worse"] = one.pooled_over_worse
-        found[f"{one.paper.about}, pooled: over the better"] = one.pooled_over_better
-    found |= _misses_over_ideal(by_window(one for one in outcomes if one.case == "A" and is_recorded(one.scenario)))
-    return {name: value for name, value in found.items() if value is not None}
+    drives = [of for scenario, of in windows.items() if cases[scenario] == "A" and is_recorded(scenario)]
+    return {name: value for name, value in (found | _misses_over_ideal(drives)).items() if value is not None}
 
 
-def _misses_over_ideal(windows: Mapping[str, Mapping[str, Outcome]]) -> dict[str, float]:
-    found = {}
-    for name in sorted({name for runs in windows.values() for name in runs} - set(IDEALS)):
-        both = [(runs[name], runs[IDEAL]) for runs in windows.values() if runs.keys() >= {name, IDEAL}]
-        if both:
-            ours, ideal = (together(runs).figures() for runs in zip(*both, strict=True))
-            if min(ours.miss_ratio, ideal.miss_ratio) * ours.requests >= ENOUGH_MISSES:
-                found[f"{name}: misses over the ideal's"] = ours.miss_ratio / ideal.miss_ratio
-    return found
+def _misses_over_ideal(windows: Iterable[Mapping[str, Figures]]) -> dict[str, float]:
+    misses: dict[str, list[tuple[float, float]]] = {}
+    for by_name in windows:
+        for name in by_name.keys() - set(IDEALS) if IDEAL in by_name else ():
+            misses.setdefault(name, []).append((by_name[name].misses, by_name[IDEAL].misses))
+    sums = {name: (sum(ours for ours, _ in both), sum(ideal for _, ideal in both)) for name, both in misses.items()}
+    return {
+        f"{name}: misses over the ideal's": ours / ideal
+        for name, (ours, ideal) in sorted(sums.items())
+        if min(ours, ideal) >= ENOUGH_MISSES
+    }
 
 
 def table(repeats: Repeats) -> Table:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.evaluation import charts, findings, others, paper, repeats
 from bench.evaluation.comparison import DIRECT, better_direct, compare, gains
-from bench.evaluation.outcome import Outcome, by_window
+from bench.evaluation.measured import Measured
+from bench.evaluation.outcome import Outcome, by_window, figures_by_window
 from bench.evaluation.redundancy_costs import MODES, NEEDED, mode_costs
 from bench.evaluation.studies import Study, pool, ranked, studies
 from bench.evaluation.targets import TARGETS
@@ -55,7 +56,7 @@ def read_records(folder: Path, scenario: str = "*") -> list[Outcome]:
     return [Outcome.read(file) for file in sorted((folder / RUNS).glob(f"{scenario}/*.json"))]
 
 
-def gather(outcomes: Sequence[Outcome], again: Sequence[Outcome] = ()) -> Report:
+def gather(outcomes: Sequence[Outcome], again: Measured | None = None) -> Report:
     """Everything, from at least one run; `again`: another evaluation of the same windows."""
     found = studies(outcomes)
     void = sum(bool(one.disturbances) for one in outcomes)
@@ -80,12 +81,13 @@ def machine_of(outcomes: Iterable[Outcome]) -> dict[str, Any]:
     return max(known, key=lambda machine: str(machine.get("measured_at", "")), default={})
 
 
-def as_json(outcomes: Sequence[Outcome], failed: Sequence[str], again: Sequence[Outcome] = ()) -> dict[str, Any]:
+def as_json(outcomes: Sequence[Outcome], failed: Sequence[str], again: Measured | None = None) -> dict[str, Any]:
     """Every figure of the report."""
     evidence = findings.gather(outcomes, again)
     found = studies(outcomes)
     runs: dict[str, dict[str, Any]] = {}
     compared = compare(outcomes)
+    windows = figures_by_window(outcomes)
     for outcome in outcomes:
         comparison = compared.get(outcome.scenario, {}).get(outcome.contender)
         runs.setdefault(outcome.scenario, {})[outcome.contender] = {
@@ -103,8 +105,8 @@ def as_json(outcomes: Sequence[Outcome], failed: Sequence[str], again: Sequence[
         "from": evidence.notes,
         "paper": [asdict(ratio) for ratio in paper.ratios(found)],
         "studies": {study.name: _pooled_as_json(study) for study in found},
-        "gains": {name: asdict(gain) for name, gain in gains(outcomes).items()},
-        "redundancy_modes": {name: asdict(cost) for name, cost in mode_costs(outcomes).items()},
+        "gains": {name: asdict(gain) for name, gain in gains(windows).items()},
+        "redundancy_modes": {name: asdict(cost) for name, cost in mode_costs(windows).items()},
         "others": {name: asdict(one) for name, one in others.beside(outcomes).items()},
         "reproduced": _repeats_as_json(outcomes, again),
         "runs": runs,
@@ -142,20 +144,23 @@ def modes_table(costs: Mapping[str, ModeCost]) -> Table:
     return Table(title, _MODE_COLUMNS, rows)
 
 
-def _repeats(outcomes: Sequence[Outcome], again: Sequence[Outcome]) -> list[Section]:
-    if not again:
+def _repeats(outcomes: Sequence[Outcome], again: Measured | None) -> list[Section]:
+    if again is None:
         return []
     return [
         Section(
-            "Repeated", "Two evaluations of the same windows.", (), (repeats.table(repeats.compare(outcomes, again)),)
+            "Repeated",
+            "Two evaluations of the same windows.",
+            (),
+            (repeats.table(repeats.compare(Measured.of(outcomes), again)),),
         )
     ]
 
 
 def _modes(outcomes: Sequence[Outcome]) -> list[Section]:
-    costs = mode_costs(outcomes)
+    costs = mode_costs(figures_by_window(outcomes))
     shared = pool(by_window(outcomes), (*DIRECT, *MODES), NEEDED)
-    beside = mode_costs(run for runs in shared.runs.values() for run in runs) if shared else {}
+    beside = mode_costs(figures_by_window(run for runs in shared.runs.values() for run in runs)) if shared else {}
     drawn = (charts.modes("modes", beside),) if beside else ()
     about = "What further copies avoid and what they cost."
     return [Section("Redundancy modes", about, drawn, (modes_table(costs),))] if costs else []
@@ -210,9 +215,9 @@ def _pooled_as_json(study: Study) -> dict[str, Any]:
     return {"windows": list(shared.windows), "contenders": contenders}
 
 
-def _repeats_as_json(outcomes: Sequence[Outcome], again: Sequence[Outcome]) -> dict[str, Any] | None:
-    if not again:
+def _repeats_as_json(outcomes: Sequence[Outcome], again: Measured | None) -> dict[str, Any] | None:
+    if again is None:
         return None
-    found = repeats.compare(outcomes, again)
+    found = repeats.compare(Measured.of(outcomes), again)
     ratios = {name: {**asdict(one), "difference": one.difference} for name, one in found.ratios.items()}
     return {"windows": found.windows, "runs": found.runs, "ratios": ratios}

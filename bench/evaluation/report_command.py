@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from bench.evaluation import page, publish, report, summary
+from bench.evaluation.measured import Measured
 from bench.evaluation.targets import TARGETS
 from bench.reporting.terminal import show_verdicts
 
@@ -33,8 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--again",
         type=Path,
-        metavar="DIR",
-        help="folder with the records of another evaluation of the same windows: how far do the ratios differ?",
+        metavar="DIR|FILE",
+        help="another evaluation of the same windows, a folder with its records or its evaluation.json (such as "
+        f"{publish.RESULTS / DATA}): how far do the ratios differ?",
     )
     parser.add_argument(
         "--publish",
@@ -51,13 +53,10 @@ def run(options: argparse.Namespace) -> int:
     """Write the reports; returns the exit code, 2 when there is nothing to report or it is not readable."""
     try:
         outcomes = report.read_records(options.out)
-        again = report.read_records(options.again) if options.again else []
-        if options.again and options.again.resolve() == options.out.resolve():
-            raise ValueError(f"--again {options.again}: expected another evaluation than --out")
+        if not outcomes:
+            raise _no_records(options.out)
+        again = _again(options.again, options.out) if options.again else None
         failed = _failed_before(options.out / DATA)
-        for folder, records in ((options.out, outcomes), (options.again, again)):
-            if folder and not records:
-                raise ValueError(f"{folder / report.RUNS}: no records; `python -m bench evaluate` makes them")
         write(options.out, outcomes, failed, again, options.publish)
     except ValueError as error:
         print(error, file=sys.stderr)
@@ -69,7 +68,7 @@ def write(
     folder: Path,
     outcomes: Sequence[Outcome],
     failed: Sequence[str],
-    again: Sequence[Outcome] = (),
+    again: Measured | None = None,
     checkout: Path | None = None,
 ) -> None:
     """Write the reports of at least one run to the folder, and to the checkout if one is given; show the verdicts.
@@ -98,6 +97,22 @@ def write(
     if checkout is not None:
         for one in publish.publish(checkout, content, text, drawn):
             console.print(f"published: {one.file}: {one.about}")
+
+
+def _again(path: Path, out: Path) -> Measured:
+    """The other evaluation. Raises ValueError: it is the same one, or there is none."""
+    if path.resolve() in (out.resolve(), (out / DATA).resolve()):
+        raise ValueError(f"--again {path}: expected another evaluation than --out")
+    if path.is_file():
+        return Measured.published(path)
+    outcomes = report.read_records(path)
+    if not outcomes:
+        raise _no_records(path)
+    return Measured.of(outcomes)
+
+
+def _no_records(folder: Path) -> ValueError:
+    return ValueError(f"{folder / report.RUNS}: no records; `python -m bench evaluate` makes them")
 
 
 def _failed_before(file: Path) -> list[str]:

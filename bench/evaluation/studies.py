@@ -10,13 +10,12 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from bench.evaluation.comparison import DIRECT, IDEAL
+from bench.evaluation.comparison import DIRECT, IDEAL, SUREST
 from bench.evaluation.contenders import CONTENDERS
 from bench.evaluation.ideal import IDEALS
 from bench.evaluation.outcome import Outcome, by_window, together
-from bench.evaluation.redundancy_costs import SUREST
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -75,23 +74,40 @@ class Study:
     def hardest(self, contenders: Sequence[str]) -> str | None:
         """The window with most misses of the two direct runs together, where all these ran; None: there is none."""
         able = [name for name, runs in self.windows.items() if {*contenders, *DIRECT} <= runs.keys()]
-        return max(able, key=lambda name: sum(_misses(self.windows[name][one]) for one in DIRECT), default=None)
+        return max(able, key=lambda name: sum(self.windows[name][one].figures().misses for one in DIRECT), default=None)
 
 
 def studies(outcomes: Iterable[Outcome]) -> list[Study]:
     """In order of case, recorded ones first."""
-    found: dict[tuple[str, bool, str], dict[str, dict[str, Outcome]]] = {}
+    found: dict[_Key, dict[str, dict[str, Outcome]]] = {}
     for scenario, runs in by_window(outcomes).items():
-        case = next(iter(runs.values())).case
-        match = _NAME.fullmatch(scenario)
-        assert match is not None
-        stem = "recorded" if match["recorded"] else match["stem"].rstrip("0123456789").rstrip("-")
-        found.setdefault((case, not match["recorded"], stem + (match["shortened"] or "")), {})[scenario] = runs
+        found.setdefault(_key(scenario, next(iter(runs.values())).case), {})[scenario] = runs
     return [
-        Study(f"{case.lower()}-{stem}", f"Case {case}, {CASES[case]}: {stem}", case, not made_up, found[key])
+        Study(key.study, f"Case {key.case}, {CASES[key.case]}: {key.stem}", key.case, not key.made_up, found[key])
         for key in sorted(found)
-        for case, made_up, stem in (key,)
     ]
+
+
+def study_of(scenario: str, case: str) -> str:
+    """The name of the study that a scenario of this case belongs to."""
+    return _key(scenario, case).study
+
+
+class _Key(NamedTuple):
+    case: str
+    made_up: bool
+    stem: str
+
+    @property
+    def study(self) -> str:
+        return f"{self.case.lower()}-{self.stem}"
+
+
+def _key(scenario: str, case: str) -> _Key:
+    match = _NAME.fullmatch(scenario)
+    assert match is not None
+    stem = "recorded" if match["recorded"] else match["stem"].rstrip("0123456789").rstrip("-")
+    return _Key(case, not match["recorded"], stem + (match["shortened"] or ""))
 
 
 def pool(
@@ -117,8 +133,3 @@ def ranked(names: Iterable[str]) -> list[str]:
     """Contenders in the order in which tables and charts have them."""
     order = (*CONTENDERS, *IDEALS)
     return sorted(names, key=lambda name: order.index(name) if name in order else len(order))
-
-
-def _misses(outcome: Outcome) -> float:
-    figures = outcome.figures()
-    return figures.miss_ratio * figures.requests

@@ -10,7 +10,7 @@ import pytest
 
 from bench.evaluation.comparison import Comparison, compare, gains
 from bench.evaluation.ideal import compute
-from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request
+from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request, figures_by_window
 from bench.evaluation.scenario import read_scenarios
 from bench.evaluation.windows import choose, cut
 from bench.netlab import LinkProfile, Trace, TraceStep
@@ -168,6 +168,8 @@ def test_a_contender_is_compared_with_the_better_direct_run_and_the_ideal() -> N
     assert "ideal" not in found["hard"]
     assert found["easy"]["ours"].p99_gain == pytest.approx(4.0)
     assert found["void"]["ours"] == Comparison(None, None, None, None)
-    medians = gains([*hard, *easy, *void])
+    medians = gains(figures_by_window([*hard, *easy, *void]))
     assert list(medians) == ["ours"]
-    assert asdict(medians["ours"]) == pytest.approx({"windows": 1, "mean_gain": 4.0, "p99_gain": 5.0})
+    assert asdict(medians["ours"]) == pytest.approx(
+        {"windows": 1, "mean_gain": 4.0, "p99_gain": 5.0, "mean_over_worse": 17.0, "p99_over_worse": 25.0}
+    )
