@@ -20,7 +20,7 @@ from sidecar.core.frame import (
 )
 from sidecar.core.introduction import encode_introduction
 from sidecar.core.path_id import PathState
-from sidecar.core.paths import NEVER
+from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
     import random

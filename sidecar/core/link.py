@@ -38,9 +38,8 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.path_keys import DEFAULT_LIMITS, KeyLimits, LinkMemory
 from sidecar.core.path_table import PathTable
-from sidecar.core.paths import NEVER
 from sidecar.core.stats import PathStats
-from sidecar.core.timers import Timers
+from sidecar.core.timers import NEVER, Timers
 
 if TYPE_CHECKING:
     import random

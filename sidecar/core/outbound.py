@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from sidecar.core import fec
 from sidecar.core.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, MIN_SYMBOL_BYTES, symbol_count
 from sidecar.core.priority import Priority
+from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -15,9 +16,6 @@ if TYPE_CHECKING:
     from sidecar.core.events import RequestId
     from sidecar.core.messages import Encoded
     from sidecar.core.path_id import PathId
-
-
-NEVER = float("inf")
 
 
 class OutboundMessage:

@@ -12,6 +12,7 @@ from sidecar.core.pmtu import PathMtu
 from sidecar.core.recovery import Recovery
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.send_queue import SendQueue
+from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
     import random
@@ -39,9 +40,6 @@ MAX_PROBES_OUT = 32
 """Unanswered probes that are remembered; older ones could only give stale round-trip times."""
 MAX_RTT_SAMPLES = 512
 """Round-trip times kept between two reports."""
-
-
-NEVER = float("inf")
 
 
 class Path:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import heapq
+import math
 from itertools import count
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
+NEVER = math.inf
+"""A moment (s) that does not come."""
 SLACK = 64
 """Outdated entries that may lie around before they are swept out; beyond it as many as there are live ones."""
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
-from sidecar.core.outbound import NEVER
 from sidecar.core.priority import Priority
 from sidecar.core.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SHARE, SendQueue
+from sidecar.core.timers import NEVER
 from tests.unit.sidecar.core.builders import message, path
 
 if TYPE_CHECKING:

@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
-from sidecar.core.outbound import NEVER, OutboundMessage
+from sidecar.core.timers import NEVER
 from sidecar.core.turn import PATIENCE, SMALL, Turn
 from tests.unit.sidecar.core.builders import message, path
+
+if TYPE_CHECKING:
+    from sidecar.core.outbound import OutboundMessage
 
 SIZE, PACE, ROUND_TRIP_S = 100_000, 200_000.0, 0.1
 """Half a second to send, 0.6 s to the answer."""
