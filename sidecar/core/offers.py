@@ -1,8 +1,8 @@
 """Robot side: which services exist on the robot, following the live servers.
 
-A service is offered only while a live server offers it. "Live" survives a tunnel: when all paths to all its servers
-are dark, the offer stays for WITHDRAW_AFTER_S, since requests wait for the first path that comes back; when the
-servers themselves left, it goes at once.
+A service is offered from its first server within reach on. When there is none any more, as all paths are dark or as the
+servers themselves are gone, the offer stays for WITHDRAW_AFTER_S: they may be in a tunnel or restarting, and requests
+wait for the first that comes back. With the offer go the requests that wait at it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sidecar.core.rules import ServiceRule
 
 WITHDRAW_AFTER_S = 15.0
-"""Longer than a cellular handover or a tunnel, shorter than a person's patience with a dead service."""
+"""Longer than a handover, a tunnel or the restart of a server, shorter than a person's patience with a dead service."""
 
 
 class Offers:
@@ -49,22 +49,25 @@ class Offers:
 
     def update(self, routes: Routes, now: float) -> list[OfferService | WithdrawService]:
         """Follow the peers' offers and the paths to them; returns what changes on the robot."""
-        wanted = self._wanted
-        events: list[OfferService | WithdrawService] = [
-            self._withdraw(name, "the last server is gone")
-            for name, kind in list(self._offered.items())
-            if name not in wanted or wanted[name][0] != kind
-        ]
-        for name, (kind, servers) in wanted.items():
-            if any(routes.reaches(server) for server in servers):
-                self._dark_since.pop(name, None)
-                if name not in self._offered:
-                    self._offered[name] = kind
-                    events.append(OfferService(name, kind))
-            elif name in self._offered:
+        reached = {
+            name: kind
+            for name, (kind, servers) in self._wanted.items()
+            if any(routes.reaches(server) for server in servers)
+        }
+        events: list[OfferService | WithdrawService] = []
+        for name, kind in list(self._offered.items()):
+            if name not in reached:
                 since = self._dark_since.setdefault(name, now)
                 if since + WITHDRAW_AFTER_S <= now:
-                    events.append(self._withdraw(name, f"no path to a server for {WITHDRAW_AFTER_S:.0f} s"))
+                    what = "path to a server" if name in self._wanted else "server"
+                    events.append(self._withdraw(name, f"no {what} for {WITHDRAW_AFTER_S:.0f} s"))
+            elif reached[name] != kind:
+                events.append(self._withdraw(name, f"its servers offer it as {reached[name]} now"))
+        for name, kind in reached.items():
+            self._dark_since.pop(name, None)
+            if name not in self._offered:
+                self._offered[name] = kind
+                events.append(OfferService(name, kind))
         return events
 
     def _withdraw(self, name: ServiceName, reason: str) -> WithdrawService:

@@ -9,6 +9,7 @@ from controlplane.core.control_events import Settings
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from protos.model import NodeName, Role, ServiceName, ServiceOffer
 from sidecar.core.events import CallsForbidden, ExecuteRequest, RequestFailed, RequestId, WithdrawService
+from sidecar.core.offers import WITHDRAW_AFTER_S
 from tests.sim.joined_planes import JoinedPlanes, restored
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 
@@ -161,6 +162,7 @@ def test_a_service_forbidden_in_mid_run_is_withdrawn_and_what_runs_already_is_an
     set_policy(fleet, Policy((ECHO_FOR_ALL,), OFFER_ANY))
     fleet.planes.run(1.0)
     assert answered(good, [request]) == 1
+    fleet.planes.run(WITHDRAW_AFTER_S)
     assert [event.name for event in good.events if isinstance(event, WithdrawService)] == [SECRET]
 
 

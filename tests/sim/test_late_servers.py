@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 
 from protos.model import ServiceOffer
+from sidecar.core.events import WithdrawService
+from sidecar.core.offers import WITHDRAW_AFTER_S
 from sidecar.core.redundancy_mode import RedundancyMode
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 from tests.sim.test_mesh import call_at, mapped
@@ -50,3 +52,21 @@ def test_requests_of_a_time_without_servers_are_answered_by_the_first_that_comes
     lost = 0 if known_dead or idempotent else 20  # what the dead one may have run, nobody else may run
     assert len(robot.responses()) >= 20 + waiting - lost
     assert len({answer.request_id for answer in robot.responses()}) == len(robot.responses())
+
+
+def test_the_restart_of_the_only_cloud_costs_no_request() -> None:
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(lifetime_s=30.0),))
+    cloud = mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(1.0)
+    asked = call_at(mesh, robot, 20, 1.0)
+    cloud.alive = False
+    asked += call_at(mesh, robot, 20, 1.0)
+    mesh.push_views()
+    asked += call_at(mesh, robot, 20, WITHDRAW_AFTER_S / 2)
+    cloud.start()
+    mesh.push_views()
+    asked += call_at(mesh, robot, 20, 2.0)
+    assert len(robot.responses()) == asked
+    assert not [event for event in robot.events if isinstance(event, WithdrawService)]

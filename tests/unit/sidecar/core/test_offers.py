@@ -78,11 +78,20 @@ def test_light_in_between_starts_the_wait_anew() -> None:
     assert robot.offers.next_timer() == 24.0 + WITHDRAW_AFTER_S
 
 
-def test_when_the_servers_leave_the_offer_goes_at_once() -> None:
+def test_servers_that_leave_may_come_back_for_a_while() -> None:
     robot = Robot(peer(A))
     robot.update()
     robot.offers.set_peers([])
-    assert robot.update(1.1) == [WithdrawService(ECHO, "the last server is gone")]
+    assert robot.update(2.0) == []
+    assert robot.offers.offered == {ECHO: TYPE}
+    robot.offers.set_peers([peer(B, session=2)])
+    assert robot.update(10.0) == []
+    assert robot.offers.next_timer() is None
+    robot.offers.set_peers([])
+    assert robot.update(20.0) == []
+    assert robot.offers.next_timer() == 20.0 + WITHDRAW_AFTER_S
+    assert robot.update(20.0 + WITHDRAW_AFTER_S) == [WithdrawService(ECHO, "no server for 15 s")]
+    assert robot.offers.next_timer() is None
 
 
 def test_a_draining_server_gets_requests_only_where_there_is_no_other() -> None:
@@ -115,9 +124,10 @@ def test_when_the_type_changes_the_old_offer_goes_and_the_new_one_comes() -> Non
     robot = Robot(peer(A))
     robot.update()
     robot.offers.set_peers([peer(A, offers=OTHER_TYPE)])
-    withdrawn, offered = robot.update()
-    assert isinstance(withdrawn, WithdrawService)
-    assert offered == OfferService(ECHO, "t/srv/Other")
+    assert robot.update() == [
+        WithdrawService(ECHO, "its servers offer it as t/srv/Other now"),
+        OfferService(ECHO, "t/srv/Other"),
+    ]
 
 
 def test_a_service_gains_each_new_server_once() -> None:
