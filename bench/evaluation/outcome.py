@@ -95,8 +95,15 @@ class Outcome:
         """Write it to FOLDER/SCENARIO/CONTENDER.json; returns the file."""
         file = folder / self.scenario / f"{self.contender}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps({**asdict(self), "figures": asdict(self.figures())}) + "\n", encoding="utf-8")
+        file.write_text(self.text(), encoding="utf-8")
         return file
+
+    def text(self) -> str:
+        """What `write` writes; times to the microsecond."""
+        requests = [
+            {name: None if at is None else round(at, 6) for name, at in asdict(one).items()} for one in self.requests
+        ]
+        return json.dumps({**asdict(self), "requests": requests, "figures": asdict(self.figures())}) + "\n"
 
     @classmethod
     def read(cls, file: Path) -> Self:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 RESULTS = Path("docs/results")
-DATA, SUMMARY = "evaluation.json", "evaluation.md"
+DATA, SUMMARY, RECORDS = "evaluation.json", "evaluation.md", "records.tar.xz"
 PAGES = ("README.md", "docs/*.md")
 FILES = "files"
 """Key of the data under which each other published file has its hash, so that an edited one is noticed."""
@@ -53,15 +53,17 @@ def filled(text: str, blocks: Mapping[str, str]) -> str:
     return _BLOCK.sub(lambda found: f"{found[1]}\n{blocks[found[2]]}\n\n{found[4]}", text)
 
 
-def publish(root: Path, content: Mapping[str, Any], summary: str, charts: Mapping[str, bytes]) -> list[Written]:
-    """Write an evaluation into a checkout; `charts` by their paths beside the summary.
+def publish(
+    root: Path, content: Mapping[str, Any], summary: str, charts: Mapping[str, bytes], records: bytes
+) -> list[Written]:
+    """Write an evaluation into a checkout; `charts` by their paths beside the summary, `records` packed.
 
     Raises ValueError, before anything is written, when the checkout has no pages to take the figures or a page's marks
     are wrong; names the page.
     """
     blocks = all_blocks(content)
     texts = _filled_pages(root, blocks)
-    others = {SUMMARY: summary.encode(), **charts}
+    others = {SUMMARY: summary.encode(), RECORDS: records, **charts}
     data = {**content, FILES: {name: hashlib.sha256(data).hexdigest() for name, data in others.items()}}
     folder = root / RESULTS
     for old in folder.glob("*/*.svg"):
@@ -72,7 +74,11 @@ def publish(root: Path, content: Mapping[str, Any], summary: str, charts: Mappin
     for file, text in texts.items():
         file.write_text(text, encoding="utf-8")
     size = sum(map(len, charts.values())) // 1000
-    about = {DATA: f"{len(content['runs'])} windows", SUMMARY: f"{len(charts)} charts beside it, {size} kB"}
+    about = {
+        DATA: f"{len(content['runs'])} windows",
+        SUMMARY: f"{len(charts)} charts beside it, {size} kB",
+        RECORDS: f"{len(records) // 1000} kB",
+    }
     return [
         *(Written(folder / name, text) for name, text in about.items()),
         *(Written(file, _counted(text)) for file, text in texts.items()),

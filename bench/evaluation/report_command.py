@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from bench.evaluation import page, publish, report, summary
+from bench.evaluation import archive, page, publish, report, summary
 from bench.evaluation.measured import Measured
 from bench.evaluation.targets import TARGETS
 from bench.reporting.terminal import show_verdicts
@@ -95,7 +95,7 @@ def write(
         console.print(f"not measured: {', '.join(missing)}")
     console.print(f"written: {', '.join(str(folder / name) for name in (DATA, PAGE, SUMMARY))}")
     if checkout is not None:
-        for one in publish.publish(checkout, content, text, drawn):
+        for one in publish.publish(checkout, content, text, drawn, archive.pack(outcomes, report.RUNS)):
             console.print(f"published: {one.file}: {one.about}")
 
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tarfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from bench.evaluation import publish
+from bench.evaluation.archive import pack
 from bench.evaluation.blocks import NOTHING, all_blocks
 from bench.evaluation.measured import Measured
-from bench.evaluation.report import as_json
+from bench.evaluation.report import RUNS, as_json, read_records
 from tests.unit.bench.evaluation_records import drive, run
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[3]
 RESULTS = ROOT / publish.RESULTS
 SVG = {"evaluation-charts/modes.svg": b"<svg/>"}
+RECORDS = b"records"
 
 
 def committed() -> dict[str, Any]:
@@ -66,11 +69,11 @@ def test_the_pages_have_a_place_for_every_figure(tmp_path: Path) -> None:
     for file, text in publish.pages(ROOT).items():
         (tmp_path / file.relative_to(ROOT)).parent.mkdir(exist_ok=True)
         (tmp_path / file.relative_to(ROOT)).write_text(text)
-    written = publish.publish(tmp_path, content(*evaluation()), "summary", SVG)
+    written = publish.publish(tmp_path, content(*evaluation()), "summary", SVG, RECORDS)
     about = {one.file.relative_to(tmp_path).as_posix(): one.about for one in written}
     assert about["README.md"].endswith("figures in drives")
     assert about["docs/results/evaluation.md"] == "1 charts beside it, 0 kB"
-    assert publish.publish(tmp_path, content(*evaluation()), "summary", SVG) == written
+    assert publish.publish(tmp_path, content(*evaluation()), "summary", SVG, RECORDS) == written
 
 
 def test_blocks_show_the_figures_of_the_data() -> None:
@@ -103,16 +106,25 @@ def test_blocks_show_the_figures_of_the_data() -> None:
 def test_nothing_is_published_where_the_marks_are_wrong(tmp_path: Path, page: str, told: str) -> None:
     root = checkout(tmp_path, page)
     with pytest.raises(ValueError, match=told):
-        publish.publish(root, content(*evaluation()), "summary", {})
+        publish.publish(root, content(*evaluation()), "summary", {}, RECORDS)
     assert (root / "README.md").read_text() == page
     assert not (root / publish.RESULTS).exists()
 
 
 def test_charts_that_are_no_more_are_removed(tmp_path: Path) -> None:
     root = checkout(tmp_path)
-    publish.publish(root, content(*evaluation()), "summary", {"evaluation-charts/old.svg": b"", **SVG})
-    publish.publish(root, content(*evaluation()), "summary", SVG)
+    publish.publish(root, content(*evaluation()), "summary", {"evaluation-charts/old.svg": b"", **SVG}, RECORDS)
+    publish.publish(root, content(*evaluation()), "summary", SVG, RECORDS)
     assert [file.name for file in (root / publish.RESULTS).glob("*/*")] == ["modes.svg"]
     data = json.loads((root / publish.RESULTS / publish.DATA).read_text())
     assert data[publish.FILES]["evaluation.md"] == hashlib.sha256(b"summary").hexdigest()
+    assert data[publish.FILES][publish.RECORDS] == hashlib.sha256(RECORDS).hexdigest()
     assert all_blocks(data)["drives"] in (root / "README.md").read_text()
+
+
+def test_published_records_give_the_same_report(tmp_path: Path) -> None:
+    (tmp_path / "packed.tar.xz").write_bytes(pack(evaluation(), RUNS))
+    with tarfile.open(tmp_path / "packed.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    assert content(*read_records(tmp_path)) == content(*evaluation())
+    assert pack(read_records(tmp_path), RUNS) == pack(reversed(evaluation()), RUNS)
