@@ -114,6 +114,23 @@ def test_sudden_misses_are_the_interfaces_unless_the_server_explains_them(
     assert (miss(estimator, B, 40.0) > 0.5) == interface_is_bad
 
 
+def test_while_a_server_answers_oddly_its_misses_are_not_the_interfaces(estimator: Estimator) -> None:
+    """From its many answers to others it is known too well for a few odd ones to explain the misses."""
+    network = histogram(0.02, times=5)
+    to_others = Report((latency("wlan0", "cloud-a", network, processing=histogram(0.01, times=100)),))
+    usual = latency("wlan0", "cloud-a", network, processing=histogram(0.01, times=5))
+    of_b = latency("wwan0", "cloud-b", histogram(), processing=histogram(0.01))
+    near_b = path("wlan0", "cloud-b", rtt=histogram(0.02))
+    for second in range(30):
+        estimator.merge(NodeName("other"), to_others, float(second))
+        estimator.merge(ROBOT, Report((usual, of_b), (near_b,)), float(second))
+    known = miss(estimator, A, 29.9), miss(estimator, B, 29.9)
+    odd = replace(latency("wlan0", "cloud-a", network, processing=histogram(0.5, times=5)), missed=5)
+    estimator.merge(ROBOT, Report((odd,), (near_b,)), 30.0)
+    assert miss(estimator, A, 30.0) > 2 * known[0]
+    assert miss(estimator, B, 30.0) == pytest.approx(known[1], rel=0.1)
+
+
 def test_a_servers_last_answers_are_odd_until_it_answers_as_usual() -> None:
     times = compute_module.ComputeTimes(half_life_s=60.0)
     found = []
