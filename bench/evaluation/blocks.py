@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from bench.evaluation import repeats
+from bench.evaluation.comparison import DIRECT
 from bench.evaluation.others import BETTER_DIRECT, OTHERS, PLR
 from bench.evaluation.outcome import UNANSWERED_S
 from bench.evaluation.repeats import Repeat, Repeats
+from bench.evaluation.studies import CASES
 from bench.evaluation.targets import TARGETS
 from bench.reporting.tables import Table, table_as_markdown
 
@@ -21,7 +23,7 @@ NOTHING = "Not measured yet."
 DRIVES = "a-recorded"
 """The study of recorded drives."""
 LIKE = {
-    BETTER_DIRECT: "ROS 2 over the better carrier of each drive, chosen afterwards",
+    BETTER_DIRECT: "ROS 2 over the better path of each window, chosen afterwards",
     "mptcp": "`mptcp`: the kernel's multipath TCP",
     "zenoh": "`zenoh` over both, first reply",
     "zenoh-drop": "`zenoh-drop`: the same, dropping what finds its queue full",
@@ -53,6 +55,21 @@ def _drives(content: Content) -> str:
             f"{gains[1]} times (medians of the {counted})."
         )
     return text
+
+
+def _cases(content: Content) -> str:
+    studies = {name: one for name, one in content.get("studies", _NOTHING).items() if name != DRIVES and one["windows"]}
+    if not studies:
+        return NOTHING
+    columns = ("", "windows", "", "missed", "mean", "P99", "kB a request")
+    rows = []
+    for study, one in studies.items():
+        case, _, stem = study.partition("-")
+        shown = [name for name in one["contenders"] if name not in DIRECT]
+        for number, name in enumerate(shown):
+            about = (f"{case.upper()}: {CASES[case.upper()]}, {stem}", len(one["windows"])) if number == 0 else ("", "")
+            rows.append((*about, _label(name), *_figures(one["contenders"][name])))
+    return f"{_UNANSWERED} P99 is of all requests.\n\n{table_as_markdown(Table('', columns, tuple(rows)))}"
 
 
 def _others(content: Content) -> str:
@@ -160,6 +177,7 @@ _BLOCKS: dict[str, Callable[[Content], str]] = {
     "others": _others,
     "measured": _measured,
     "verdicts": _verdicts,
+    "cases": _cases,
     "paper": _paper,
     "reproduced": _reproduced,
     "modes": _modes,

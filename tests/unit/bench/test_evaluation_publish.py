@@ -81,7 +81,7 @@ def test_blocks_show_the_figures_of_the_data() -> None:
     blocks = all_blocks(content(*evaluation(), again=again))
     drives = blocks["drives"]
     assert "1 drives, 100 requests each" in drives
-    assert "| ROS 2 over the better carrier of each drive, chosen afterwards | 20.0 % | 480 ms | 2.0 s |" in drives
+    assert "| ROS 2 over the better path of each window, chosen afterwards | 20.0 % | 480 ms | 2.0 s |" in drives
     assert "| `plr-replicate` | 1.0 % | 119 ms | 100 ms | 200 |" in drives
     assert "is 4.03 times lower than that of the better direct run, its P99 20 times" in drives
     assert "zenoh" not in drives, "who did not run has no row"
@@ -92,6 +92,18 @@ def test_blocks_show_the_figures_of_the_data() -> None:
     assert "| driving, mean | 2.73, 1.9 | 7.23, 4.03 | 1 |" in blocks["paper"]
     assert "| a-recorded, plr-replicate: mean gain | 4.03 | 3.48 | 14 % |" in blocks["reproduced"]
     assert blocks["budgets"] == blocks["fallback"] == NOTHING
+
+
+def test_other_cases_have_a_table_of_their_own() -> None:
+    late = {"direct-a": 60, "direct-b": 40, "plr-replicate": 2, "ideal": 1}
+    wifi = [run(name, scenario=f"two-wifi-{n}", case="C", late=count) for n in (1, 2) for name, count in late.items()]
+    table = all_blocks(content(*evaluation(), *wifi))["cases"]
+    assert (
+        "| C: two Wi-Fi, two-wifi | 2 | ROS 2 over the better path of each window, chosen afterwards | 40.0 %" in table
+    )
+    assert "|  |  | `plr-replicate` | 2.0 % |" in table
+    assert "direct-a" not in table
+    assert "A: driving" not in table
 
 
 @pytest.mark.parametrize(
