@@ -40,7 +40,7 @@ missing_packages() {
   local python=$1 pair
   local tools=(
     cmake:cmake g++:g++                       # interface package
-    nft:nftables ip:iproute2 ping:iputils-ping # network lab
+    nft:nftables ip:iproute2 ping:iputils-ping ethtool:ethtool # network lab
     unshare:util-linux flock:util-linux capsh:libcap2-bin
     iperf3:iperf3                             # benchmarks: a TCP flow at the same bottleneck
     turnserver:coturn turnutils_stunclient:coturn # third-party STUN

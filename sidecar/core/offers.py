@@ -59,8 +59,10 @@ class Offers:
             if name not in reached:
                 since = self._dark_since.setdefault(name, now)
                 if since + WITHDRAW_AFTER_S <= now:
-                    what = "path to a server" if name in self._wanted else "server"
-                    events.append(self._withdraw(name, f"no {what} for {WITHDRAW_AFTER_S:.0f} s"))
+                    seconds = f"{WITHDRAW_AFTER_S:.0f} s"
+                    dark = name in self._wanted
+                    why = f"no path to a server for {seconds}" if dark else f"no live server for {seconds}"
+                    events.append(self._withdraw(name, why))
             elif reached[name] != kind:
                 events.append(self._withdraw(name, f"its servers offer it as {reached[name]} now"))
         for name, kind in reached.items():

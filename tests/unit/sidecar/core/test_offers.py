@@ -90,7 +90,7 @@ def test_servers_that_leave_may_come_back_for_a_while() -> None:
     robot.offers.set_peers([])
     assert robot.update(20.0) == []
     assert robot.offers.next_timer() == 20.0 + WITHDRAW_AFTER_S
-    assert robot.update(20.0 + WITHDRAW_AFTER_S) == [WithdrawService(ECHO, "no server for 15 s")]
+    assert robot.update(20.0 + WITHDRAW_AFTER_S) == [WithdrawService(ECHO, "no live server for 15 s")]
     assert robot.offers.next_timer() is None
 
 
