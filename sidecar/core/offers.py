@@ -33,6 +33,7 @@ class Offers:
         self._wanted: dict[ServiceName, tuple[str, tuple[NodeName, ...]]] = {}
         """Service -> (type, servers), as the peers offer it."""
         self._gained: set[ServiceName] = set()
+        """Of the wanted ones, those that got another server since somebody asked."""
         self._dark_since: dict[ServiceName, float] = {}
         self.conflicts: set[tuple[ServiceName, NodeName, str]] = set()
         """Servers left out because they offer another type than the rest."""
@@ -111,6 +112,7 @@ class Offers:
             self._wanted[name] = (kind, servers)
             if name not in before or not set(servers) <= set(before[name][1]):
                 self._gained.add(name)
+        self._gained &= self._wanted.keys()  # a cloud's sidecar never asks
 
     def take_gained(self) -> set[ServiceName]:
         """Return the services that got another server since the last call."""

@@ -141,3 +141,6 @@ def test_a_service_gains_each_new_server_once() -> None:
     assert robot.offers.take_gained() == set()
     robot.offers.set_peers([peer(A, draining=True)])
     assert robot.offers.take_gained() == {ECHO}
+    robot.offers.set_peers([peer(B, session=2)])
+    robot.offers.set_peers([])
+    assert robot.offers.take_gained() == set(), "a service that nobody offers any more has not gained"
