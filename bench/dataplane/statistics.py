@@ -25,6 +25,12 @@ def median(values: Iterable[float | None]) -> float | None:
     return statistics.median(known) if known else None
 
 
+def geometric_mean(values: Iterable[float | None]) -> float | None:
+    """Geometric mean of what was measured; None when nothing was, or something is not above zero."""
+    known = [value for value in values if value is not None]
+    return statistics.geometric_mean(known) if known and min(known) > 0 else None
+
+
 def ratio(one: float | None, other: float | None) -> float | None:
     """`one` over `other`; None unless both were measured and `other` is above zero."""
     return one / other if one is not None and other else None

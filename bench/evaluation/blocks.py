@@ -113,7 +113,7 @@ def _paper(content: Content) -> str:
     columns = (
         "times lower than over a single path",
         "paper: worse path, better path",
-        "ours, median window: worse, better",
+        "ours, mean of windows: worse, better",
         "windows",
         "ours, all requests: worse, better",
         "windows",

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, Report, Role, ServiceUse
-from sidecar.core.events import ApplicationEvent, ExecutionId, RejectReason, RequestFailed, RequestId
+from sidecar.core.events import (
+    ApplicationEvent,
+    ExecutionId,
+    RejectReason,
+    RequestFailed,
+    RequestId,
+    WithdrawService,
+)
 from sidecar.core.inbound import Decoding, Inbound
 from sidecar.core.link_events import (
     FinishedLost,
@@ -358,7 +365,10 @@ class Engine:
 
     def _update_offers(self, now: float) -> None:
         if self._config.role is Role.ROBOT:
-            self._events.extend(self._offers.update(self.routes, now))
+            for event in self._offers.update(self.routes, now):
+                if isinstance(event, WithdrawService):
+                    self._requests.on_withdrawn(event.name, event.reason, now)
+                self._events.append(event)
             gained = self._offers.take_gained()
             if gained:
                 self._requests.on_servers_gained(gained, now)

@@ -1,8 +1,9 @@
 """Robot side: which services exist on the robot, following the live servers.
 
 A service is offered from its first server within reach on. When there is none any more, as all paths are dark or as the
-servers themselves are gone, the offer stays for WITHDRAW_AFTER_S: they may be in a tunnel or restarting, and requests
-wait for the first that comes back. With the offer go the requests that wait at it.
+servers themselves are gone, the offer stays for WITHDRAW_AFTER_S, or for the lifetime of a request where that is longer:
+they may be in a tunnel or restarting, and requests wait for the first that comes back. With the offer end the requests
+that still wait at it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class Offers:
         """Service -> (type, servers), as the peers offer it."""
         self._gained: set[ServiceName] = set()
         """Of the wanted ones, those that got another server since somebody asked."""
-        self._dark_since: dict[ServiceName, float] = {}
+        self._dark_until: dict[ServiceName, float] = {}
+        """Service without a server in reach -> when its offer ends."""
         self.conflicts: set[tuple[ServiceName, NodeName, str]] = set()
         """Servers left out because they offer another type than the rest."""
 
@@ -58,16 +60,16 @@ class Offers:
         events: list[OfferService | WithdrawService] = []
         for name, kind in list(self._offered.items()):
             if name not in reached:
-                since = self._dark_since.setdefault(name, now)
-                if since + WITHDRAW_AFTER_S <= now:
-                    seconds = f"{WITHDRAW_AFTER_S:.0f} s"
+                patience_s = self._patience_s(name)
+                if self._dark_until.setdefault(name, now + patience_s) <= now:
+                    seconds = f"{patience_s:g} s"
                     dark = name in self._wanted
                     why = f"no path to a server for {seconds}" if dark else f"no live server for {seconds}"
                     events.append(self._withdraw(name, why))
             elif reached[name] != kind:
                 events.append(self._withdraw(name, f"its servers offer it as {reached[name]} now"))
         for name, kind in reached.items():
-            self._dark_since.pop(name, None)
+            self._dark_until.pop(name, None)
             if name not in self._offered:
                 self._offered[name] = kind
                 events.append(OfferService(name, kind))
@@ -75,8 +77,12 @@ class Offers:
 
     def _withdraw(self, name: ServiceName, reason: str) -> WithdrawService:
         del self._offered[name]
-        self._dark_since.pop(name, None)
+        self._dark_until.pop(name, None)
         return WithdrawService(name, reason)
+
+    def _patience_s(self, name: ServiceName) -> float:
+        rule = find_rule(self._rules, name)
+        return max(WITHDRAW_AFTER_S, rule.lifetime_s) if rule else WITHDRAW_AFTER_S
 
     def uses(self, carried: Mapping[ServiceName, bool | None]) -> tuple[ServiceUse, ...]:
         """Return the offered services of these, as the control plane is told of them.
@@ -120,5 +126,5 @@ class Offers:
         return gained
 
     def next_timer(self) -> float | None:
-        """When the oldest darkness ends an offer."""
-        return min(self._dark_since.values()) + WITHDRAW_AFTER_S if self._dark_since else None
+        """When the first darkness ends an offer."""
+        return min(self._dark_until.values(), default=None)

@@ -245,6 +245,12 @@ class RequestTable:
             if request.service in services and not request.done and not request.answered_here:
                 self._reconsider(request, now)
 
+    def on_withdrawn(self, service: ServiceName, reason: str, now: float) -> None:
+        """The service is not offered here any more: what waits gets no answer, and is told so now."""
+        for request in list(self._requests.values()):
+            if request.service == service and not request.done:
+                self._end(request, f"withdrawn: {reason}", now)
+
     def _reconsider(self, request: Request, now: float) -> None:
         """There is one more way to a server: send what had none, or whose copies are all in trouble."""
         if request.copies:
@@ -323,13 +329,16 @@ class RequestTable:
             self._parts.measurements.lost(request.carried(copy), delivered=delivered)
 
     def _expire(self, request: Request, now: float) -> None:
+        why = "no answer" if request.copies else "no path to any server"
+        self._end(request, f"{why} within {request.rule.lifetime_s:g} s", now)
+
+    def _end(self, request: Request, reason: str, now: float) -> None:
         for copy in request.pending():
             copy.state = CopyState.DEAD
             self._lost(request, copy, delivered=copy.message.newest.over)
             self._parts.outbox.drop(copy.message)
         if not request.done:
-            why = "no answer" if request.copies else "no path to any server"
-            self._fail(request, "failed", f"{why} within {request.rule.lifetime_s:g} s", now)
+            self._fail(request, "failed", reason, now)
         self._settle(request, now)
 
     def _fail(self, request: Request, outcome: str, reason: str, now: float) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import ServiceOffer
-from sidecar.core.events import WithdrawService
+from sidecar.core.events import RequestFailed, WithdrawService
 from sidecar.core.offers import WITHDRAW_AFTER_S
 from sidecar.core.redundancy_mode import RedundancyMode
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
@@ -70,3 +70,39 @@ def test_the_restart_of_the_only_cloud_costs_no_request() -> None:
     asked += call_at(mesh, robot, 20, 2.0)
     assert len(robot.responses()) == asked
     assert not [event for event in robot.events if isinstance(event, WithdrawService)]
+
+
+def test_what_waits_when_a_long_tunnel_begins_has_its_whole_lifetime() -> None:
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(lifetime_s=30.0),))
+    cloud = mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(1.0)
+    cloud.alive = False
+    asked = call_at(mesh, robot, 5, 1.0)
+    mesh.run(WITHDRAW_AFTER_S + 8.0)
+    cloud.start()
+    mesh.push_views()
+    mesh.run(2.0)
+    assert len(robot.responses()) == asked
+
+
+@pytest.mark.parametrize("mode", RedundancyMode)
+def test_what_waits_at_a_withdrawn_service_fails_with_it_and_once(mode: RedundancyMode) -> None:
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(redundancy=mode),))
+    cloud = mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(1.0)
+    answered = call_at(mesh, robot, 5, 1.0)
+    cloud.alive = False
+    asked = call_at(mesh, robot, 40, WITHDRAW_AFTER_S + 3.0)
+    withdrawn = next(n for n, event in enumerate(robot.events) if isinstance(event, WithdrawService))
+    failed = [n for n, event in enumerate(robot.events) if isinstance(event, RequestFailed)]
+    at_once = [event for event in robot.events if isinstance(event, RequestFailed) and "withdrawn" in event.reason]
+    assert len(at_once) >= 5
+    assert [n for n in failed if n < withdrawn][-len(at_once) :] == list(range(withdrawn - len(at_once), withdrawn))
+    mesh.run(30.0)
+    ended = [event.request_id for event in robot.events if isinstance(event, RequestFailed)]
+    assert len(robot.responses()) == answered
+    assert len(ended) == len(set(ended)) == asked

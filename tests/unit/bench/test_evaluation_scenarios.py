@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.evaluation.comparison import Comparison, compare, gains
+from bench.evaluation.comparison import Comparison, compare, gains, hard_windows, over_direct
 from bench.evaluation.ideal import compute
 from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request, figures_by_window
 from bench.evaluation.scenario import read_scenarios
@@ -168,8 +168,25 @@ def test_a_contender_is_compared_with_the_better_direct_run_and_the_ideal() -> N
     assert "ideal" not in found["hard"]
     assert found["easy"]["ours"].p99_gain == pytest.approx(4.0)
     assert found["void"]["ours"] == Comparison(None, None, None, None)
-    medians = gains(figures_by_window([*hard, *easy, *void]))
-    assert list(medians) == ["ours"]
-    assert asdict(medians["ours"]) == pytest.approx(
-        {"windows": 1, "mean_gain": 4.0, "p99_gain": 5.0, "mean_over_worse": 17.0, "p99_over_worse": 25.0}
+    gained = gains(figures_by_window([*hard, *easy, *void]))
+    assert list(gained) == ["ours"]
+    assert asdict(gained["ours"]) == pytest.approx(
+        {"windows": 1, "mean_gain": 4.0, "p99_gain": 5.0, "median_mean_gain": 4.0, "median_p99_gain": 5.0}
     )
+
+
+def test_gains_are_averaged_geometrically_and_the_medians_beside() -> None:
+    directs = ((0.8, 1.6), (3.2, 1.2), (4.0, 3.6))
+    windows = figures_by_window(
+        [
+            ran(f"window-{number}", name, latency_s)
+            for number, (a, b) in enumerate(directs)
+            for name, latency_s in (("direct-a", a), ("direct-b", b), ("ours", 0.4))
+        ]
+    )
+    gained = gains(windows)["ours"]
+    assert gained.windows == 3
+    assert gained.mean_gain == pytest.approx((2 * 3 * 9) ** (1 / 3))
+    assert gained.median_mean_gain == pytest.approx(3)
+    hard = hard_windows(windows.values(), "ours")
+    assert over_direct(hard, "ours", "p99_ms", max) == pytest.approx([4, 8, 10])

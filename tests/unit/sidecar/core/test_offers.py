@@ -13,9 +13,9 @@ OTHER_TYPE = (ServiceOffer(ECHO, "t/srv/Other"),)
 class Robot:
     """Offers over routes that the test sets."""
 
-    def __init__(self, *peers: Peer) -> None:
+    def __init__(self, *peers: Peer, lifetime_s: float = 10.0) -> None:
         self.routes = Routes()
-        self.offers = Offers((rule(ECHO),))
+        self.offers = Offers((rule(ECHO, lifetime_s=lifetime_s),))
         for known in (A, B):
             self.reach(known)
         self.offers.set_peers(list(peers))
@@ -62,6 +62,16 @@ def test_darkness_is_outlasted_for_a_while_then_ends_the_offer() -> None:
     assert robot.offers.next_timer() is None, "a timer that nothing clears would spin"
     robot.reach(A)
     assert robot.update(99.0) == [OfferService(ECHO, TYPE)]
+
+
+def test_an_offer_outlasts_what_waited_when_darkness_fell() -> None:
+    robot = Robot(peer(A), lifetime_s=40.0)
+    robot.update()
+    robot.reach(A, PathState.DOWN)
+    assert robot.update(10.0) == []
+    assert robot.offers.next_timer() == 50.0
+    assert robot.update(49.9) == []
+    assert robot.update(50.0) == [WithdrawService(ECHO, "no path to a server for 40 s")]
 
 
 def test_light_in_between_starts_the_wait_anew() -> None:
