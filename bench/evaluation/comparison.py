@@ -39,8 +39,8 @@ class Comparison:
 class Gains:
     """How many times lower one contender's figures are than the better direct run's, over windows.
 
-    The mean of ratios is the geometric one. It moves less than their median from one evaluation to the next: with a dozen
-    windows the median is what the two in the middle happened to do.
+    The mean of ratios is the geometric one. It moves less than their median from one evaluation to the next: with a
+    dozen windows the median is what the two in the middle happened to do.
     """
 
     windows: int
@@ -73,7 +73,10 @@ def hard_windows(windows: Iterable[Mapping[str, Figures]], contender: str) -> li
 
 
 def over_direct(
-    windows: Iterable[Mapping[str, Figures]], contender: str, figure: str, direct: Callable[[Iterable[float]], float] = min
+    windows: Iterable[Mapping[str, Figures]],
+    contender: str,
+    figure: str,
+    direct: Callable[[Iterable[float]], float] = min,
 ) -> list[float | None]:
     """In each window, how many times lower a figure is than that of the better direct run; `direct=max`: the worse."""
     value = attrgetter(figure)

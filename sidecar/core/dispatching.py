@@ -70,7 +70,7 @@ class Dispatching:
             self._send_best(request, self._best_first(request, chosen, now), now)
         if servers and not request.copies:
             self._parts.seek(frozenset(servers))
-        look_at = self._first_look(request, now)
+        look_at = self.first_look(request, now)
         unmapped = self._exploration.path(request, servers, now)
         if unmapped is not None:
             self._send(request, unmapped, now, _Why.EXPLORATION)
@@ -99,14 +99,16 @@ class Dispatching:
 
         return sorted(paths, key=order)
 
-    def _first_look(self, request: Request, now: float) -> float | None:
-        if not request.copies or now >= request.deadline_at or not request.rule.redundancy.helps:
+    def first_look(self, request: Request, now: float) -> float | None:
+        """Return when `look_again` is wanted at a request one copy of which was just sent, if at all."""
+        waiting = request.relied_on()
+        if not waiting or now >= request.deadline_at or not request.rule.redundancy.helps:
             return None
         if request.rule.redundancy is RedundancyMode.ADAPTIVE:
             return self._adapt(request, now)
         half = request.submitted_at + HEDGE_AT * request.rule.deadline_s
         if request.rule.redundancy is RedundancyMode.HEDGE:
-            path, quantile = request.copies[0].path, request.rule.hedge_quantile
+            path, quantile = waiting[0].path, request.rule.hedge_quantile
             delay_s = self._records.quantile_s(request.service, path, quantile, now)
             return half if delay_s is None else min(now + delay_s, half)
         return half if request.rule.idempotent and len(request.asked()) == 1 else None

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
-from protos.model import MappingSet, PeerSet, Report, Role, ServiceUse
+from protos.model import MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.events import (
     ApplicationEvent,
     ExecutionId,
@@ -200,11 +200,15 @@ class Engine:
             self._outbox.on_interface_gone(interface, now)
             for path in paths:
                 self._requests.on_path_changed(path, PathState.DOWN, now)
+                if not self.routes.reaches(path.peer):
+                    self._drop_if_unlisted(path.peer, now)
+        self._update_offers(now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def apply_peers(self, peer_set: PeerSet, now: float) -> str | None:
         """Take a view of the peers; returns why it is refused, or None."""
         before = {peer.name: peer.session for peer in self.peers.all()}
+        left = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
         error = self.peers.apply(peer_set, self.routes.reaches)
         if error:
             self.stats.nacks += 1
@@ -213,7 +217,8 @@ class Engine:
         self._offers.set_peers(self.peers.all())
         for name, session in before.items():
             if self.peers.session(name) != session:
-                self._end_session(name, now)
+                over = name in self.peers or name in left or name in self.peers.refused
+                self._end_session(name, now, may_return=not over)
         self._commands.append((None, SetPeers(self.peers.for_links())))
         self._update_offers(now)
         return None
@@ -268,6 +273,7 @@ class Engine:
                 self._outbox.on_forgotten(peer, number)
             case MessageFinished(peer, number):
                 self._outbox.on_finished(peer, number)
+                self._requests.on_room(now)
             case FinishedLost(path, numbers) if path.peer in self.peers:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
             case FragmentsLost():
@@ -286,11 +292,11 @@ class Engine:
                 pass  # of a peer that left, or an interface that went, a moment ago
             case PeerRestarted():
                 if self.peers.restarted(event, now):
-                    self._serving.on_session_over(event.peer)
                     self._end_session(event.peer, now)
                     self._commands.append((None, SetPeers(self.peers.for_links())))
-            case PeerClosed(peer):
-                self._on_peer_closed(peer, now)
+            case PeerClosed(peer, session):
+                if self.peers.session(peer) == session:
+                    self._on_peer_closed(peer, now)
         self.stats.in_flight = self._requests.unanswered + self._serving.running
 
     def _is_current(self, path: PathId, session: SessionId) -> bool:
@@ -343,7 +349,7 @@ class Engine:
         """The last path to a peer died, and it may have been kept for its paths only."""
         if self.peers.drop_if_unlisted(name):
             self._offers.set_peers(self.peers.all())
-            self._end_session(name, now)
+            self._end_session(name, now, may_return=True)
             self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def _on_peer_closed(self, name: NodeName, now: float) -> None:
@@ -356,7 +362,10 @@ class Engine:
         self._requests.on_peer_gone(name, now)
         self._drop_if_unlisted(name, now)
 
-    def _end_session(self, name: NodeName, now: float) -> None:
+    def _end_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
+        """`may_return`: it was only silent for long, and may be back with the same session, for its answers."""
+        if not may_return:
+            self._serving.on_session_over(name)
         self._inbound.forget_peer(name)
         self._outbox.drop_peer(name)
         self.routes.forget_peer(name)
@@ -387,6 +396,7 @@ class Engine:
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
             self._outbox.expire(now)
+            self._requests.on_room(now)
             self._inbound.expire(now)
         dark_until = self._offers.next_timer()
         if dark_until is not None and dark_until <= now:

@@ -243,6 +243,7 @@ class PeerClosed:
     """The peer said goodbye."""
 
     peer: NodeName
+    session: SessionId
 
 
 LinkEvent = (

@@ -173,7 +173,7 @@ class LinkReader:
                     events.append(MessageForgotten(path.peer, number))
                 case frame.Close() if path.state is not PathState.DOWN:
                     self._keeper.take_down(path, "peer closed")
-                    events.append(PeerClosed(path.peer))
+                    events.append(PeerClosed(path.peer, path.session))
                 case frame.Close():
                     pass
         self._stats.datagrams["received", kind] += 1

@@ -1,9 +1,9 @@
 """Robot side: which services exist on the robot, following the live servers.
 
 A service is offered from its first server within reach on. When there is none any more, as all paths are dark or as the
-servers themselves are gone, the offer stays for WITHDRAW_AFTER_S, or for the lifetime of a request where that is longer:
-they may be in a tunnel or restarting, and requests wait for the first that comes back. With the offer end the requests
-that still wait at it.
+servers themselves are gone, the offer stays for WITHDRAW_AFTER_S, or for the lifetime of a request where that is
+longer: they may be in a tunnel or restarting, and requests wait for the first that comes back. With the offer end the
+requests that still wait at it.
 """
 
 from __future__ import annotations

@@ -33,6 +33,7 @@ from sidecar.core.messages import (
     RejectionMessage,
     ResponseMessage,
 )
+from sidecar.core.no_room import NoRoom
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.redundancy_mode import RedundancyMode
 
@@ -59,6 +60,7 @@ class RequestTable:
         self._timers: list[tuple[float, RequestId]] = []
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
+        self._no_room = NoRoom()
         self.unanswered = 0
         self._held_bytes = 0
 
@@ -117,6 +119,30 @@ class RequestTable:
 
     def _dispatch(self, request: Request, now: float) -> None:
         self._look_at(request, self._dispatching.start(request, now))
+        if request.copies:
+            self._no_room.remove(request)
+        elif self._finds_no_room(request):
+            self._no_room.add(request)
+
+    def _finds_no_room(self, request: Request) -> bool:
+        servers = self._parts.offers.servers(request.service)
+        reached = tuple(server for server in servers if self._parts.routes.reaches(server))
+        return bool(reached) and not self._dispatching.with_room(reached, len(request.payload or b""))
+
+    def on_room(self, now: float) -> None:
+        """Less waits to be sent than before: send what found no room, in order of arrival."""
+        for service in self._no_room.services():
+            while (request := self._no_room.first(service)) and not self._finds_no_room(request):
+                self._no_room.remove(request)
+                if not request.answered_here:
+                    self._dispatch(request, now)
+
+    def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
+        """See `Dispatching.rescue`. A copy that is alone is looked at as the first one was."""
+        alone = not request.relied_on()
+        self._dispatching.rescue(request, now, insist=insist, rejected=rejected)
+        if alone and request.relied_on():
+            self._look_at(request, self._dispatching.first_look(request, now))
 
     def _look_at(self, request: Request, when: float | None) -> None:
         if when is not None:
@@ -186,7 +212,7 @@ class RequestTable:
         self._parts.outbox.on_answered(copy.message)
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
         if not request.done:
-            self._dispatching.rescue(request, now, rejected=True)
+            self._rescue(request, now, rejected=True)
             if not request.pending():
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
                 self._fail(request, "rejected", reason, now)
@@ -219,7 +245,7 @@ class RequestTable:
                 copy.message.newest.stand_down()
                 self._lost(request, copy, delivered=True)
             if hit and not request.done:
-                self._dispatching.rescue(request, now)
+                self._rescue(request, now)
                 if not request.pending() and not request.rule.idempotent:
                     self._fail(request, "failed", f"{peer} went away; it may have run the request", now)
             self._settle(request, now)
@@ -234,7 +260,7 @@ class RequestTable:
                 for copy in hit:
                     copy.message.newest.stand_down()
                 if hit:
-                    self._dispatching.rescue(request, now)
+                    self._rescue(request, now)
                 self._notice_unreachable(request)
             else:
                 self._reconsider(request, now)
@@ -254,7 +280,7 @@ class RequestTable:
     def _reconsider(self, request: Request, now: float) -> None:
         """There is one more way to a server: send what had none, or whose copies are all in trouble."""
         if request.copies:
-            self._dispatching.rescue(request, now)
+            self._rescue(request, now)
         else:
             self._dispatch(request, now)
 
@@ -272,7 +298,7 @@ class RequestTable:
                 continue
             waiting = request.relied_on()
             if len(waiting) == 1 and waiting[0].message.newest is message:
-                self._dispatching.rescue(request, now, insist=True)
+                self._rescue(request, now, insist=True)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
@@ -304,7 +330,7 @@ class RequestTable:
             elif not request.missed:
                 self._miss(request)
                 if request.rule.idempotent:
-                    self._dispatching.rescue(request, now, insist=True)
+                    self._rescue(request, now, insist=True)
 
     def _miss(self, request: Request) -> None:
         request.missed = True
@@ -329,7 +355,8 @@ class RequestTable:
             self._parts.measurements.lost(request.carried(copy), delivered=delivered)
 
     def _expire(self, request: Request, now: float) -> None:
-        why = "no answer" if request.copies else "no path to any server"
+        unsent = "no room to send it" if request in self._no_room else "no path to any server"
+        why = "no answer" if request.copies else unsent
         self._end(request, f"{why} within {request.rule.lifetime_s:g} s", now)
 
     def _end(self, request: Request, reason: str, now: float) -> None:
@@ -348,6 +375,7 @@ class RequestTable:
 
     def _finish(self, request: Request, outcome: str) -> None:
         request.done = True
+        self._no_room.remove(request)
         self._held_bytes -= len(request.payload or b"")
         request.payload = None
         self.unanswered -= 1

@@ -113,11 +113,11 @@ class RobotSide:
                 self._fail(event, now)
             case OfferService():
                 self._proxies.offer(event)
-                self._publish_carried()
+                self._uses_changed()
                 self.look_is_due = True
             case WithdrawService():
                 self._proxies.withdraw(event, self._fallbacks.types())
-                self._publish_carried()
+                self._uses_changed()
             case _:
                 self._stats.dropped["event_for_other_role"] += 1
 
@@ -277,6 +277,11 @@ class RobotSide:
             self._fallbacks.look(served, self._proxies.offers, now)
             self._proxies.look(served, self._fallbacks.types(), now)
             self._publish_carried()
+
+    def _uses_changed(self) -> None:
+        """What is used is what is carried and offered: another offer changes it, also of a service carried before."""
+        self._publish_carried()
+        self._data_plane.set_carried(self._carried)
 
     def _publish_carried(self) -> None:
         carried = {service: self._stats.fallback_up.get(service) for service in self._stats.carried}

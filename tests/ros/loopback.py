@@ -218,6 +218,7 @@ class RobotPlane:
 
     def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
         self._link.carried = frozenset(services)
+        self._link.counts["carried_told"] += 1
 
 
 class CloudPlane:

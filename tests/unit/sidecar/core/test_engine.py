@@ -268,7 +268,7 @@ def test_a_goodbye_ends_the_requests_there_and_leaves_nothing_in_the_outbox() ->
     sidecar = robot()
     sidecar.engine.submit(request_id(1), ECHO, b"", 0.1)
     assert sidecar.engine.busy == 2
-    sidecar.engine.on_link_event(PeerClosed(A), 0.2)
+    sidecar.engine.on_link_event(PeerClosed(A, SessionId(1)), 0.2)
     assert len(sidecar.engine._outbox) == 0
     assert not sidecar.engine.routes.reaches(A)
 
@@ -281,14 +281,14 @@ def test_a_cloud_that_drains_waits_only_for_what_is_awaited() -> None:
     sidecar.receive(CancelMessage(request_id(1)))
     assert sidecar.engine.busy == 1
     sidecar.take()
-    sidecar.engine.on_link_event(PeerClosed(ROBOT), 0.2)
+    sidecar.engine.on_link_event(PeerClosed(ROBOT, SessionId(1)), 0.2)
     _, events = sidecar.take()
     assert [type(event) for event in events] == [CancelExecution]
     assert sidecar.engine.busy == 0
 
 
 def test_a_peer_kept_only_for_its_paths_goes_with_the_last_of_them() -> None:
-    for goes in (PathChanged(path(), PathState.DOWN, ""), PeerClosed(A)):
+    for goes in (PathChanged(path(), PathState.DOWN, ""), PeerClosed(A, SessionId(1))):
         sidecar = robot()
         sidecar.view(version=2)
         assert A in sidecar.engine.peers

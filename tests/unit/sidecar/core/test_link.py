@@ -33,6 +33,7 @@ from tests.unit.sidecar.core.builders import (
     OUR_NAME,
     OUR_SESSION,
     PEER_ADDRESS,
+    PEER_SESSION,
     WLAN,
     A,
     Bench,
@@ -302,7 +303,7 @@ def test_a_peer_that_left_is_forgotten_with_its_timers() -> None:
 def test_goodbye_takes_the_path_down_once_and_a_flood_of_it_is_one() -> None:
     bench = up()
     bench.receive(frame.encode_close() * frame.MAX_FRAMES)
-    assert bench.events() == [PathChanged(PATH, PathState.DOWN, "peer closed"), PeerClosed(A)]
+    assert bench.events() == [PathChanged(PATH, PathState.DOWN, "peer closed"), PeerClosed(A, PEER_SESSION)]
     bench.receive(frame.encode_close())
     assert bench.events() == []
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from sidecar.core.dispatching import MAX_COPIES
 from sidecar.core.events import RejectReason, ResponseArrived
 from sidecar.core.path_id import PathId, PathState
+from sidecar.core.redundancy_mode import RedundancyMode
 from tests.unit.sidecar.core.builders import A, B, request_id
 from tests.unit.sidecar.core.request_table import RACE, SERVERS, WLAN_A, WWAN_B, Table
 
@@ -181,3 +184,23 @@ def test_messages_do_not_hold_each_other_in_memory_when_their_request_is_over() 
     table.table.handle_timer(20.0)
     assert not table.table._requests
     assert shared == []
+
+
+@pytest.mark.parametrize("mode", [RedundancyMode.HEDGE, RedundancyMode.ADAPTIVE, RedundancyMode.REPLICATE])
+def test_a_copy_that_comes_late_as_the_first_one_died_is_looked_at_as_that_one_was(mode: RedundancyMode) -> None:
+    table = Table()
+    table.rule = dataclasses.replace(table.rule, redundancy=mode)
+    table.routes.set_state(WWAN_B, PathState.DOWN)
+    table.submit()
+    assert table.sent() == [WLAN_A]
+    table.routes.set_state(WLAN_A, PathState.DOWN)
+    table.table.on_peer_gone(A, 0.1)
+    table.table.handle_timer(0.55)  # half of the deadline is over: nothing to look at
+    assert table.sent() == []
+    table.change(WLAN_A, PathState.UP, now=0.6)
+    assert table.sent() == [WLAN_A]
+    table.routes.set_state(WWAN_B, PathState.UP)
+    table.outbox.on_finished(A, max(table.outbox._messages))
+    for now in (0.7, 0.8, 0.9, 0.99):
+        table.table.handle_timer(now)
+    assert table.sent() == [WWAN_B], "its server is silent as well"

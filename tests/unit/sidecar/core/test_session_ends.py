@@ -1,0 +1,83 @@
+"""What ends with a session or an interface, and what does not."""
+
+from __future__ import annotations
+
+import pytest
+
+from protos.model import PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
+from sidecar.core.events import CancelExecution, ResponseArrived, WithdrawService
+from sidecar.core.link_events import PeerClosed, PeerRestarted, SetPeers
+from sidecar.core.messages import ResponseMessage
+from sidecar.core.offers import WITHDRAW_AFTER_S
+from sidecar.core.path_id import PathState
+from tests.sessions import credential_of
+from tests.unit.sidecar.core.builders import ECHO, A, peer, request, request_id
+from tests.unit.sidecar.core.test_engine import ROBOT, Sidecar, cloud, robot
+
+
+def cancelled(sidecar: Sidecar) -> int:
+    return sum(isinstance(event, CancelExecution) for event in sidecar.take()[1])
+
+
+def busy_cloud() -> Sidecar:
+    """A robot's request is at the application, or in the queue before it."""
+    sidecar = cloud()
+    sidecar.receive(request(1))
+    sidecar.take()
+    return sidecar
+
+
+@pytest.mark.parametrize(
+    ("reason", "ends"),
+    [(reason, reason is not RemovalReason.LEASE_EXPIRED) for reason in RemovalReason],
+)
+def test_what_a_robot_left_in_the_queue_is_not_run_unless_it_may_come_back_for_it(
+    reason: RemovalReason, ends: bool
+) -> None:
+    sidecar = busy_cloud()
+    sidecar.change(PathState.DOWN)
+    removed = (RemovedPeer(ROBOT, reason),)
+    assert sidecar.engine.apply_peers(PeerSet(Version(2), 1, (), removed), 1.0) is None
+    assert cancelled(sidecar) == ends
+
+
+def test_a_restart_ends_what_was_asked_before_whoever_tells_of_it() -> None:
+    sidecar = busy_cloud()
+    sidecar.view(peer(ROBOT, session=2, incarnation=2), version=2)
+    assert cancelled(sidecar) == 1
+    sidecar = busy_cloud()
+    sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential_of(ROBOT, Role.CLOUD, 2, 2)), 1.0)
+    assert cancelled(sidecar) == 1
+
+
+def test_a_goodbye_of_a_session_that_is_over_says_nothing_of_the_next() -> None:
+    sidecar = robot()
+    sidecar.view(peer(A, session=2, incarnation=2), version=2)
+    sidecar.change(PathState.UP)
+    sidecar.take()
+    sidecar.engine.submit(request_id(1), ECHO, b"", 0.1)
+    sidecar.engine.on_link_event(PeerClosed(A, SessionId(1)), 0.2)
+    assert sidecar.engine.routes.reaches(A)
+    sidecar.receive(ResponseMessage(request_id(1), 0, 0.01, b"answer"), session=2)
+    assert [type(event) for event in sidecar.take()[1]] == [ResponseArrived]
+
+
+@pytest.mark.parametrize("told_first", [True, False])
+def test_an_interface_that_vanishes_is_as_a_path_that_died(told_first: bool) -> None:
+    sidecar = robot()
+    if told_first:
+        sidecar.change(PathState.DOWN, 1.0)
+    sidecar.engine.set_interfaces((), 1.0)
+    assert sidecar.engine.next_timer() <= 1.0 + WITHDRAW_AFTER_S
+    sidecar.engine.handle_timer(1.0 + WITHDRAW_AFTER_S)
+    assert [type(event) for event in sidecar.take()[1]] == [WithdrawService]
+
+
+def test_a_peer_kept_only_for_its_paths_goes_with_the_last_interface() -> None:
+    sidecar = robot()
+    sidecar.view(version=2)
+    assert A in sidecar.engine.peers
+    sidecar.take()
+    sidecar.engine.set_interfaces((), 1.0)
+    assert A not in sidecar.engine.peers
+    assert SetPeers(()) in sidecar.take()[0]
