@@ -210,7 +210,7 @@ class ControlLoop:
         if error.reason == REVOKED:
             self._core.revoke(name, self._loop.time())
         else:
-            self._core.end_stream(name, CloseReason.CERTIFICATE_ENDED)
+            self._core.end_stream(name, CloseReason.CERTIFICATE_ENDED, self._loop.time())
 
     def refused(self, reason: str) -> None:
         """Count a connection or call that was refused or ended, by one of metrics.REFUSAL_REASONS."""

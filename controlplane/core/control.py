@@ -59,7 +59,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from controlplane.core.policy import Policy
-    from controlplane.core.registry import Sidecar
     from protos.explanation import Explanation
     from protos.model import NodeName, ServiceName, SidecarMessage
     from protos.status import SidecarStatus, SyncState
@@ -110,9 +109,7 @@ class ControlCore:
             return result
         self._last_stream = stream
         name = registration.name
-        if result.replaced is not None:
-            self._streams.pop(result.replaced, None)
-            self._events.append(Close(result.replaced, CloseReason.REPLACED))
+        self._close(result.replaced, CloseReason.REPLACED, now)
         self._streams[stream] = name
         if result.new_run:
             self._forget_paths(name)
@@ -202,22 +199,30 @@ class ControlCore:
         sidecar = self.registry.revoke(name)
         if sidecar is None:
             return
-        self._end_stream(sidecar, CloseReason.REVOKED)
+        self._close(sidecar.stream, CloseReason.REVOKED, now)
         self._forget(name, RemovalReason.REVOKED)
         self._drawing.members_changed()
         self._debounce.note(Change.MEMBERS, now)
         self._publish(now)
 
-    def end_stream(self, name: NodeName, reason: CloseReason) -> None:
-        """End a sidecar's stream; it stays registered until its lease ends."""
+    def end_stream(self, name: NodeName, reason: CloseReason, now: float) -> None:
+        """End a sidecar's stream; unless it was about to go, it stays registered until its lease ends."""
         sidecar = self.registry.get(name)
         if sidecar is not None:
-            self._end_stream(sidecar, reason)
+            self._close(sidecar.stream, reason, now)
 
-    def _end_stream(self, sidecar: Sidecar, reason: CloseReason) -> None:
-        if sidecar.stream is not None:
-            self._streams.pop(sidecar.stream, None)
-            self._events.append(Close(sidecar.stream, reason))
+    def _close(self, stream: StreamId | None, reason: CloseReason, now: float) -> None:
+        """End a stream, if there is one; it has ended at once, not when the driver has carried that out."""
+        if stream is not None:
+            self._events.append(Close(stream, reason))
+            self.disconnected(stream, now)
+
+    def disconnected(self, stream: StreamId, now: float) -> None:
+        """A stream ended, whoever ended it: the only way in which one does. No news if it had ended before."""
+        name = self._streams.pop(stream, None)
+        if name is not None and self.registry.disconnect(name, stream) is not None:
+            self._forget(name, RemovalReason.LEFT)
+            self._members_changed(now)
 
     # ── policy ──
 
@@ -239,13 +244,6 @@ class ControlCore:
         if untold:
             self._events.append(OffersRefusedNotice(name, untold))
 
-    def disconnected(self, stream: StreamId, now: float) -> None:
-        """A stream ended, whoever ended it."""
-        name = self._streams.pop(stream, None)
-        if name is not None and self.registry.disconnect(name, stream) is not None:
-            self._forget(name, RemovalReason.LEFT)
-            self._members_changed(now)
-
     # ── time ──
 
     def next_timer(self) -> float | None:
@@ -262,7 +260,7 @@ class ControlCore:
     def handle_timer(self, now: float) -> None:
         """Let leases end, and publish what changed."""
         for sidecar in self.registry.expire(now):
-            self._end_stream(sidecar, CloseReason.LEASE_EXPIRED)
+            self._close(sidecar.stream, CloseReason.LEASE_EXPIRED, now)
             self._forget(sidecar.name, RemovalReason.LEASE_EXPIRED)
             self._members_changed(now)
         if self._publisher.warm_until is not None and self._publisher.warm_until <= now:

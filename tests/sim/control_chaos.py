@@ -1,4 +1,5 @@
-"""Many sidecars join, move, fall silent, refuse, restart and leave in seeded random order; invariants at each step.
+"""Many sidecars join, move, fall silent, refuse, are cut off, restart and leave in seeded random order; invariants at
+each step.
 
 - versions of each resource of each sidecar only grow, nonces too;
 - a sidecar that refused what it was sent last is never shown as synced;
@@ -15,7 +16,7 @@ import random
 import zlib
 from typing import TYPE_CHECKING
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control_events import CloseReason, Settings
 from protos.model import (
     CandidateSet,
     InterfaceName,
@@ -179,7 +180,10 @@ class Chaos:
             self.world.leave(self.rng.choice(anyone))
         elif draw < 0.42:
             self.world.drop_stream(self.rng.choice(anyone))
-        elif draw < 0.47:
+        elif draw < 0.44:
+            self.world.core.end_stream(self.rng.choice(anyone).name, CloseReason.CERTIFICATE_ENDED, self.world.now)
+            self.world.dispatch()
+        elif draw < 0.48:
             self.rng.choice(anyone).silent = True
         elif draw < 0.57:
             self.tell_interfaces(self.rng.choice(anyone))

@@ -7,9 +7,9 @@ import random
 
 import pytest
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control_events import CloseReason, Settings
 from controlplane.core.policy import CallRule, OfferRule, Policy
-from protos.model import CandidateSet, InterfaceName, MappingSet, PeerSet, Role, ServiceSet
+from protos.model import CandidateSet, InterfaceName, MappingSet, PeerSet, Role, ServiceSet, Version
 from protos.preferences import AT_MOST_EVERY_INTERFACE, Copies, InterfaceLabel
 from tests.sim.control_chaos import Chaos
 from tests.sim.control_world import SimSidecar, World
@@ -88,6 +88,37 @@ def test_a_restarted_control_plane_never_takes_a_living_server_from_a_robot(seed
         assert now.peers_version > robot.peers_version
         assert len(now.peer_sets) == 1
         assert len(now.pairs()) == 2
+
+
+@pytest.mark.parametrize("apart_s", [0.0, 0.3])
+def test_certificates_that_end_together_end_these_streams_and_nothing_else(apart_s: float) -> None:
+    """A robot's mapping changes within its lease, as a server of it goes too: there is nobody to send that to."""
+    world = World()
+    clouds, robots = [world.cloud(name) for name in ("a", "b")], [world.robot(name) for name in ("one", "two")]
+    for robot in robots:
+        world.all_up(robot, ("a", "b"))
+    world.run(2.0)
+    ending = (clouds[1], robots[0])
+    for sidecar in ending:
+        world.core.end_stream(sidecar.name, CloseReason.CERTIFICATE_ENDED, world.now)
+        world.dispatch()
+        world.run(apart_s)
+    held = len(robots[0].received)
+    world.run(world.settings.lease_s + 1.0)
+    assert [sidecar.closed for sidecar in ending] == [[CloseReason.CERTIFICATE_ENDED]] * 2
+    assert len(robots[0].received) == held
+    assert {sidecar.name for sidecar in world.core.registry} == {"a", "two"}
+    assert set(robots[1].pairs().values()) == {"a"}
+    for sidecar in ending:
+        sidecar.peers_version = sidecar.mapping_version = Version(0)
+    # With new certificates.
+    world.join(ending[0].registration)
+    world.say(ending[0], CandidateSet(interfaces("eth0")))
+    world.say(ending[0], ServiceSet((offer(),)))
+    world.robot("one")
+    world.run(2.0)
+    assert robots[0].peer_names == robots[1].peer_names == {"a", "b"}
+    assert set(robots[0].pairs().values()) <= {"a", "b"}
 
 
 def test_labels_and_wishes_of_sidecars_decide_their_mappings() -> None:

@@ -11,6 +11,7 @@ from controlplane.core.registry import Refusal
 from protos.errors import DecodeError
 from protos.model import (
     CandidateSet,
+    Drain,
     NodeName,
     RemovalReason,
     Role,
@@ -152,10 +153,40 @@ def test_a_revoked_server_goes_at_once_and_its_peers_are_told_why(world: World) 
 def test_a_stream_that_is_ended_leaves_its_sidecar_registered(world: World) -> None:
     a, robot = world.cloud("a"), world.robot()
     world.run(SETTLED_S)
-    world.core.end_stream(NodeName("a"), CloseReason.CERTIFICATE_ENDED)
+    world.core.end_stream(NodeName("a"), CloseReason.CERTIFICATE_ENDED, world.now)
     world.run(0.5)
     assert a.closed == [CloseReason.CERTIFICATE_ENDED]
     assert robot.peer_names == {"a"}
+
+
+def test_a_robot_whose_stream_is_ended_is_sent_nothing_more(world: World) -> None:
+    world.cloud("a")
+    b, robot = world.cloud("b"), world.robot()
+    world.run(SETTLED_S)
+    received = len(robot.received)
+    world.core.end_stream(robot.name, CloseReason.CERTIFICATE_ENDED, world.now)
+    world.dispatch()
+    world.leave(b)  # Its mapping changes within its lease.
+    world.run(SETTLED_S)
+    assert robot.closed == [CloseReason.CERTIFICATE_ENDED]
+    assert len(robot.received) == received
+    known = world.core.registry.get(robot.name)
+    assert known is not None
+    assert known.stream is None
+    world.join(dataclasses.replace(robot.registration, peers_version=robot.peers_version))
+    world.run(SETTLED_S)
+    assert robot.peer_names == {"a"}
+    assert set(robot.pairs().values()) == {"a"}
+
+
+def test_who_was_about_to_go_has_left_when_its_stream_is_ended(world: World) -> None:
+    a, robot = world.cloud("a"), world.robot()
+    world.run(SETTLED_S)
+    world.say(a, Drain())
+    world.core.end_stream(a.name, CloseReason.CERTIFICATE_ENDED, world.now)
+    world.run(0.5)
+    assert world.departed == ["a"]
+    assert robot.removed == {"a": RemovalReason.LEFT}
 
 
 def test_the_revocation_list_goes_to_all_at_once_and_to_who_comes_later(world: World) -> None:
