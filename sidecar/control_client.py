@@ -27,6 +27,7 @@ from protos.names import clean_text
 from protos.plr.v1 import control_pb2_grpc
 from sidecar.core.control_session import Apply
 from sidecar.outage_log import OutageLog
+from sidecar.refusal_log import RefusalLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,6 +109,7 @@ class ControlClient:
         """Why the last attempt or stream ended; None before that, or when we ended it."""
         self._stopping = False
         self._outage = OutageLog(log, target)
+        self._refusals = RefusalLog(log)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._main_task: asyncio.Task[None] | None = None
         self._wake = asyncio.Event()
@@ -306,8 +308,9 @@ class ControlClient:
         try:
             value = control_message_from_proto(message)
         except DecodeError as error:
-            log.warning("refused a message of the control plane: %s", error)
-            self._session.undecodable(*_what_it_was(message), str(error))
+            resource, nonce = _what_it_was(message)
+            self._refusals.refused(resource, "a message of the control plane", str(error))
+            self._session.undecodable(resource, nonce, str(error))
             return
         match self._session.receive(value, time.monotonic()):
             case Welcome() as welcome:
@@ -326,17 +329,20 @@ class ControlClient:
 
     def _apply(self, apply: Apply) -> None:
         content = apply.content
+        failure: Exception | None = None
         try:
             if isinstance(content, PeerSet):
                 error = self._hooks.apply_peers(content)
             else:
                 error = self._hooks.apply_mapping(content)
-        except Exception as failure:
-            log.exception("applying %s failed", apply.resource.value)
-            error = f"internal error: {failure}"
+        except Exception as raised:
+            failure = raised
+            error = f"internal error: {raised}"
         self._session.applied(apply, error)
-        if error is not None:
-            log.warning("refused %s version %d: %s", apply.resource.value, content.version, error)
+        if error is None:
+            self._refusals.taken(apply.resource)
+        else:
+            self._refusals.refused(apply.resource, f"{apply.resource.value} version {content.version}", error, failure)
 
     def _take_report(self) -> Report:
         try:

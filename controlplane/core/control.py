@@ -139,7 +139,7 @@ class ControlCore:
             case Ack():
                 self._receive_ack(name, message)
             case Nack():
-                self._receive_nack(name, message)
+                self._receive_nack(name, message, now)
             case Drain():
                 if self.registry.set_draining(name):
                     self._members_changed(now)
@@ -169,12 +169,13 @@ class ControlCore:
         else:
             self.counters.stale_answers += 1
 
-    def _receive_nack(self, name: NodeName, nack: Nack) -> None:
-        if self._publisher.nacked(name, nack):
-            self.counters.nacks[nack.resource] += 1
-            self._events.append(NackNotice(name, nack))
-        else:
+    def _receive_nack(self, name: NodeName, nack: Nack, now: float) -> None:
+        if not self._publisher.nacked(name, nack, now):
             self.counters.stale_answers += 1
+            return
+        self.counters.nacks[nack.resource] += 1
+        if not self._publisher[name].track(nack.resource).refused_as_before:
+            self._events.append(NackNotice(name, nack))
 
     def _welcome(self) -> Welcome:
         settings = self._settings
@@ -254,6 +255,7 @@ class ControlCore:
             self._debounce.next_time(),
             self._drawing_since,
             self._publisher.warm_until,
+            self._publisher.resend_at,
         )
         return min((time for time in times if time is not None), default=None)
 
@@ -265,6 +267,9 @@ class ControlCore:
             self._members_changed(now)
         if self._publisher.warm_until is not None and self._publisher.warm_until <= now:
             self._publisher.end_warm_up()
+            self._publish_soon(now)
+        if self._publisher.resend_at is not None and self._publisher.resend_at <= now:
+            self._publisher.send_refused_again()
             self._publish_soon(now)
         if self._publish_at is not None and self._publish_at <= now:
             self._publish(now)

@@ -81,7 +81,7 @@ class Counters:
 
 @dataclass(frozen=True, slots=True)
 class NackNotice:
-    """A sidecar refused what it was sent, for the log."""
+    """A sidecar refused what it was sent, for the log; a reason is told once until the sidecar takes something."""
 
     sidecar: NodeName
     nack: Nack

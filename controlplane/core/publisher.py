@@ -6,6 +6,9 @@ is over: a set without a server that merely has not yet come back would cost the
 nothing, and clouds (they find their robots by the robots' own probes), are served at once. Nor are sets judged by the
 policy before the warm-up is over (PeerSet.policy): a peer that is merely not back yet would be taken for one that the
 policy leaves nothing to do.
+
+Refusals. A sidecar refuses what it cannot hold at the moment: its interface went and is back, its driver hung. That
+passes, and what it is to hold need not change for it. So what is refused is sent again until it is taken.
 """
 
 from __future__ import annotations
@@ -33,6 +36,10 @@ if TYPE_CHECKING:
 MAX_GONE_SNAPSHOTS = MAX_SIDECARS
 """Sidecars that are gone and whose last set is remembered, for the notices when they return; the oldest go."""
 
+RESEND_S = 5.0
+"""From one sending of what is refused to the next: a cause that passed is cured within seconds, and a set of a hundred
+peers (1 kB each) that is refused for good takes 20 kB/s of a cellular link."""
+
 
 class Publisher:
     """The snapshots of all sidecars, those registered and the last ones gone."""
@@ -46,6 +53,8 @@ class Publisher:
         """When the warm-up ends; None once it is over."""
         self._held_back: dict[NodeName, frozenset[NodeName] | None] = {}
         """Robots, and the servers that they wait for; None before their first report."""
+        self.resend_at: float | None = None
+        """When to `send_refused_again`, to all in one go; None while nothing is refused."""
 
     def __getitem__(self, name: NodeName) -> Snapshots:
         return self._snapshots[name]
@@ -85,10 +94,19 @@ class Publisher:
         snapshots = self._snapshots[name]
         return snapshots.peers_acked(ack) if ack.resource is ResourceKind.PEERS else snapshots.mapping.ack(ack)
 
-    def nacked(self, name: NodeName, nack: Nack) -> bool:
+    def nacked(self, name: NodeName, nack: Nack, now: float) -> bool:
         """A sidecar refused what it was sent; False if that is stale."""
-        snapshots = self._snapshots[name]
-        return (snapshots.peers if nack.resource is ResourceKind.PEERS else snapshots.mapping).nack(nack)
+        if not self._snapshots[name].track(nack.resource).nack(nack):
+            return False
+        if self.resend_at is None:
+            self.resend_at = now + RESEND_S
+        return True
+
+    def send_refused_again(self) -> None:
+        """What is refused now goes out with the next `publish`; the next refusal sets the time anew."""
+        self.resend_at = None
+        for snapshots in self._snapshots.values():
+            snapshots.send_refused_again()
 
     def publish(self, permits: Permits, plan: Plan, picture: Picture) -> Iterator[Send]:
         """Everything that is news to somebody.
@@ -133,7 +151,7 @@ class Publisher:
         snapshots = self._snapshots[sidecar.name]
         judged = self.warm_until is None or not permits.restricted
         view = PeerView(views.peers_of(sidecar), permits.fingerprint if judged else POLICY_PENDING)
-        if view != snapshots.peers.sent:
+        if snapshots.peers.send_again or view != snapshots.peers.sent:
             removed = views.removed(sidecar, snapshots.known_names)
             yield Send(stream, snapshots.send_peers(view, removed, self._versions))
 
@@ -145,7 +163,7 @@ class Publisher:
             # Nothing to say yet is no reason to take away what the sidecar holds from before.
             worth_sending = bool(mapping)
         else:
-            worth_sending = reconcile.differs(mapping, sent)
+            worth_sending = snapshots.mapping.send_again or reconcile.differs(mapping, sent)
         if worth_sending:
             yield Send(stream, snapshots.send_mapping(mapping, self._versions))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from protos.model import POLICY_PENDING, MappingSet, PeerSet, Version
+from protos.model import POLICY_PENDING, MappingSet, PeerSet, ResourceKind, Version
 from protos.status import ResourceStatus, SyncState
 
 if TYPE_CHECKING:
@@ -49,6 +49,11 @@ class Track(Generic[C]):
         self.version_sent = Version(0)
         self.version_acked = Version(0)
         self.error = ""
+        self.send_again = False
+        """Whether it is to be sent although it is what `sent` says: that was refused, a while ago."""
+        self.refused_as_before = False
+        """Whether the last refusal gave the same reason as the one before, with nothing taken in between."""
+        self._refusal: str | None = None
         self._floor = Version(0)
 
     def begin_stream(self, held: Version) -> None:
@@ -62,6 +67,7 @@ class Track(Generic[C]):
         self.state = SyncState.NOT_SENT
         self.version_acked = held
         self.error = ""
+        self._refusal = None
 
     def send(self, content: C, versions: VersionSource) -> Version:
         """`content` goes out; returns its version. The nonce is the new `nonce`."""
@@ -70,6 +76,7 @@ class Track(Generic[C]):
         self.nonce += 1
         self.state = SyncState.STALE
         self.error = ""
+        self.send_again = False
         return self.version_sent
 
     def ack(self, ack: Ack) -> bool:
@@ -78,6 +85,7 @@ class Track(Generic[C]):
             return False
         self.state = SyncState.SYNCED
         self.version_acked = ack.version
+        self._refusal = None
         return True
 
     def nack(self, nack: Nack) -> bool:
@@ -87,6 +95,8 @@ class Track(Generic[C]):
         self.state = SyncState.REJECTED
         self.version_acked = nack.version
         self.error = nack.error
+        self.refused_as_before = nack.error == self._refusal
+        self._refusal = nack.error
         return True
 
     @property
@@ -116,6 +126,15 @@ class Snapshots:
         """Send the sidecar its mapping."""
         version = self.mapping.send(services, versions)
         return MappingSet(version, self.mapping.nonce, services)
+
+    def track(self, resource: ResourceKind) -> Track[PeerView] | Track[tuple[ServiceMapping, ...]]:
+        """One of the two."""
+        return self.peers if resource is ResourceKind.PEERS else self.mapping
+
+    def send_refused_again(self) -> None:
+        """What is refused is due once more; as it is wanted then, and as a new version."""
+        for track in (self.peers, self.mapping):
+            track.send_again = track.state is SyncState.REJECTED
 
     def peers_acked(self, ack: Ack) -> bool:
         """The sidecar applied its peers: it forgot all others."""

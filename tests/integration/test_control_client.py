@@ -159,15 +159,20 @@ def test_applies_and_acks(server: ScriptedControlPlane, rig: Rig) -> None:
     assert [content.version for content in rig.hooks.applied] == [41, 7]
 
 
-def test_what_the_engine_refuses_is_nacked(server: ScriptedControlPlane, rig: Rig) -> None:
+def test_what_the_engine_refuses_is_nacked(
+    server: ScriptedControlPlane, rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
     rig.hooks.error = "/plan: no interface 'wwan7' here"
     rig.client.start()
     rig.hooks.expect_connection(True)
-    server.say(PeerSet(Version(41), nonce=5))
-    assert server.expect(Nack) == Nack(ResourceKind.PEERS, Version(40), 5, rig.hooks.error)
+    for version, nonce in ((41, 5), (42, 6)):
+        server.say(PeerSet(Version(version), nonce=nonce))
+        assert server.expect(Nack) == Nack(ResourceKind.PEERS, Version(40), nonce, rig.hooks.error)
+    told = [record for record in caplog.records if record.getMessage().startswith("refused peers")]
+    assert len(told) == 1, "sent again until it is taken: told once"
     rig.hooks.error = None
-    server.say(PeerSet(Version(42), nonce=6))
-    assert server.expect(Ack) == Ack(ResourceKind.PEERS, Version(42), 6)
+    server.say(PeerSet(Version(43), nonce=7))
+    assert server.expect(Ack) == Ack(ResourceKind.PEERS, Version(43), 7)
 
 
 def test_a_crash_of_the_engine_becomes_a_nack_and_the_stream_goes_on(server: ScriptedControlPlane, rig: Rig) -> None:

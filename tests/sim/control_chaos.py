@@ -5,7 +5,7 @@ each step.
 - a sidecar that refused what it was sent last is never shown as synced;
 - a mapping names only peers the sidecar was sent and interfaces it told;
 - neither peers nor mappings ever tell of a call that the policy of the moment denies;
-- when all is quiet, every connected sidecar that does not refuse is synced and sees who is there
+- when all is quiet, and nobody refuses any more, every connected sidecar is synced and sees who is there
   and concerns it.
 """
 
@@ -201,23 +201,23 @@ class Chaos:
         self.world.core.set_policy(self.policy, self.world.now)
 
     def settle(self) -> None:
-        """Nothing happens for long enough: everybody has to be in order."""
+        """Nothing happens for long enough, and causes to refuse have passed: everybody has to be in order."""
+        for sidecar in self.world.sidecars.values():
+            sidecar.refuse = lambda _: False
         self.world.run(self.world.settings.lease_s * 2)
         there = {role: {s.name for s in self.connected(role) if not s.silent} for role in Role}
         assert {sidecar.name for sidecar in self.world.core.registry} == there[Role.ROBOT] | there[Role.CLOUD]
         status = {found.peer.name: found for found in self.world.core.status(self.world.now)}
         for sidecar in self.connected():
             shown = status[sidecar.name]
-            assert shown.peers.state in (SyncState.SYNCED, SyncState.REJECTED)
-            if shown.peers.state is SyncState.SYNCED:
-                other = Role.CLOUD if sidecar.registration.role is Role.ROBOT else Role.ROBOT
-                concerned = {name for name in there[other] if self.concern_each_other(sidecar.name, name)}
-                # A cloud's robots keep their place while a server of it is away.
-                assert concerned <= sidecar.peer_names <= there[other]
-                for peer in sidecar.peers:
-                    self.check_peer(sidecar, peer)
+            assert shown.peers.state is SyncState.SYNCED
+            other = Role.CLOUD if sidecar.registration.role is Role.ROBOT else Role.ROBOT
+            concerned = {name for name in there[other] if self.concern_each_other(sidecar.name, name)}
+            # A cloud's robots keep their place while a server of it is away.
+            assert concerned <= sidecar.peer_names <= there[other]
+            for peer in sidecar.peers:
+                self.check_peer(sidecar, peer)
             if sidecar.registration.role is Role.ROBOT:
-                assert shown.mapping.state in (SyncState.SYNCED, SyncState.REJECTED)
-                if shown.mapping.state is SyncState.SYNCED:
-                    assert sidecar.services == shown.services
-                    assert {mapping.service for mapping in sidecar.services} == {u.name for u in shown.uses}
+                assert shown.mapping.state is SyncState.SYNCED
+                assert sidecar.services == shown.services
+                assert {mapping.service for mapping in sidecar.services} == {u.name for u in shown.uses}

@@ -29,6 +29,7 @@ class ControlPlaneStub:
     """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
     version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
     and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
+    What is refused is sent again every few seconds, as a new version: the cause may have passed.
     """
 
     def __init__(self, channel):
@@ -48,6 +49,7 @@ class ControlPlaneServicer:
     """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
     version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
     and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
+    What is refused is sent again every few seconds, as a new version: the cause may have passed.
     """
 
     def Connect(self, request_iterator, context):
@@ -76,6 +78,7 @@ class ControlPlane:
     """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
     version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
     and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
+    What is refused is sent again every few seconds, as a new version: the cause may have passed.
     """
 
     @staticmethod

@@ -30,6 +30,7 @@ class ControlPlaneStub:
     """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
     version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
     and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
+    What is refused is sent again every few seconds, as a new version: the cause may have passed.
     """
 
     @_typing.overload
@@ -43,6 +44,7 @@ class ControlPlaneAsyncStub(ControlPlaneStub):
     """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
     version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
     and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
+    What is refused is sent again every few seconds, as a new version: the cause may have passed.
     """
 
     def __init__(self, channel: _aio.Channel) -> None: ...
@@ -52,6 +54,7 @@ class ControlPlaneServicer(metaclass=_abc_1.ABCMeta):
     """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
     version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
     and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
+    What is refused is sent again every few seconds, as a new version: the cause may have passed.
     """
 
     @_abc_1.abstractmethod

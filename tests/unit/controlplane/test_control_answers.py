@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model import Ack, PeerSet, RemovalReason, ResourceKind
+import pytest
+
+from controlplane.core.publisher import RESEND_S
+from protos.model import Ack, MappingSet, PeerSet, RemovalReason, ResourceKind
 from protos.status import SyncState
 from tests.sim.control_world import SETTLED_S
 
@@ -12,13 +15,13 @@ if TYPE_CHECKING:
     from tests.sim.control_world import World
 
 
-def test_a_nack_is_shown_and_the_same_content_is_not_sent_again(world: World) -> None:
+def test_a_nack_is_shown_and_the_same_content_is_not_sent_again_at_once(world: World) -> None:
     world.cloud("a")
     robot = world.robot()
     robot.refuse = lambda message: isinstance(message, PeerSet)
     world.run(SETTLED_S)
     sent = len(robot.peer_sets)
-    world.run(3 * SETTLED_S)
+    world.run(RESEND_S - SETTLED_S - 0.1)
     assert len(robot.peer_sets) == sent
     (status,) = (found for found in world.core.status(world.now) if found.peer.name == "robot")
     assert status.peers.state is SyncState.REJECTED
@@ -30,6 +33,59 @@ def test_a_nack_is_shown_and_the_same_content_is_not_sent_again(world: World) ->
     world.run(SETTLED_S)
     (status,) = (found for found in world.core.status(world.now) if found.peer.name == "robot")
     assert status.peers.state is SyncState.SYNCED
+
+
+@pytest.mark.parametrize("kind", [PeerSet, MappingSet])
+def test_what_was_refused_is_sent_again_until_it_is_taken(world: World, kind: type[PeerSet | MappingSet]) -> None:
+    """Why it was refused passes, and nothing else changes meanwhile."""
+    world.cloud("a")
+    robot = world.robot()
+    robot.refuse = lambda message: isinstance(message, kind)
+    world.run(SETTLED_S + 4 * RESEND_S)
+    refused = [message for message in robot.received if isinstance(message, kind)]
+    assert 4 <= len(refused) <= 6
+    assert sorted({message.version for message in refused}) == [message.version for message in refused]
+    robot.refuse = lambda message: False
+    world.run(RESEND_S + 0.1)
+    taken = [message for message in robot.received if isinstance(message, kind)]
+    assert len(taken) == len(refused) + 1
+    (status,) = (found for found in world.core.status(world.now) if found.peer.name == "robot")
+    assert (status.peers.state, status.mapping.state) == (SyncState.SYNCED, SyncState.SYNCED)
+    assert robot.peer_names == {"a"}
+    assert set(robot.pairs().values()) == {"a"}
+    # Nobody refuses anything: nothing is sent any more, and no timer asks for it.
+    world.run(3 * RESEND_S)
+    assert len([message for message in robot.received if isinstance(message, kind)]) == len(taken)
+
+
+def test_the_same_refusal_is_told_once_until_something_is_taken(world: World) -> None:
+    world.cloud("a")
+    robot = world.robot()
+    robot.refuse = lambda message: isinstance(message, PeerSet)
+    world.run(SETTLED_S + 3 * RESEND_S)
+    assert len(world.nacks) == 1
+    assert world.core.counters.nacks[ResourceKind.PEERS] >= 4
+    robot.refuse = lambda message: False
+    world.run(SETTLED_S + RESEND_S)
+    robot.refuse = lambda message: isinstance(message, PeerSet)
+    world.cloud("b")
+    world.run(SETTLED_S)
+    assert len(world.nacks) == 2
+
+
+def test_what_a_sidecar_refused_before_its_stream_was_lost_is_sent_once_on_the_next(world: World) -> None:
+    world.cloud("a")
+    robot = world.robot()
+    robot.refuse = lambda message: True
+    world.run(SETTLED_S)
+    world.drop_stream(robot)
+    world.run(0.1)
+    robot.refuse = lambda message: False
+    before = len(robot.peer_sets)
+    world.join(robot.registration)
+    world.run(2 * RESEND_S)
+    assert len(robot.peer_sets) == before + 1
+    assert robot.peer_names == {"a"}
 
 
 def test_stale_answers_are_counted_and_ignored(world: World) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from controlplane.core.snapshots import PeerView, Snapshots, Track, VersionSource
@@ -20,11 +22,11 @@ from protos.status import SyncState
 EPOCH = 1000
 
 
-def state(track: Track[str]) -> SyncState:
+def state(track: Track[Any]) -> SyncState:
     return track.status.state
 
 
-def ack(track: Track[str], *, nonce: int | None = None, version: int | None = None) -> bool:
+def ack(track: Track[Any], *, nonce: int | None = None, version: int | None = None) -> bool:
     return track.ack(
         Ack(
             ResourceKind.PEERS,
@@ -34,7 +36,7 @@ def ack(track: Track[str], *, nonce: int | None = None, version: int | None = No
     )
 
 
-def nack(track: Track[str], *, nonce: int | None = None, in_force: int = 0) -> bool:
+def nack(track: Track[Any], *, nonce: int | None = None, in_force: int = 0) -> bool:
     answer = Nack(ResourceKind.PEERS, Version(in_force), nonce if nonce is not None else track.nonce, "no such peer")
     return track.nack(answer)
 
@@ -79,6 +81,36 @@ def test_a_nack_is_never_shown_as_synced(versions: VersionSource) -> None:
     assert state(track) is SyncState.STALE
     assert track.error == ""
     assert ack(track)
+
+
+def test_a_refusal_for_the_same_reason_is_no_news_until_something_is_taken(versions: VersionSource) -> None:
+    track: Track[str] = Track()
+    told = []
+    for taken in (False, False, True, False):
+        track.send("a", versions)
+        if taken:
+            ack(track)
+        else:
+            nack(track)
+            told.append(not track.refused_as_before)
+    assert told == [True, False, True]
+    track.begin_stream(Version(0))
+    track.send("a", versions)
+    nack(track)
+    assert not track.refused_as_before
+
+
+def test_only_what_is_refused_is_sent_again(versions: VersionSource) -> None:
+    snapshots = Snapshots()
+    snapshots.send_peers(PeerView((peer("a"),)), (), versions)
+    snapshots.send_mapping((), versions)
+    snapshots.send_refused_again()
+    assert not snapshots.peers.send_again
+    nack(snapshots.track(ResourceKind.MAPPING))
+    snapshots.send_refused_again()
+    assert (snapshots.peers.send_again, snapshots.mapping.send_again) == (False, True)
+    snapshots.send_mapping((), versions)
+    assert not snapshots.mapping.send_again
 
 
 def test_a_nack_after_the_ack_wins(versions: VersionSource) -> None:

@@ -1,0 +1,30 @@
+"""Log lines for what is refused of the control plane, which sends it again until it is taken."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protos.model import ResourceKind
+
+
+class RefusalLog:
+    """Says what is refused and why: once, until the reason changes or something of that resource is taken."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._told: dict[ResourceKind, str] = {}
+
+    def refused(self, resource: ResourceKind | None, what: str, error: str, failure: Exception | None = None) -> None:
+        """This was refused; `resource` is None if it is not known which it is of, `failure` is a fault of ours."""
+        level = logging.WARNING if failure is None else logging.ERROR
+        if resource is not None:
+            if self._told.get(resource) == error:
+                level = logging.DEBUG
+            self._told[resource] = error
+        self._log.log(level, "refused %s: %s", what, error, exc_info=failure)
+
+    def taken(self, resource: ResourceKind) -> None:
+        """The next refusal is news again."""
+        self._told.pop(resource, None)
