@@ -54,6 +54,9 @@ MAX_CREDENTIAL_BYTES = 2048
 MAX_LATENCIES = 4096
 """Pairs (interface, server) in one report, counted anew for each service and size class that they carried."""
 
+MAX_PATHS = 4096
+"""Paths (interface, server) in one report."""
+
 MAX_JOINTS = 1024
 """Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers. As many of interfaces."""
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from protos.convert.fields import (
     MAX_MAPPED_SERVICES,
     MAX_OFFERS,
-    MAX_PATHS,
     MAX_SIDECARS,
     MAX_USES,
     duration,
@@ -20,6 +19,7 @@ from protos.convert.fields import (
 from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
 from protos.convert.reports import path_from_proto, path_to_proto
 from protos.convert.types import peer_from_proto, peer_to_proto, service_names, use_from_proto, use_to_proto
+from protos.model import MAX_PATHS
 from protos.names import clean_text, text
 from protos.plr.v1 import admin_pb2
 from protos.status import ResourceStatus, SidecarStatus, SyncState

@@ -34,9 +34,6 @@ MAX_ASSIGNMENTS = 256
 MAX_MAPPED_SERVICES = 1024
 """Services in one mapping: as many as a robot can carry."""
 
-MAX_PATHS = 4096
-"""Path reports in one report."""
-
 MAX_OUTCOMES = 1024
 """Outcome reports in one report: as many as a robot can carry services."""
 

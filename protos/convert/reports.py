@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from protos.convert.fields import MAX_EVENTS, MAX_OUTCOMES, MAX_PATHS, at_most, each
+from protos.convert.fields import MAX_EVENTS, MAX_OUTCOMES, at_most, each
 from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
 from protos.errors import DecodeError
 from protos.model import (
     MAX_JOINTS,
     MAX_LATENCIES,
+    MAX_PATHS,
     InterfaceJointReport,
     JointReport,
     LatencyReport,

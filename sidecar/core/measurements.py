@@ -7,7 +7,16 @@ from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
-from protos.model import MAX_JOINTS, MAX_LATENCIES, JointReport, LatencyReport, OutcomeReport, PathReport, Report
+from protos.model import (
+    MAX_JOINTS,
+    MAX_LATENCIES,
+    MAX_PATHS,
+    JointReport,
+    LatencyReport,
+    OutcomeReport,
+    PathReport,
+    Report,
+)
 from protos.size_class import size_class
 from sidecar.core.interface_outcomes import JointCounts
 from sidecar.core.path_id import PathState
@@ -53,6 +62,8 @@ class Measurements:
         self._dropped = dropped
         """Counts what a report has no room for."""
         self._answer_bytes: dict[ServiceName, int] = {}
+        self._next_path = 0
+        """Which path is told of first, where one report does not hold all."""
         self._clear()
 
     def _clear(self) -> None:
@@ -138,16 +149,13 @@ class Measurements:
         counts.add(outcome)
 
     def take(self, routes: Routes, servers: list[NodeName]) -> Report:
-        """Return everything since the last call, and the state of every path to these servers."""
+        """Return everything since the last call, and the state of every path to these servers there is room for."""
         latencies = tuple(
             LatencyReport(*carried, of.network, of.called_off, of.processing, of.requests, of.missed)
             for carried, of in sorted(self._carried.items(), key=itemgetter(0))
         )
-        paths = tuple(
-            self._path_report(interface, server, routes)
-            for server in servers
-            for interface in routes.interfaces_to(server)
-        )
+        known = [(interface, server) for server in servers for interface in routes.interfaces_to(server)]
+        paths = tuple(self._path_report(interface, server, routes) for interface, server in self._in_turn(known))
         services = {service for service, _ in self._outcomes}
         outcomes = tuple(
             OutcomeReport(
@@ -162,6 +170,16 @@ class Measurements:
         interface_joints = tuple(counts.report(pair) for pair, counts in self._interfaces.items())
         self._clear()
         return Report(latencies, paths, outcomes, joints, interface_joints)
+
+    def _in_turn(self, paths: list[tuple[InterfaceName, NodeName]]) -> list[tuple[InterfaceName, NodeName]]:
+        """As many as one report holds, from where the last one ended: all are told of, if not always."""
+        left_out = len(paths) - MAX_PATHS
+        if left_out <= 0:
+            return paths
+        self._dropped["path_reports_full"] += left_out
+        first = self._next_path % len(paths)
+        self._next_path = first + MAX_PATHS
+        return (paths[first:] + paths[:first])[:MAX_PATHS]
 
     def _path_report(self, interface: InterfaceName, server: NodeName, routes: Routes) -> PathReport:
         """One report for all paths between the two: the mapping knows interfaces and servers only."""

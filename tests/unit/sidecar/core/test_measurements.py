@@ -5,7 +5,17 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model import Assignment, InterfaceJointReport, JointReport, OutcomeReport, ServiceName
+from protos.convert import parse_sidecar_message, sidecar_message_to_proto
+from protos.model import (
+    MAX_PATHS,
+    Assignment,
+    InterfaceJointReport,
+    InterfaceName,
+    JointReport,
+    NodeName,
+    OutcomeReport,
+    ServiceName,
+)
 from sidecar.core import measurements as measurements_module
 from sidecar.core.copies import Carried
 from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
@@ -122,6 +132,43 @@ def test_outcomes_by_pair_of_interfaces_are_counted_up_to_a_limit(monkeypatch: p
     told = InterfaceJointReport(ECHO, WLAN, WWAN, None, 10, 2, 5, 2, 1)
     assert measurements.take(Routes(), []).interface_joints == (told,)
     assert measurements.take(Routes(), []).interface_joints == ()
+
+
+def test_paths_that_one_report_has_no_room_for_are_told_by_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurements_module, "MAX_PATHS", 4)
+    dropped: Counter[str] = Counter()
+    measurements, routes = Measurements(dropped), Routes()
+    servers = [NodeName(f"cloud-{number}") for number in range(3)]
+    pairs = {(nic, server) for nic in (WLAN, WWAN) for server in servers}
+
+    def told(known: list[NodeName]) -> set[tuple[InterfaceName, NodeName]]:
+        paths = measurements.take(routes, known).paths
+        found = {(report.interface, report.server) for report in paths}
+        assert len(found) == len(paths) <= 4, "none twice"
+        return found
+
+    for nic, server in pairs:
+        routes.set_state(path(nic, server), PathState.UP)
+    assert len(told(servers[:2])) == 4
+    assert not dropped
+    turns = [told(servers) for _ in range(3)]
+    assert dropped == {"path_reports_full": 3 * 2}
+    assert turns[0] | turns[1] == pairs
+    assert Counter(pair for turn in turns for pair in turn) == dict.fromkeys(pairs, 2)
+    # Fewer now: where the last turn ended does not exist any more.
+    routes.forget_peer(servers[2])
+    routes.set_state(path("eth0", servers[0]), PathState.UP)
+    assert len(told(servers[:2]) | told(servers[:2])) == 5
+
+
+def test_a_report_of_the_most_paths_is_one_that_the_control_plane_takes() -> None:
+    measurements, routes = Measurements(Counter()), Routes()
+    servers = [NodeName(f"cloud-{number}") for number in range(MAX_PATHS // 2 + 1)]
+    for server in servers:
+        for nic in (WLAN, WWAN):
+            routes.set_state(path(nic, server), PathState.UP)
+    report = measurements.take(routes, servers)
+    assert parse_sidecar_message(sidecar_message_to_proto(report).SerializeToString()) == report
 
 
 def test_what_is_judged_at_the_deadline_is_told_before_its_times_are_known(measurements: Measurements) -> None:
