@@ -55,6 +55,10 @@ GOODBYE_S = 0.5
 WATCH_INTERVAL_S = 1.0
 """How often to look for new certificate files: they are renewed weeks before they end."""
 
+JUDGE_AGAIN_S = 10.0
+"""Between two judgements on refused peers: a robot without a clock hears the time soon after its start, and 4096 peers
+are a second of public-key work."""
+
 _CHANNEL_OPTIONS: tuple[tuple[str, int | str], ...] = (
     ("grpc.keepalive_time_ms", KEEPALIVE_TIME_MS),
     ("grpc.keepalive_timeout_ms", KEEPALIVE_TIMEOUT_MS),
@@ -180,11 +184,22 @@ class ControlClient:
         self._loop = asyncio.get_running_loop()
         self._main_task = asyncio.current_task()
         self._running.set()
+        judging = asyncio.create_task(self._judge_again())
         with contextlib.suppress(asyncio.CancelledError):
             while not self._stopping:
                 await self._wait_until(self._session.retry_at)
                 if not self._stopping:
                     await self._one_stream()
+        judging.cancel()
+
+    async def _judge_again(self) -> None:
+        """Also without any stream: while our clock is wrong, the control plane's certificate is no good either."""
+        while True:
+            await asyncio.sleep(JUDGE_AGAIN_S)
+            try:
+                self._hooks.judge_again()
+            except Exception:
+                log.exception("judge_again failed")
 
     def _begin_stop(self) -> None:
         self._stopping = True

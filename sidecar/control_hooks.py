@@ -27,5 +27,8 @@ class ControlHooks(Protocol):
     def connection_changed(self, connected: bool, reason: str) -> None:
         """The control plane came within reach, or went out of it."""
 
+    def judge_again(self) -> None:
+        """Time has passed, or our clock was set: refused peers may be good now."""
+
     def certificate_changed(self, files: TlsFiles) -> None:
         """New certificate files are in use from now on; the session tells the next registration of them."""

@@ -215,6 +215,10 @@ class Sidecar:
         """Return what was measured since the last call."""
         return self._data_plane.take_report()
 
+    def judge_again(self) -> None:
+        """Time has passed, or our clock was set: refused peers may be good now."""
+        self._data_plane.judge_again()
+
     def certificate_changed(self, files: TlsFiles) -> None:
         """New certificate files are in use: the credential of this session is signed anew with them."""
         credential = signed(self._own.credential, files)

@@ -56,7 +56,7 @@ from sidecar.core.stats import EngineStats
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceOffer, SessionId
+    from protos.model import InterfaceName, NodeName, Peer, ServiceMapping, ServiceName, ServiceOffer, SessionId
     from sidecar.core.budgets import Budget
     from sidecar.core.session import OwnSession
 
@@ -223,13 +223,14 @@ class Engine:
         self._update_offers(now)
         return None
 
-    def recheck_peers(self, now: float) -> None:
-        """Whom to trust has changed: the sessions of peers not to be trusted any more end at once."""
-        gone = self.peers.recheck()
+    def recheck_peers(self, judged: Iterable[Peer], now: float) -> list[NodeName]:
+        """Judgements changed: sessions of those bad now end; returns the refused taken, as they are `judged` good."""
+        gone, taken = self.peers.recheck(), self.peers.readmit(judged)
         self._offers.set_peers(self.peers.all())
         for name in gone:
             self._end_session(name, now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
+        return taken
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         """Take a mapping; returns why it is refused, or None."""

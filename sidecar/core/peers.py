@@ -1,7 +1,8 @@
 """The peers this sidecar may talk to: the control plane's view, corrected by what the paths themselves prove.
 
 A peer is known by its credential, which this sidecar judges itself (`OwnSession.admit`): one whose credential is bad
-is no peer, whatever the control plane says.
+is no peer, whatever the control plane says. It is kept for later judgements all the same: a clock that is set right
+or a new CA may prove it good, and the control plane, to which the view is in force, does not send it again.
 
 A peer that merely vanished from the view (its lease ran out, or the control plane restarted with an empty registry)
 is kept while a path to it lives: a dead control plane must not cost a request. One that left, was revoked or is kept
@@ -12,15 +13,17 @@ it may do under the new one.
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
+from protos.identity import CertificateError
 from protos.model import NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
 from sidecar.core.link_events import LinkPeer
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from protos.model import Address, InterfaceId, NodeName, Peer, ServiceName, SessionId
     from sidecar.core.key_schedule import PairKeys
@@ -34,6 +37,21 @@ RESTART_GAP_S = 1.0
 all links work, and every look public-key work."""
 
 
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A peer of the view whose credential is bad."""
+
+    peer: Peer
+    why: str
+    cause: str
+    """The same for as long as it is refused for the same: `why` may tell the seconds."""
+
+    @staticmethod
+    def of(peer: Peer, error: DecodeError) -> Refusal:
+        """Return what to note when `error` is what came of judging the peer."""
+        return Refusal(peer, str(error), error.reason if isinstance(error, CertificateError) else str(error))
+
+
 class Peers:
     """Known peers by name."""
 
@@ -43,8 +61,8 @@ class Peers:
         self._known: dict[NodeName, Peer] = {}
         self._keys: dict[NodeName, PairKeys] = {}
         """What is shared with each of them."""
-        self.refused: dict[NodeName, str] = {}
-        """Peers of the view whose credentials are bad, and why."""
+        self.refused: dict[NodeName, Refusal] = {}
+        """Of the view, so no more than `MAX_PEERS`."""
         self._unlisted: set[NodeName] = set()
         self._restarted_at: dict[NodeName, float] = {}
         self._policy = NO_POLICY
@@ -84,7 +102,7 @@ class Peers:
                 known[peer.name] = peer
             except DecodeError as error:
                 self._dropped["bad_credential"] += 1
-                self.refused[peer.name] = str(error)
+                self.refused[peer.name] = Refusal.of(peer, error)
         unlisted = set()
         new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)
         for name, peer in self._known.items():
@@ -143,10 +161,36 @@ class Peers:
                 self._own.admit(peer)
             except DecodeError as error:
                 self._dropped["bad_credential"] += 1
-                self.refused[name] = str(error)
+                if name not in self._unlisted:
+                    self.refused[name] = Refusal.of(peer, error)
                 self._forget(name)
                 gone.append(name)
         return gone
+
+    def all_refused(self) -> list[Peer]:
+        """Return the refused peers: another time of day or new trust may prove them good."""
+        return [refusal.peer for refusal in self.refused.values()]
+
+    def readmit(self, judged: Iterable[Peer]) -> list[NodeName]:
+        """Of the refused, these were judged good a moment ago (`OwnSession.admit`); returns those now taken."""
+        taken = []
+        sessions = {peer.session for peer in self._known.values()}
+        for peer in judged:
+            refusal = self.refused.get(peer.name)
+            # Not when a newer view came meanwhile, nor with a session that another has taken since.
+            if refusal is None or refusal.peer is not peer or peer.session in sessions:
+                continue
+            if len(self._known) >= MAX_PEERS:
+                break
+            try:
+                self._keys[peer.name] = self._own.admit(peer)
+            except DecodeError:
+                continue
+            self._known[peer.name] = peer
+            sessions.add(peer.session)
+            del self.refused[peer.name]
+            taken.append(peer.name)
+        return taken
 
     def _forget(self, name: NodeName) -> None:
         self._unlisted.discard(name)

@@ -76,6 +76,7 @@ class ThreadedDataPlane:
         self._watchdog = Watchdog(self._clock())
         self._stopping = False
         self._logged_refusals: dict[NodeName, str] = {}
+        """Their causes."""
         self._logged_conflicts: frozenset[tuple[ServiceName, NodeName, str]] = frozenset()
         self._timer_thread = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
 
@@ -182,34 +183,63 @@ class ThreadedDataPlane:
         with self._lock:
             error = self._engine.apply_peers(peer_set, self._clock())
             woken = self._queue_outputs()
-            conflicts = self._engine.offer_conflicts
-            refused = self._engine.peers.refused
         self._wake(woken)
-        for name, reason in refused.items():
-            if self._logged_refusals.get(name) != reason:
-                log.warning("%s is not talked to, whatever the control plane says: %s", name, reason)
-        self._logged_refusals = refused
+        self._log_peers()
+        return error
+
+    def _log_peers(self) -> None:
+        """Say what is new of those that are not talked to, or get no requests."""
+        with self._lock:
+            conflicts = self._engine.offer_conflicts
+            refused = list(self._engine.peers.refused.values())
+        for refusal in refused:
+            if self._logged_refusals.get(refusal.peer.name) != refusal.cause:
+                name, why = refusal.peer.name, refusal.why
+                log.warning("%s is not talked to, whatever the control plane says: %s", name, why)
+        self._logged_refusals = {refusal.peer.name: refusal.cause for refusal in refused}
         for service, server, kind in sorted(conflicts - self._logged_conflicts):
             log.warning("%s at %s has type %s, unlike the other servers: it gets no requests", service, server, kind)
         self._logged_conflicts = conflicts
-        return error
 
-    def _judge(self, peers: Iterable[Peer]) -> None:
-        """Do the public-key work for these peers before the engine, under its lock, asks what came of it."""
+    def _judge(self, peers: Iterable[Peer]) -> list[Peer]:
+        """Do the public-key work for these peers before the engine, under its lock, asks what came of it.
+
+        Returns the good ones.
+        """
+        good = []
         for peer in peers:
             with contextlib.suppress(DecodeError):
                 self._own.admit(peer)
+                good.append(peer)
+        return good
 
     def trust_changed(self) -> None:
-        """CAs or revocations are others now: peers that are not to be trusted any more lose their sessions at once."""
+        """CAs or revocations are others now: peers that are not to be trusted any more lose their sessions at once.
+
+        Refused ones may be good now.
+        """
         self._own.forget_admitted()
         with self._lock:
-            peers = self._engine.peers.all()
-        self._judge(peers)
+            known, refused = self._engine.peers.all(), self._engine.peers.all_refused()
+        self._judge(known)
+        self._recheck_peers(self._judge(refused))
+
+    def judge_again(self) -> None:
+        """Time has passed, or our clock was set: refused peers may be good now."""
         with self._lock:
-            self._engine.recheck_peers(self._clock())
+            refused = self._engine.peers.all_refused()
+        good = self._judge(refused)
+        if good:
+            self._recheck_peers(good)
+
+    def _recheck_peers(self, judged: list[Peer]) -> None:
+        with self._lock:
+            taken = self._engine.recheck_peers(judged, self._clock())
             woken = self._queue_outputs()
         self._wake(woken)
+        for name in taken:
+            log.info("%s is talked to after all: its credential is good now", name)
+        self._log_peers()
 
     def renew_credential(self, credential: SessionCredential) -> None:
         """Our certificate was renewed, and this session's credential signed anew.

@@ -53,6 +53,9 @@ class Engine:
     def certificate_changed(self, files: TlsFiles) -> None:
         raise AssertionError("insecure here")
 
+    def judge_again(self) -> None:
+        """Nobody is refused here."""
+
     def connection_changed(self, connected: bool, reason: str) -> None:
         """Nothing to do."""
 

@@ -45,6 +45,7 @@ from protos.model import (
     Welcome,
 )
 from protos.plr.v1 import control_pb2
+from sidecar import control_client
 from sidecar.control_client import ControlClient
 from sidecar.core import control_session
 from sidecar.core.control_session import ControlSession
@@ -71,6 +72,7 @@ class Recorder:
         self.report = Report()
         self.error: str | None = None
         self.crash = False
+        self.judgements = 0
 
     def welcome(self, welcome: Welcome) -> None:
         self.welcomes.append(welcome)
@@ -92,6 +94,11 @@ class Recorder:
 
     def certificate_changed(self, files: TlsFiles) -> None:
         raise AssertionError("insecure here")
+
+    def judge_again(self) -> None:
+        self.judgements += 1
+        if self.crash:
+            raise RuntimeError("broken engine")
 
     def connection_changed(self, connected: bool, reason: str) -> None:
         self.connection.put((connected, reason))
@@ -285,6 +292,17 @@ def test_gives_up_a_stream_that_is_never_answered(
         wait_for(lambda: rig.client.stats.attempts >= 2)
         rig.client.stop()
     assert rig.client.stats.streams == 0
+
+
+def test_judges_again_and_again_also_without_control_plane_and_whatever_comes_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(control_client, "JUDGE_AGAIN_S", 0.01)
+    rig = Rig(f"127.0.0.1:{free_port()}")
+    rig.hooks.crash = True
+    rig.client.start()
+    wait_for(lambda: rig.hooks.judgements >= 3)
+    rig.client.stop()
 
 
 @pytest.mark.parametrize("target", ["127.0.0.1:{port}", "no-such-host.invalid:50051"])

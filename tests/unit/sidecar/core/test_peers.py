@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
+from protos.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
     NO_POLICY,
     POLICY_PENDING,
@@ -230,4 +231,81 @@ def test_peers_are_judged_anew_when_trust_changes() -> None:
     own.forget_admitted()
     assert peers.recheck() == [A]
     assert peers.names() == [B]
-    assert peers.refused == {A: "revoked"}
+    assert peers.refused[A].why == "revoked"
+
+
+class Judge:
+    """Judges credentials by what is `wrong` with them, and counts how often it had to look."""
+
+    def __init__(self) -> None:
+        self.wrong: dict[NodeName, DecodeError] = {}
+        self.looks = 0
+        self.own = OwnSession(OWN.credential, private_key("robot-1", 99), self)
+        self.peers = Peers(self.own, Counter())
+
+    def __call__(self, credential: SessionCredential) -> None:
+        self.looks += 1
+        if (error := self.wrong.get(credential.name)) is not None:
+            raise error
+
+
+EARLY = CertificateError(NOT_YET_VALID, "not valid yet, for 99 s")
+
+
+def test_refused_peers_are_taken_once_they_are_judged_good() -> None:
+    judge = Judge()
+    judge.wrong = {A: EARLY, B: CertificateError(UNTRUSTED, "of another CA")}
+    peers = judge.peers
+    assert peers.apply(view(*HELD), nobody) is None
+    assert peers.names() == []
+    assert peers.all_refused() == list(HELD)
+    assert peers.readmit(peers.all_refused()) == []
+    del judge.wrong[A]
+    judge.own.admit(HELD[0])
+    looks = judge.looks
+    assert peers.readmit([HELD[0]]) == [A]
+    assert judge.looks == looks, "what was judged before the lock was taken is not judged again under it"
+    assert [link_peer.name for link_peer in peers.for_links()] == [A]
+    assert set(peers.refused) == {B}
+    assert not peers.drop_if_unlisted(A), "the view lists it"
+
+
+def test_one_dropped_when_trust_changed_comes_back_with_its_trust_unless_the_view_lists_it_no_more() -> None:
+    judge = Judge()
+    peers = judge.peers
+    peers.apply(view(*HELD), nobody)
+    peers.apply(view(HELD[0]), everybody)
+    judge.wrong = {A: CertificateError(UNTRUSTED, "of another CA"), B: CertificateError(UNTRUSTED, "of another CA")}
+    judge.own.forget_admitted()
+    assert peers.recheck() == [A, B]
+    judge.wrong.clear()
+    assert peers.readmit(peers.all_refused()) == [A]
+
+
+def test_a_refused_peer_is_not_taken_against_what_became_known_since() -> None:
+    judge = Judge()
+    judge.wrong = {A: EARLY}
+    peers = judge.peers
+    peers.apply(view(*HELD), nobody)
+    (refused,) = peers.all_refused()
+    judge.wrong.clear()
+    assert peers.restarted(restart(B, session=1), 1.0)
+    assert peers.readmit([refused]) == [], "its session is another's now"
+    peers.apply(view(HELD[1]), nobody)
+    assert peers.readmit([refused]) == [], "a newer view does not list it"
+    assert peers.readmit([peer("stranger", session=7)]) == []
+    assert peers.names() == [B]
+
+
+def test_the_peers_taken_are_no_more_than_the_limit() -> None:
+    judge = Judge()
+    many = tuple(peer(f"n{number}", session=number + 10) for number in range(MAX_PEERS))
+    peers = judge.peers
+    peers.apply(view(HELD[0]), nobody)
+    judge.wrong = {many[0].name: EARLY}
+    peers.apply(view(*many), everybody)
+    assert A in peers, "kept for its paths, in the place of the refused one"
+    judge.wrong.clear()
+    assert peers.readmit(peers.all_refused()) == []
+    assert peers.drop_if_unlisted(A)
+    assert peers.readmit(peers.all_refused()) == [many[0].name]

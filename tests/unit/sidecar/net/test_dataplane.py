@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import random
 import socket
 import threading
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.errors import DecodeError
+from protos.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
     ALL_CALLS,
     Candidate,
@@ -210,6 +212,51 @@ def test_a_peer_that_trust_no_longer_covers_loses_its_session_at_once(nodes: tup
     robot.plane.trust_changed()
     assert robot.plane.engine_stats.dropped["bad_credential"] == 1
     assert cloud.name not in robot.plane._engine.peers
+
+
+def test_a_peer_refused_while_the_clock_was_wrong_is_talked_to_when_it_is_right(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Nobody sends the peers again: those on disk are the newest, and counted as taken."""
+    seconds = itertools.count(1000, -1)
+    wrong = True
+
+    def judge(credential: SessionCredential) -> None:
+        if wrong:
+            raise CertificateError(NOT_YET_VALID, f"not valid yet, for {next(seconds)} s")
+
+    robot, cloud = Node("robot", Role.ROBOT, 1), Node("cloud", Role.CLOUD, 2)
+    robot.own._verify = judge
+    with contextlib.ExitStack() as stack:
+        for node, other in ((robot, cloud), (cloud, robot)):
+            stack.callback(node.stop)
+            node.start(other)
+        for _ in range(3):
+            robot.plane.judge_again()
+            robot.plane.trust_changed()
+        assert caplog.text.count("is not talked to") == 1
+        assert cloud.name not in robot.plane._engine.peers
+        wrong = False
+        robot.plane.judge_again()
+        robot.wait_for(OfferService)
+        submit(robot, 1, b"at last")
+        robot.wait_for(ResponseArrived)
+
+
+def test_a_peer_of_a_ca_that_is_copied_late_is_talked_to_from_then_on(nodes: tuple[Node, Node]) -> None:
+    robot, cloud = nodes
+
+    def judge(credential: SessionCredential) -> None:
+        raise CertificateError(UNTRUSTED, "the certificate is of another CA")
+
+    believe, robot.own._verify = robot.own._verify, judge
+    robot.plane.trust_changed()
+    assert cloud.name not in robot.plane._engine.peers
+    robot.own._verify = believe
+    robot.plane.trust_changed()
+    assert cloud.name in robot.plane._engine.peers
+    submit(robot, 1, b"again")
+    robot.wait_for(ResponseArrived)
 
 
 def test_requests_go_on_while_the_credential_is_signed_anew(nodes: tuple[Node, Node]) -> None:
