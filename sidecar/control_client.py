@@ -145,6 +145,10 @@ class ControlClient:
         """Tell the control plane what we offer and carry now."""
         self._post(lambda: self._session.set_services(ServiceSet(offers, uses)))
 
+    def try_again(self) -> None:
+        """Interfaces or peers are others now: a mapping that was refused for want of them may fit."""
+        self._post(self._try_refused)
+
     def drain(self) -> None:
         """Say that we are going; what is in flight goes on, and so does the stream."""
         self._post(self._session.drain)
@@ -343,21 +347,30 @@ class ControlClient:
         self._note_connection(True, "registered")
 
     def _apply(self, apply: Apply) -> None:
-        content = apply.content
-        failure: Exception | None = None
-        try:
-            if isinstance(content, PeerSet):
-                error = self._hooks.apply_peers(content)
-            else:
-                error = self._hooks.apply_mapping(content)
-        except Exception as raised:
-            failure = raised
-            error = f"internal error: {raised}"
+        error, failure = self._put_in_force(apply)
         self._session.applied(apply, error)
         if error is None:
             self._refusals.taken(apply.resource)
         else:
-            self._refusals.refused(apply.resource, f"{apply.resource.value} version {content.version}", error, failure)
+            what = f"{apply.resource.value} version {apply.content.version}"
+            self._refusals.refused(apply.resource, what, error, failure)
+
+    def _put_in_force(self, apply: Apply) -> tuple[str | None, Exception | None]:
+        """Return why it is refused, or None, and the fault of ours that is the reason, if one is."""
+        content = apply.content
+        try:
+            if isinstance(content, PeerSet):
+                return self._hooks.apply_peers(content), None
+            return self._hooks.apply_mapping(content), None
+        except Exception as failure:
+            return f"internal error: {failure}", failure
+
+    def _try_refused(self) -> None:
+        apply = self._session.refused
+        if apply is not None and self._put_in_force(apply)[0] is None:
+            self._session.applied_late()
+            self._refusals.taken(apply.resource)
+            log.info("%s version %d fits now", apply.resource.value, apply.content.version)
 
     def _take_report(self) -> Report:
         try:

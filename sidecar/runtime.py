@@ -15,7 +15,7 @@ from protos.errors import ConfigError
 from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, Version
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar.control_client import ControlClient
-from sidecar.core.control_session import ControlSession
+from sidecar.core.control_session import Apply, ControlSession
 from sidecar.core.engine import EngineConfig
 from sidecar.metrics import MetricSources, serve_metrics
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
@@ -59,7 +59,7 @@ class Sidecar:
         self._data_plane = ThreadedDataPlane(
             EngineConfig(config.role, rules, config.budgets()),
             own,
-            DataPlaneHooks(self._bridge, self._on_stun, self._on_services_changed),
+            DataPlaneHooks(self._bridge, self._on_stun, self._on_services_changed, self._on_reach_changed),
         )
         last = self._store.last_good
         self._control_session = ControlSession(
@@ -106,11 +106,12 @@ class Sidecar:
         self._interfaces.set_stun_servers(self._stun_servers(last.welcome))
         self._interfaces.start()
         if last.peers is not None:
-            self._restore(ResourceKind.PEERS, self._data_plane.apply_peers(last.peers))
+            self._restore(Apply(ResourceKind.PEERS, last.peers), self._data_plane.apply_peers(last.peers))
         if last.mapping is not None:
-            self._restore(ResourceKind.MAPPING, self._data_plane.apply_mapping(last.mapping))
+            self._restore(Apply(ResourceKind.MAPPING, last.mapping), self._data_plane.apply_mapping(last.mapping))
         self._bridge.start(self._data_plane)
         self._control.start()
+        self._control.try_again()  # an interface may have come before it was noted that the mapping lacks it
 
     def stop(self) -> None:
         """Finish what is in flight, say goodbye, end every thread."""
@@ -152,12 +153,12 @@ class Sidecar:
             problem = f"expected an address and port to listen on, got '{listen}': {error.strerror or error}"
             raise ConfigError("the configuration", "metrics_listen", problem) from error
 
-    def _restore(self, what: ResourceKind, error: str | None) -> None:
+    def _restore(self, held: Apply, error: str | None) -> None:
         if error:
-            log.warning("the %s kept on disk no longer fits: %s", what.value, error)
-            self._control_session.forget(what)
+            log.warning("the %s kept on disk no longer fits: %s", held.resource.value, error)
+            self._control_session.not_restored(held)
         else:
-            log.info("started from the %s kept on disk", what.value)
+            log.info("started from the %s kept on disk", held.resource.value)
 
     def _take_revocations(self, welcome: Welcome) -> None:
         if self._tls is not None and welcome.crl and self._tls.take_revocations(welcome.crl):
@@ -180,6 +181,9 @@ class Sidecar:
 
     def _on_services_changed(self) -> None:
         self._control.set_services(*self._data_plane.services())
+
+    def _on_reach_changed(self) -> None:
+        self._control.try_again()
 
     # -- ControlHooks, on the control client's thread -------------------------------------------------------------
 

@@ -111,6 +111,8 @@ class ControlSession:
         self._candidates = CandidateSet()
         self._services = ServiceSet()
         self._draining = False
+        self.refused: Apply | None = None
+        """The newest mapping, if it could not be put in force: it may fit when interfaces or peers are others."""
         self.state = ControlState.OFFLINE
         self.stats = ControlStats()
         self._retry_at = 0.0
@@ -143,9 +145,10 @@ class ControlSession:
         """What the next registration says of us: the session's credential, signed anew."""
         self._registration = replace(self._registration, credential=credential)
 
-    def forget(self, resource: ResourceKind) -> None:
-        """What the registration said we hold could not be put in force after all."""
-        self._in_force[resource] = Version(0)
+    def not_restored(self, held: Apply) -> None:
+        """What the registration said we hold could not be put in force: it is asked for anew."""
+        self._in_force[held.resource] = Version(0)
+        self._keep_if_refused(held, refused=True)
 
     # ── the stream ──
 
@@ -213,11 +216,24 @@ class ControlSession:
 
     def applied(self, apply: Apply, error: str | None) -> None:
         """The driver put the resource in force, or could not because of `error`."""
+        self._keep_if_refused(apply, refused=error is not None)
         if error is not None:
             self._nack(apply.resource, apply.content.nonce, error)
             return
         self._in_force[apply.resource] = apply.content.version
         self._ack(apply.resource, apply.content.nonce)
+
+    def _keep_if_refused(self, apply: Apply, *, refused: bool) -> None:
+        if apply.resource is ResourceKind.MAPPING:
+            self.refused = apply if refused else None
+
+    def applied_late(self) -> None:
+        """The driver put in force what was `refused`.
+
+        The control plane is not told: for it a refused version stays refused, and it sends what it wants in force
+        again. So the version in force stays here too, and whatever comes is newer.
+        """
+        self.refused = None
 
     def undecodable(self, resource: ResourceKind | None, nonce: int, error: str) -> None:
         """A message broke its format; `resource` and `nonce` as far as they could be read."""

@@ -60,6 +60,8 @@ class DataPlaneHooks:
     stun: Callable[[InterfaceName, StunEvent], None]
     services_changed: Callable[[], None]
     """Offers or uses may have changed: the control plane wants to know."""
+    reach_changed: Callable[[], None]
+    """Interfaces or peers may have come: a mapping that was refused for want of them may fit now."""
 
 
 class ThreadedDataPlane:
@@ -94,6 +96,7 @@ class ThreadedDataPlane:
             self._post_credential()  # it may have been signed anew since they were made
             woken = self._queue_outputs()
         self._wake(woken)
+        self._hooks.reach_changed()
 
     def _post_credential(self) -> None:
         credential = self._own.credential.encode()
@@ -185,6 +188,8 @@ class ThreadedDataPlane:
             woken = self._queue_outputs()
         self._wake(woken)
         self._log_peers()
+        if error is None:
+            self._hooks.reach_changed()
         return error
 
     def _log_peers(self) -> None:
@@ -240,6 +245,7 @@ class ThreadedDataPlane:
         for name in taken:
             log.info("%s is talked to after all: its credential is good now", name)
         self._log_peers()
+        self._hooks.reach_changed()
 
     def renew_credential(self, credential: SessionCredential) -> None:
         """Our certificate was renewed, and this session's credential signed anew.
@@ -317,10 +323,11 @@ class ThreadedDataPlane:
         running = [name for name, link in self._links.items() if not self._watchdog.hangs(link)]
         self._engine.set_interfaces(running, now)
 
-    def _look_for_hung_links(self, now: float) -> None:
+    def _look_for_hung_links(self, now: float) -> bool:
+        """Return whether the interfaces in use are others now."""
         changes = self._watchdog.look(self._links.values(), now)
         if changes is None:
-            return
+            return False
         for link in changes.hung:
             log.warning("%s: its driver does not return; requests take other paths", link.interface)
             link.link.stats.hangs += 1
@@ -329,6 +336,7 @@ class ThreadedDataPlane:
             # What it thinks of its paths is as old as what it still has to send.
             link.post(ResetPaths("driver hung"))
         self._use_links_that_run(now)
+        return True
 
     def _links_for(self, interface: InterfaceName | None) -> list[InterfaceThread]:
         if interface is None:
@@ -357,9 +365,11 @@ class ThreadedDataPlane:
     def _timer_turn(self) -> None:
         with self._lock:
             now = self._clock()
-            self._look_for_hung_links(now)
+            changed = self._look_for_hung_links(now)
             self._engine.handle_timer(now)
             woken = self._queue_outputs()
             if not self._stopping:
                 self._timer.arm(min(self._engine.next_timer(), now + LOOK_EVERY_S))
         self._wake(woken)
+        if changed:
+            self._hooks.reach_changed()

@@ -182,6 +182,26 @@ def test_what_the_engine_refuses_is_nacked(
     assert server.expect(Ack) == Ack(ResourceKind.PEERS, Version(43), 7)
 
 
+def test_a_refused_mapping_is_tried_again_when_the_sidecar_has_news(server: ScriptedControlPlane, rig: Rig) -> None:
+    rig.hooks.error = "/plan: no interface 'wwan7' here"
+    rig.client.start()
+    rig.hooks.expect_connection(True)
+    server.say(MappingSet(Version(7), nonce=5))
+    assert server.expect(Nack).nonce == 5
+    rig.client.try_again()
+    server.say(MappingSet(Version(8), nonce=6))
+    assert server.expect(Nack).nonce == 6, "what fails again is not said again"
+    rig.hooks.error = None
+    rig.client.try_again()
+    wait_for(lambda: rig.hooks.applied)
+    server.say(MappingSet(Version(9), nonce=7))
+    assert server.expect(Ack) == Ack(ResourceKind.MAPPING, Version(9), 7)
+    rig.client.try_again()
+    server.say(PeerSet(Version(41), nonce=8))
+    server.expect(Ack)
+    assert [content.version for content in rig.hooks.applied] == [8, 9, 41], "the newest only, and once"
+
+
 def test_a_crash_of_the_engine_becomes_a_nack_and_the_stream_goes_on(server: ScriptedControlPlane, rig: Rig) -> None:
     rig.hooks.crash = True
     rig.client.start()

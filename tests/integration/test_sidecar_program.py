@@ -266,6 +266,26 @@ def test_a_mapping_on_disk_that_no_longer_fits_is_asked_for_again(program: Progr
 
 
 @pytest.mark.ros
+def test_a_mapping_on_disk_is_in_force_as_soon_as_it_fits_and_stays_on_the_disk(program: Program) -> None:
+    remember(program, PeerSet(Version(10), 0, ()), mapping("lo"))
+    with ScriptedControlPlane(welcome=Welcome(3.0, 0.5)) as control_plane:
+        program.config["control_plane"] = control_plane.target
+        program.path.write_text(yaml.safe_dump(program.config))
+        program.start()
+        program.wait_for_log("registered with the control plane")
+        assert "plr_mapping_version 0.0" in program.metrics()
+        control_plane.say(PEERS)
+        program.wait_for_log("mapping version 12 fits now")
+        assert "plr_mapping_version 12.0" in program.metrics()
+        program.process.send_signal(signal.SIGTERM)
+        assert program.end() == 0
+    program.start()
+    program.wait_for_log("started from the mapping kept on disk")
+    program.process.send_signal(signal.SIGTERM)
+    assert program.end() == 0
+
+
+@pytest.mark.ros
 def test_what_another_program_holds_is_exit_2_and_says_which_key(program: Program) -> None:
     host, port = str(program.config["metrics_listen"]).split(":")
     with socket.create_server((host, int(port))):

@@ -202,11 +202,49 @@ def test_a_new_stream_says_what_is_held_by_now_and_forgets_old_nonces() -> None:
 
 def test_what_the_disk_held_in_vain_is_asked_for_again() -> None:
     session = make_session(peers=4, mapping=5)
-    session.forget(ResourceKind.MAPPING)
+    held = Apply(ResourceKind.MAPPING, mapping(5))
+    session.not_restored(held)
     session.opened(0.0)
     registration = session.messages_to_send(0.0)[0]
     assert isinstance(registration, Registration)
     assert (registration.peers_version, registration.mapping_version) == (4, 0)
+    assert session.refused is held, "it may fit before the control plane is within reach"
+    assert isinstance(session.receive(mapping(5), 0.0), Apply)
+
+
+def test_the_newest_mapping_that_was_refused_is_kept_until_one_is_taken() -> None:
+    session = online(make_session())
+
+    def take(message: PeerSet | MappingSet, error: str | None) -> Apply:
+        event = session.receive(message, 0.0)
+        assert isinstance(event, Apply)
+        session.applied(event, error)
+        return event
+
+    def kept() -> Apply | None:
+        return session.refused
+
+    take(mapping(4), None)
+    take(peers(4), "two peers share a session")
+    assert kept() is None, "only what others may cure is kept"
+    take(mapping(5), "no interface 'wwan0' here")
+    newest = take(mapping(6), "no interface 'wwan0' here")
+    take(peers(5), None)
+    assert kept() is newest
+    take(mapping(7), None)
+    assert kept() is None
+
+
+def test_a_mapping_that_is_taken_late_is_no_answer_to_the_control_plane() -> None:
+    """It counts the version as refused for good, and may give the next one any number above what it was told."""
+    session = online(make_session(mapping=4))
+    event = session.receive(mapping(6), 0.0)
+    assert isinstance(event, Apply)
+    session.applied(event, "no interface 'wwan0' here")
+    assert isinstance(answer(session, 0.0), Nack)
+    session.applied_late()
+    assert session.refused is None
+    assert not any(isinstance(message, Ack | Nack) for message in session.messages_to_send(0.0))
     assert isinstance(session.receive(mapping(5), 0.0), Apply)
 
 

@@ -65,9 +65,10 @@ class Node:
         self.token = session.to_bytes(16, "big")
         self.offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
         self.events: list[ApplicationEvent] = []
+        self.reach_changes = 0
         self.news = threading.Condition()
         config = EngineConfig(role, (ServiceRule(SERVICE, 5.0, 20.0, idempotent=True),))
-        hooks = DataPlaneHooks(self, lambda *_: None, lambda: None)
+        hooks = DataPlaneHooks(self, lambda *_: None, lambda: None, self.count_reach)
         own = self.own = session_of(name, role, session)
         self.plane = ThreadedDataPlane(config, own, hooks)
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -76,6 +77,9 @@ class Node:
         now = time.monotonic()
         identity = LinkIdentity.of(own.credential, self.token, InterfaceName("lo"), InterfaceId(0))
         self.thread = InterfaceThread(sock, Link(identity, random.Random(session), now), None, self.plane)
+
+    def count_reach(self) -> None:
+        self.reach_changes += 1
 
     def handle(self, event: ApplicationEvent) -> None:
         if isinstance(event, ExecuteRequest):
@@ -257,6 +261,30 @@ def test_a_peer_of_a_ca_that_is_copied_late_is_talked_to_from_then_on(nodes: tup
     assert cloud.name in robot.plane._engine.peers
     submit(robot, 1, b"again")
     robot.wait_for(ResponseArrived)
+
+
+def test_tells_when_interfaces_or_peers_are_others(nodes: tuple[Node, Node], monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, cloud = nodes
+
+    def told() -> bool:
+        before, robot.reach_changes = robot.reach_changes, 0
+        return before > 0
+
+    told()
+    robot.plane.set_links({InterfaceName("lo"): robot.thread})
+    assert told()
+    robot.plane.apply_peers(PeerSet(Version(2), 1, (cloud.as_peer(),)))
+    assert told()
+    robot.plane.apply_peers(PeerSet(Version(3), 1, (cloud.as_peer(), replace(cloud.as_peer(), name=NodeName("twin")))))
+    assert not told(), "refused"
+    robot.plane.trust_changed()
+    assert told()
+    for hangs in (True, False):
+        monkeypatch.setattr(robot.thread, "in_turn_for", lambda now, hangs=hangs: 1.0 if hangs else 0.0)
+        end = time.monotonic() + PATIENCE_S
+        while not told():
+            assert time.monotonic() < end
+            time.sleep(0.01)
 
 
 def test_requests_go_on_while_the_credential_is_signed_anew(nodes: tuple[Node, Node]) -> None:
