@@ -58,17 +58,20 @@ def test_200_requests_at_once_to_a_server_with_the_default_queue(mesh: Mesh) -> 
 def test_100_answers_at_once_to_a_client_with_the_default_queue(mesh: Mesh) -> None:
     """The answers come together, as after a dark link; unpaced, such a client gets 10 to 24 of them.
 
-    All arrive unless the client itself stands still for 20 ms, which it may on a busy machine.
+    All arrive unless the client itself stands still for 20 ms, which it may on a busy machine: one of three tries counts.
     """
     mesh.faults.delay_s = lambda: 0.25
     mesh.start()
     mesh.serve("--plan", "/plan", "--deep")
     mesh.wait_carried("/plan")
-    result = mesh.result(mesh.call("/plan", "--count", "100", "--plain", "--timeout-s", "5"))
-    assert result["answered"] > 50
-    assert result["wrong"] == 0
-    assert mesh.robot.stats.answers_sent == {"/plan": 100}
-    assert mesh.robot.stats.answers_paced > 50
+    answered: list[int] = []
+    while len(answered) < 3 and max(answered, default=0) <= 50:
+        result = mesh.result(mesh.call("/plan", "--count", "100", "--plain", "--timeout-s", "5"))
+        answered.append(result["answered"])
+        assert result["wrong"] == 0
+    assert max(answered) > 50, answered
+    assert mesh.robot.stats.answers_sent == {"/plan": 100 * len(answered)}
+    assert mesh.robot.stats.answers_paced > 50 * len(answered)
 
 
 def test_several_services_at_once(mesh: Mesh) -> None:
