@@ -58,7 +58,8 @@ def test_200_requests_at_once_to_a_server_with_the_default_queue(mesh: Mesh) -> 
 def test_100_answers_at_once_to_a_client_with_the_default_queue(mesh: Mesh) -> None:
     """The answers come together, as after a dark link; unpaced, such a client gets 10 to 24 of them.
 
-    All arrive unless the client itself stands still for 20 ms, which it may on a busy machine: one of three tries counts.
+    All arrive unless the client itself stands still for 20 ms, which it may on a busy machine: the best of three tries
+    counts.
     """
     mesh.faults.delay_s = lambda: 0.25
     mesh.start()
