@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from sidecar.core.bandwidth_search import BandwidthSearch, is_faster
 from sidecar.core.delivery_rate import DeliveryRate
 from sidecar.core.loss_ceiling import LossCeiling
+from sidecar.core.policer import Policer
 from sidecar.core.units import DATAGRAM_BYTES, END_HOST_S
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ class CongestionController:
         "_was_down",
         "ceiling",
         "phase",
+        "policer",
         "rate",
     )
 
@@ -105,6 +107,7 @@ class CongestionController:
         self.phase = Phase.STARTUP
         self.rate = DeliveryRate()
         self.ceiling = LossCeiling()
+        self.policer = Policer()
         self._rtt: RttEstimator | None = None
         self._first_window = float(INITIAL_WINDOW_BYTES)
         self._release_at = 0.0
@@ -139,7 +142,9 @@ class CongestionController:
 
     @property
     def _allowance_s(self) -> float:
-        return PAUSE_S if self.rate.is_dry else LATE_S
+        allowed_s = PAUSE_S if self.rate.is_dry else LATE_S
+        policed = self.policer.rate
+        return allowed_s if policed is None else min(allowed_s, self.policer.burst / policed)
 
     def next_release(self, in_flight: int) -> float | None:
         """Return when pacing lets more leave (it may have passed); None when only an acknowledgement can."""
@@ -169,6 +174,10 @@ class CongestionController:
     @property
     def pacing_rate(self) -> float | None:
         """Bytes a second; None while nothing is known of the path."""
+        model, policed = self._model_pace(), self.policer.rate
+        return model if model is None or policed is None else min(model, policed)
+
+    def _model_pace(self) -> float | None:
         rate = self.rate.best
         if not rate or self._rtt is None:
             return None
@@ -188,6 +197,7 @@ class CongestionController:
         """These bytes left; `in_flight` includes them."""
         allowance_s = self._allowance_s
         self.rate.on_sent(now)
+        self.policer.on_sent(now)
         self._probe_credit = 0
         if in_flight <= size:
             self._silent_since = now
@@ -199,6 +209,7 @@ class CongestionController:
     def ran_dry(self) -> None:
         """More might leave, but nothing waits: what is delivered from here on says little of what the path can."""
         self.rate.ran_dry()
+        self.policer.ran_dry()
 
     def on_acked(self, sample: RateSample, rtt: RttEstimator, now: float) -> None:
         """Learn from an acknowledgement."""
@@ -213,7 +224,8 @@ class CongestionController:
             if self.phase is Phase.PROBE_RTT:
                 self._probe_rtt(sample, rtt, now)
         limit = STARTUP_GAIN * (self.rate.settled or self._first_window / max(rtt.minimum, 1e-4))
-        held_back = self.phase is Phase.PROBE_RTT or self._ceiling_binds(rtt)
+        held_back = self.phase is Phase.PROBE_RTT or self.policer.rate is not None or self._ceiling_binds(rtt)
+        self.policer.on_acked(sample.acked_bytes, sample.sent_at)
         round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit, held_back=held_back)
         self.ceiling.on_acked(sample.acked_bytes, sample.rtt_s, rtt, self._model_window(), now)
         if self.phase is Phase.DRAIN and sample.in_flight <= self.rate.best * rtt.minimum:
@@ -235,6 +247,12 @@ class CongestionController:
         """These bytes were lost, the newest of them sent at `sent_at`; `in_flight` is what is left."""
         rtt = self._rtt
         if rtt is None:
+            return
+        # What start-up overflows fills in one round: nothing stands yet.
+        queued = self.phase is Phase.STARTUP and self._stands(self._round_max_rtt, rtt)
+        queued = queued or self.ceiling.meets_queue(rtt)
+        if self.policer.on_lost(lost_bytes, sent_at, rtt.smoothed, now, queued=queued):
+            self.ceiling.forget()
             return
         # What the path is known to carry, if the application asked for less: a loss among few bytes in flight does
         # not tell that the path ends there, and a ceiling that low would take many seconds to grow back.
@@ -279,6 +297,7 @@ class CongestionController:
         self._round_min_rtt, self._round_max_rtt = float("inf"), 0.0
         self._phase_rounds += 1
         self.ceiling.end_round(rtt, now)
+        self.policer.end_round(now)
         if standing_s > rtt.minimum + 2 * END_HOST_S:
             self._standing_rounds += 1
             self._believed_before = max(self._believed_before, self.rate.best)

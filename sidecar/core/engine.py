@@ -283,7 +283,7 @@ class Engine:
                 self._outbox.on_lost(event, now)
             case PathMeasured() if self._knows(event.path):
                 self.routes.set_rtt(event.path, event.smoothed_rtt_s)
-                self.routes.note_fates(event.path, event.arrived, event.missed)
+                self.routes.note_fates(event.path, event.arrived, event.missed, policed=event.policed)
                 self._measurements.path(event)
             case PathChanged():
                 self._on_path_changed(event, now)

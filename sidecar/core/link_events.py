@@ -228,6 +228,8 @@ class PathMeasured:
     """Acknowledged datagrams."""
     missed: int = 0
     """Datagrams found missing while others arrived."""
+    policed: bool = False
+    """What was missed so far was a policer's, and ends with the rate at which it was sent."""
 
 
 @dataclass(frozen=True, slots=True)

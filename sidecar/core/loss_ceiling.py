@@ -133,6 +133,10 @@ class LossCeiling:
         self._recent_lost = 0.0
         return True
 
+    def meets_queue(self, rtt: RttEstimator) -> bool:
+        """Whether what is lost now may have met a queue."""
+        return self._queued or self._queue_before or self._queue.stands(rtt)
+
     def end_round(self, rtt: RttEstimator, now: float) -> None:
         """A round trip is over. What it lost while no datagram met a queue, nor in the one before, is usual."""
         if not self._queued and not self._queue_before and not self._unclear and not self._is_heavy():

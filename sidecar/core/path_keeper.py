@@ -43,7 +43,9 @@ class PathKeeper:
         if newly is None:
             self._table.stats.dropped["acks_the_unsent"] += 1
             return
-        _mark_acked(recovery.late(ack, now))
+        if late := recovery.late(ack, now):
+            _mark_acked(late)
+            path.control.policer.on_spurious(sum(run.size for run in late))
         if not newly:
             return
         _mark_acked(newly)

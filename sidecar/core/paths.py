@@ -266,7 +266,9 @@ class Path:
             sent - self.reported_sent,
             lost - self.reported_lost,
             *self._take_fates(),
+            policed=self.control.policer.was_found,
         )
+        self.control.policer.was_found = False
         self.rtts.clear()
         self.reported_sent, self.reported_lost = sent, lost
         return measured

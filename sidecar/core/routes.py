@@ -62,9 +62,16 @@ class Routes:
         route = self._routes.get(path)
         return 0.0 if route is None else route.smoothed_rtt_s
 
-    def note_fates(self, path: PathId, arrived: int, missed: int) -> None:
-        """Note how many of a path's datagrams arrived and were missed since the last call."""
-        self._get(path).estimate.add(arrived, missed)
+    def note_fates(self, path: PathId, arrived: int, missed: int, *, policed: bool = False) -> None:
+        """Note how many of a path's datagrams arrived and were missed since the last call.
+
+        `policed`: what was lost until now says nothing of what the path loses from now on.
+        """
+        route = self._get(path)
+        if policed:
+            route.estimate = LossEstimate()
+        else:
+            route.estimate.add(arrived, missed)
 
     def loss(self, path: PathId) -> Loss:
         """Return what to expect the path to lose."""

@@ -57,6 +57,29 @@ class Bottleneck:
         return sum(waits) / len(waits) if waits else 0.0
 
 
+class Policed(Bottleneck):
+    """A token bucket drops what exceeds it, before a link that is 20 times as fast."""
+
+    def __init__(self, rate: float, rtt_s: float, bucket: float, loss: float = 0.0, seed: int = 1) -> None:
+        super().__init__(20 * rate, rtt_s, 20 * rate, loss, seed)
+        self.token_rate = rate
+        self.bucket = self.tokens = bucket
+        self.offered = self.policed = 0
+        self.first_drop_at: float | None = None
+        self._filled_at = 0.0
+
+    def carry(self, size: int, arrived: Callable[[], None]) -> None:
+        self.offered += size
+        self.tokens = min(self.bucket, self.tokens + (self.now - self._filled_at) * self.token_rate)
+        self._filled_at = self.now
+        if self.tokens < size:
+            self.policed += size
+            self.first_drop_at = self.now if self.first_drop_at is None else self.first_drop_at
+            return
+        self.tokens -= size
+        super().carry(size, arrived)
+
+
 class Flow:
     """What both kinds of sender share: numbers, losses by the packet threshold, a probe timeout."""
 

@@ -81,3 +81,11 @@ def test_forgetting_a_peer_or_an_interface_leaves_nothing_of_it() -> None:
     assert not table.reaches(A)
     assert table.all_to(A) == []
     assert not table._routes
+
+
+def test_what_a_policer_dropped_is_not_expected_to_go_on() -> None:
+    table = routes()
+    table.note_fates(FAST, 50, 50)
+    assert table.loss(FAST).share > 0.1
+    table.note_fates(FAST, 90, 10, policed=True)
+    assert table.loss(FAST).share == 0.0

@@ -1,0 +1,301 @@
+"""The token rate of a policer on one path: carriers drop what exceeds a token bucket, without queueing it.
+
+The bucket is empty whenever it drops. What arrives of what left between two losses, while there was always something
+to send, is therefore what the tokens allowed; and below that rate nothing is dropped. Loss at random looks the same at
+one rate, but does not end at a lower one, so a rate found is tried first. (After Flach et al., "An Internet-Wide
+Analysis of Traffic Policing", 2016, and the long-term bandwidth of BBRv1. Times are those of sending: a bucket knows of
+no acknowledgements.)
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from sidecar.core.units import DATAGRAM_BYTES
+
+SUSPECT_LOSS = 0.1
+"""Losing this share is worth a trial. Nobody who knows of no policer loses much less to it; radios mostly do."""
+KNOWN_LOSS = 0.02
+"""Losing this share (the loss threshold of draft-ietf-ccwg-bbr) below its rate is, where one is known."""
+SUSPECT_BYTES = 12 * DATAGRAM_BYTES
+"""Fewer losses tell no share."""
+MEMORY_BYTES = 400 * DATAGRAM_BYTES
+"""Over how much the share is measured while no policer is known."""
+SPAN_BYTES = 10 * DATAGRAM_BYTES
+SPAN_S = 0.01
+"""A rate of less is noise."""
+EXACT_BYTES = 30 * DATAGRAM_BYTES
+EXACT_S = 0.1
+"""Measured over this much, a rate is known to MARGIN; or over this time, when less is lost than this is worth."""
+TRIAL_LOSSES = 12
+"""A trial lasts for as many datagrams as would lose so many if the losses were at random."""
+RANDOM = 0.6
+"""They are if at least this share of them is lost all the same ..."""
+POLICED = 0.25
+"""... and not if it is at most this; between these, the rate found is too high, and a lower one is tried. A path that
+loses a share at random passes for policed once in 400 trials (Poisson, three or fewer of twelve)."""
+TRY_AGAIN_S = 20.0
+"""After losses that were at random, a trial only after this time, or when twice as much is lost."""
+MARGIN = 0.97
+"""Of the token rate is used: what was lost before refills the bucket, and the measurement is good for a few percent."""
+GROWTH = 0.03 / 8
+"""Looking for more: the share of the rate added after `t` units of time, per cubed unit. The rate is that measured
+after two units, ..."""
+FORGET = 2.0
+"""... and this many times it after six and a half. Then there is no policer any more."""
+UNIT_S = 1.0
+UNIT_ROUNDS = 10.0
+UNIT_BYTES = 100 * DATAGRAM_BYTES
+"""A unit is the longest of these: what is lost by asking for too much is lost for some round trips."""
+CHANGE_ROUNDS = 2.0
+"""Losses below the rate are not judged sooner than this after it was set: the bucket is still empty."""
+BURST_S = 0.025
+LEAST_BURST = 2 * DATAGRAM_BYTES
+"""What the rate allows in BURST_S may leave at once at first, as without a policer; half of it whenever losses begin
+below the rate: then the bucket holds less."""
+CUT = 0.9
+"""What is left of the rate then, if the burst is the least already and the rate could not be measured."""
+MAX_REMEMBERED = 64
+"""Acknowledgements, and pauses for want of data, by which a span is measured."""
+
+
+class _Fates:
+    """Bytes whose fate is known, of those that left after some moment."""
+
+    __slots__ = ("known", "lost", "since")
+
+    def __init__(self, since: float) -> None:
+        self.since = since
+        self.known = self.lost = 0
+
+    def note(self, size: int, sent_at: float, *, lost: bool) -> None:
+        if sent_at > self.since:
+            self.known += size
+            self.lost += size if lost else 0
+
+    @property
+    def share(self) -> float:
+        return self.lost / max(self.known, 1)
+
+
+class Policer:
+    """What the losses of one path without a queue tell. Sizes in bytes, rates in bytes a second, times in seconds."""
+
+    __slots__ = (
+        "_acks",
+        "_asked_s",
+        "_before",
+        "_delivered",
+        "_dry",
+        "_fates",
+        "_overrun_at",
+        "_paused",
+        "_random",
+        "_rejected_at",
+        "_round_at",
+        "_rtt_s",
+        "_span",
+        "_token_rate",
+        "_trains",
+        "_tried_share",
+        "_usual",
+        "burst",
+        "was_found",
+    )
+
+    def __init__(self) -> None:
+        self.burst = 0.0
+        """Bytes that may leave at once, where a policer is known."""
+        self.was_found = False
+        """Whether a trial told that what was lost before was a policer's; who acts on it resets it."""
+        self._token_rate = self._before = 0.0
+        """0: no policer is known. And what it was before the trial under way."""
+        self._fates = _Fates(float("-inf"))
+        self._tried_share: float | None = None
+        """What was lost before the trial under way; None: there is none."""
+        self._usual = 0.0
+        """What is lost below the token rate."""
+        self._random = 0.0
+        self._rejected_at = float("-inf")
+        """What was lost at random, and when a trial showed that."""
+        self._overrun_at: float | None = None
+        """When looking for more met the policer again; its rate is measured then."""
+        self._asked_s = 0.0
+        """For how long the token rate has held back what there is to send."""
+        self._delivered = 0
+        self._acks: deque[tuple[float, int]] = deque(maxlen=MAX_REMEMBERED)
+        """What was delivered of what had left by some time."""
+        self._trains: deque[float] = deque(maxlen=MAX_REMEMBERED)
+        """When something left after a pause for want of data."""
+        self._span: tuple[float, int] | None = None
+        """Since which loss the rate is measured: when that left, and what was delivered of what left before."""
+        self._paused = self._dry = True
+        """Whether nothing waits to be sent; whether that was so in this round."""
+        self._round_at = 0.0
+        self._rtt_s = 0.0
+
+    # -- asking ---------------------------------------------------------------------------------------------------
+
+    @property
+    def rate(self) -> float | None:
+        """Bytes a second that may be sent; None when no policer is known."""
+        return self._token_rate * self._gain if self._token_rate else None
+
+    @property
+    def _gain(self) -> float:
+        return MARGIN + GROWTH * float((self._asked_s / self._unit_s) ** 3)
+
+    @property
+    def _unit_s(self) -> float:
+        return max(UNIT_S, UNIT_ROUNDS * self._rtt_s, UNIT_BYTES / self._token_rate)
+
+    # -- being told -----------------------------------------------------------------------------------------------
+
+    def ran_dry(self) -> None:
+        """Nothing waits to be sent."""
+        self._paused = self._dry = True
+
+    def on_sent(self, now: float) -> None:
+        """Something left."""
+        if self._paused:
+            self._paused = False
+            self._trains.append(now)
+
+    def on_acked(self, size: int, sent_at: float) -> None:
+        """Take newly acknowledged bytes, the newest of them sent at `sent_at`."""
+        self._delivered += size
+        self._acks.append((sent_at, self._delivered))
+        fates = self._fates
+        fates.note(size, sent_at, lost=False)
+        if not self._token_rate and fates.known > MEMORY_BYTES:
+            fates.known //= 2
+            fates.lost //= 2
+
+    def on_lost(self, size: int, sent_at: float, rtt_s: float, now: float, *, queued: bool) -> bool:
+        """Take a loss, the newest datagram of it sent at `sent_at`; True when a trial begins.
+
+        `queued`: it may have met a queue, which is another's affair.
+        """
+        self._rtt_s = rtt_s
+        if queued:
+            self._span = None
+            return False
+        self._fates.note(size, sent_at, lost=True)
+        if self._tried_share is not None or (self._token_rate and sent_at <= self._fates.since):
+            return False
+        if self._token_rate and self._gain > 1:
+            self._on_overrun(sent_at, now)
+            return False
+        measured = self._measure(sent_at)
+        if self._span is None:
+            self._span = sent_at, self._delivered_by(sent_at)
+            return False
+        if not self._is_suspect(now):
+            if measured and not self._token_rate:
+                self._span = sent_at, self._delivered_by(sent_at)
+            return False
+        return self._try(measured, sent_at, now)
+
+    def on_spurious(self, size: int) -> None:
+        """Bytes taken for lost were only overtaken: a trial for their sake is over, and their end tells nothing."""
+        self._fates.lost = max(0, self._fates.lost - size)
+        if self._tried_share is not None:
+            self._tried_share = None
+            self._token_rate = self._before
+
+    def end_round(self, now: float) -> None:
+        """A round trip is over."""
+        elapsed, self._round_at = now - self._round_at, now
+        dry, self._dry = self._dry, False
+        if not self._token_rate:
+            return
+        if self._tried_share is not None:
+            if self._fates.known * self._tried_share >= TRIAL_LOSSES * DATAGRAM_BYTES:
+                self._judge(self._tried_share, now)
+        elif self._overrun_at is not None:
+            if now - self._overrun_at > self._unit_s:
+                self._overrun_at = None  # nothing more was lost
+        elif not dry:
+            below = self._gain <= 1
+            self._asked_s += elapsed
+            if below and self._gain > 1:
+                self._usual = self._fates.share
+                self._fates = _Fates(now)
+            elif self._gain > FORGET:
+                self._token_rate = 0.0
+
+    # -- trials ---------------------------------------------------------------------------------------------------
+
+    def _is_suspect(self, now: float) -> bool:
+        least = KNOWN_LOSS if self._token_rate else SUSPECT_LOSS
+        if now - self._rejected_at < TRY_AGAIN_S:
+            least = max(least, 2 * self._random)
+        return self._fates.lost >= SUSPECT_BYTES and self._fates.share >= least
+
+    def _try(self, measured: float | None, sent_at: float, now: float) -> bool:
+        """Send no faster than what arrived, and see whether the losses end."""
+        known = self._token_rate
+        if measured is None:
+            if not known or now - self._fates.since < CHANGE_ROUNDS * self._rtt_s:
+                return False
+            measured = known if self.burst > LEAST_BURST else CUT * known
+        self.burst = max(self.burst / 2, LEAST_BURST) if known else BURST_S * measured
+        self._tried_share = self._fates.share
+        self._before = known
+        self._set(measured, sent_at, now)
+        return True
+
+    def _judge(self, tried_share: float, now: float) -> None:
+        share = self._fates.share
+        self._fates = _Fates(now)
+        if share >= RANDOM * tried_share:
+            self._token_rate = self._before
+            self._random, self._rejected_at = tried_share, now
+            self._tried_share = None
+        elif share > POLICED * tried_share:
+            sent_at, _ = self._acks[-1]
+            measured = self._measure(sent_at)
+            self._set(min(self._token_rate, measured or self._token_rate), sent_at, now)
+            self._tried_share = share
+        else:
+            self._tried_share = None
+            self._random = 0.0
+            self.was_found = True
+
+    def _on_overrun(self, sent_at: float, now: float) -> None:
+        """Take a loss above the rate: the bucket is empty. Stay at this rate until the next loss gives that of now."""
+        fates = self._fates
+        if self._overrun_at is None:
+            if fates.lost > 2 * self._usual * fates.known + DATAGRAM_BYTES:
+                self._overrun_at = now
+                self._span = sent_at, self._delivered_by(sent_at)
+            return
+        measured = self._measure(sent_at, min(EXACT_BYTES, max(SPAN_BYTES, EXACT_S * self._token_rate)))
+        if measured or self._span is None:
+            self._set(min(measured or self._token_rate, self._token_rate * self._gain), sent_at, now)
+
+    def _set(self, rate: float, sent_at: float, now: float) -> None:
+        self._token_rate = rate
+        self._asked_s = 0.0
+        self._overrun_at = None
+        self._fates = _Fates(now)
+        self._span = sent_at, self._delivered_by(sent_at)
+
+    # -- measuring ------------------------------------------------------------------------------------------------
+
+    def _measure(self, sent_at: float, least: float = SPAN_BYTES) -> float | None:
+        """The rate of what left since the span began, as far as it arrived; None while that tells nothing."""
+        if self._span is None:
+            return None
+        at, before = self._span
+        if any(at < train <= sent_at for train in self._trains):
+            self._span = None  # during the pause, the bucket may have been full
+            return None
+        delivered = self._delivered_by(sent_at) - before
+        return delivered / (sent_at - at) if sent_at - at >= SPAN_S and delivered >= least else None
+
+    def _delivered_by(self, sent_at: float) -> int:
+        for at, delivered in reversed(self._acks):
+            if at <= sent_at:
+                return delivered
+        return self._acks[0][1] if self._acks else 0
