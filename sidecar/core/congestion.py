@@ -96,6 +96,7 @@ class CongestionController:
         "_search",
         "_silent_since",
         "_standing_rounds",
+        "_unproven_bytes",
         "_was_down",
         "ceiling",
         "phase",
@@ -116,6 +117,8 @@ class CongestionController:
         self._silent_since = 0.0
         self._rate_before_silence = 0.0
         self._search = BandwidthSearch()
+        self._unproven_bytes: float | None = None
+        """In flight at most, until a burst's first acknowledgements prove a rate that nothing confirmed for long."""
         self._phase_rounds = 0
         self._standing_rounds = 0
         self._believed_before = 0.0
@@ -129,6 +132,8 @@ class CongestionController:
 
     def budget(self, now: float, in_flight: int) -> int:
         """Return the bytes that may leave now: 0, or at least one datagram."""
+        if self.rate.is_dry:
+            self._validate(now)
         room = self.window - in_flight
         if room <= 0:
             return self._probe_credit
@@ -139,6 +144,17 @@ class CongestionController:
             late = min(now - self._release_at, self._allowance_s) * pace
             room = min(room, max(burst(pace), late))
         return max(int(room), DATAGRAM_BYTES)
+
+    def _validate(self, now: float) -> None:
+        """Rely on the rate as far as it was confirmed of late, and look for more (RFC 7661; RFC 9002 section 7.8).
+
+        What an unknown path gets may leave in any case.
+        """
+        reliance = self.rate.reliance(now)
+        if reliance < 1 and self.rate.best:
+            if self._unproven_bytes is None and self.phase is Phase.CRUISE:
+                self._look_for_more()
+            self._unproven_bytes = max(float(INITIAL_WINDOW_BYTES), reliance * self._model_window())
 
     @property
     def _allowance_s(self) -> float:
@@ -158,6 +174,8 @@ class CongestionController:
         model = self._model_window()
         if self.ceiling.bytes is not None:
             model = min(model, self.ceiling.bytes)
+        if self._unproven_bytes is not None:
+            model = min(model, self._unproven_bytes)
         least = MIN_WINDOW_BYTES if self.phase is not Phase.PROBE_RTT else MIN_WINDOW_BYTES / 2
         return min(max(model, least), MAX_WINDOW_BYTES)
 
@@ -224,9 +242,14 @@ class CongestionController:
             if self.phase is Phase.PROBE_RTT:
                 self._probe_rtt(sample, rtt, now)
         limit = STARTUP_GAIN * (self.rate.settled or self._first_window / max(rtt.minimum, 1e-4))
-        held_back = self.phase is Phase.PROBE_RTT or self.policer.rate is not None or self._ceiling_binds(rtt)
+        held_back = self._unproven_bytes is not None or self.policer.rate is not None
+        held_back = held_back or self.phase is Phase.PROBE_RTT or self._ceiling_binds(rtt)
         self.policer.on_acked(sample.acked_bytes, sample.sent_at)
         round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit, held_back=held_back)
+        if self.rate.reliance(now) >= 1:
+            self._unproven_bytes = None
+        elif self._unproven_bytes is not None and not self._stands(sample.rtt_s or float("inf"), rtt):
+            self._unproven_bytes += sample.acked_bytes  # as in slow start, where acknowledgements come in clumps
         self.ceiling.on_acked(sample.acked_bytes, sample.rtt_s, rtt, self._model_window(), now)
         if self.phase is Phase.DRAIN and sample.in_flight <= self.rate.best * rtt.minimum:
             self._cruise()

@@ -13,6 +13,7 @@ from sidecar.core.congestion import (
     RateSample,
     burst,
 )
+from sidecar.core.delivery_rate import FRESH_S, HALF_LIFE_S
 from sidecar.core.loss_ceiling import CUT
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.units import DATAGRAM_BYTES
@@ -102,9 +103,9 @@ def test_what_leaves_is_spread_over_time_and_the_timer_says_when_more_may(cruisi
 
 
 def test_a_sender_woken_late_makes_up_for_it_but_not_for_a_pause(cruising: Sender) -> None:
-    cruising.run(1.0, sending=False)
+    cruising.run(0.5, sending=False)
     paused = cruising.control.budget(cruising.now, 0)
-    cruising.run(1.0, sending=False)
+    cruising.run(0.5, sending=False)
     assert cruising.control.budget(cruising.now, 0) == paused
     assert paused <= max(burst(1.25 * RATE), PAUSE_S * 1.25 * RATE)
 
@@ -118,6 +119,23 @@ def test_the_window_is_a_round_trip_or_two(cruising: Sender) -> None:
 def test_a_pause_keeps_the_rate(cruising: Sender) -> None:
     cruising.run(30.0, sending=False)
     assert cruising.control.rate.best == pytest.approx(RATE, rel=0.05)
+
+
+@pytest.mark.audit("dp-6")
+def test_a_rate_that_nothing_confirmed_for_long_is_relied_upon_ever_less_and_a_burst_proves_it(
+    cruising: Sender,
+) -> None:
+    control = cruising.control
+    before = control.window
+    cruising.run(FRESH_S + HALF_LIFE_S, sending=False)
+    control.budget(cruising.now, 0)
+    assert control.window == pytest.approx(before / 2, rel=0.2)  # the last acknowledgements came later
+    cruising.run(60.0, sending=False)
+    control.budget(cruising.now, 0)
+    assert control.window == INITIAL_WINDOW_BYTES
+    assert control.rate.best == pytest.approx(RATE, rel=0.05)
+    cruising.run(1.3 * RTT_S)
+    assert control.window > 0.9 * before
 
 
 def test_after_an_outage_it_starts_from_a_part_of_the_rate(cruising: Sender) -> None:
