@@ -31,7 +31,7 @@ from sidecar.config_fields import (
     converted,
     is_glob,
 )
-from sidecar.core.rules import ServiceRule, find_rule
+from sidecar.core.rules import Rules, ServiceRule
 from sidecar.service_config import NetworkConfig, ServiceConfig
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ def _check_order(config: SidecarConfig, index: int) -> Iterator[_Problem]:
         if service.fallback == name:
             yield ("services", index, "name"), f"expected a service that is not the fallback of services[{other}]"
     if not is_glob(name):
-        winner = find_rule(config.service_rules()[:index], ServiceName(name))
+        winner = Rules(config.service_rules()[:index]).find(ServiceName(name))
         if winner is not None and winner.pattern != name:
             yield (
                 ("services", index, "name"),

@@ -140,7 +140,8 @@ class Request:
         """
         busy = {copy.path.peer for copy in self.relied_on()}
         refused = {copy.path.peer for copy in self.copies if copy.state is CopyState.REJECTED}
-        others = tuple(server for server in servers if server not in busy | refused)
+        asked = busy | refused
+        others = tuple(server for server in servers if server not in asked)
         if others or rejected:
             return others
         hopeless = {copy.path.peer for copy in self.copies if not copy.certainly_not_run}

@@ -242,12 +242,15 @@ class Dispatching:
             fec=rule.fec,
             deadline=request.deadline_at,
             expires=request.expires_at,
+            copy_of=request.id,
             siblings=request.messages if why in _PLANNED and not request.is_race() else None,
         )
         if message is None:
             return False
         explores = why is _Why.EXPLORATION
-        request.copies.append(Copy(path, now, message, explores=explores, hedges=why is _Why.HEDGE))
+        copy = Copy(path, now, message, explores=explores, hedges=why is _Why.HEDGE)
+        request.copies.append(copy)
+        self._parts.in_flight.add_copy(request, copy)
         request.withheld = tuple(other for other in request.withheld if other != path)
         if extra:
             self._budgets.spend(path.interface, content.size)

@@ -37,6 +37,7 @@ class OutboundMessage:
         "answers",
         "begun",
         "content",
+        "copy_of",
         "count",
         "deadline",
         "expected_at",
@@ -65,6 +66,7 @@ class OutboundMessage:
         expires: float,
         symbol: int = BASE_SYMBOL_BYTES,
         answers: RequestId | None = None,
+        copy_of: RequestId | None = None,
         repairs: int = 0,
         siblings: list[OutboundMessage] | None = None,
     ) -> None:
@@ -94,6 +96,8 @@ class OutboundMessage:
         self.acked = bytearray(self.symbols)
         self.answers = answers
         """The request that it answers; the engine's, links do not look at this."""
+        self.copy_of = copy_of
+        """The request that it is a copy of; the engine's as well."""
         self.begun = False
         """Something of it may have left."""
         self.over = False
@@ -151,6 +155,7 @@ class OutboundMessage:
             expires=self.expires,
             symbol=symbol,
             answers=self.answers,
+            copy_of=self.copy_of,
             repairs=-(-self.repairs * symbol_count(self.total, symbol) // self.count),
             siblings=self.siblings if shared else None,
         )

@@ -82,12 +82,14 @@ class Outbox:
         expires: float,
         fec: Redundancy = None,
         answers: RequestId | None = None,
+        copy_of: RequestId | None = None,
         siblings: list[OutboundMessage] | None = None,
     ) -> OutboundMessage | None:
         """Send a message over `path`; None (counted) when there is no room.
 
         `fec`: repair symbols for each source symbol, None: by the path's loss; none at all where they find no room.
         `answers`: the request that it answers, by which `drop_answers` finds it.
+        `copy_of`: the request that it is a copy of.
         `siblings`: what carries the same request already; it becomes one of them.
         """
         if not self.has_room(path.peer, content.size):
@@ -108,6 +110,7 @@ class Outbox:
             symbol=symbol,
             repairs=repairs,
             answers=answers,
+            copy_of=copy_of,
             siblings=siblings,
         )
         self._enter(message)

@@ -12,6 +12,7 @@ the network is known to be longer than that, and is reported so.
 from __future__ import annotations
 
 import heapq
+from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
@@ -38,9 +39,10 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection, Iterable, Iterator
 
     from protos.model import NodeName, ServiceName
+    from sidecar.core.backlog import Step
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.request_parts import RequestParts
     from sidecar.core.rules import ServiceRule
@@ -56,7 +58,8 @@ class RequestTable:
 
     def __init__(self, parts: RequestParts) -> None:
         self._parts = parts
-        self._requests: dict[RequestId, Request] = {}
+        self._requests = parts.in_flight
+        self._backlog = parts.backlog
         self._timers: list[tuple[float, RequestId]] = []
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
@@ -84,13 +87,13 @@ class RequestTable:
             self._parts.measurements.outcome(service, "rejected")
             self._parts.emit(RequestFailed(request_id, service, "rejected", problem, 0.0))
             return
-        self._requests[request_id] = request
+        self._requests.add(request)
         self.unanswered += 1
         self._held_bytes += len(payload)
         heapq.heappush(self._timers, (request.deadline_at, request_id))
         request.dark = self._parts.routes.dark(self._parts.offers.servers(service))
         self._dispatch(request, now)
-        self._notice_unreachable(request)
+        self._notice_unreachable(request, now)
 
     def answered_here(self, request_id: RequestId, now: float) -> None:
         """The application has its answer, not from the network. The request ends at its deadline at the latest."""
@@ -238,44 +241,77 @@ class RequestTable:
 
     def on_peer_gone(self, peer: NodeName, now: float) -> None:
         """A peer's session ended: its copies get no answer any more."""
-        for request in list(self._requests.values()):
-            hit = [copy for copy in request.pending() if copy.path.peer == peer]
-            for copy in hit:
-                copy.state = CopyState.DEAD
-                copy.message.newest.stand_down()
-                self._lost(request, copy, delivered=True)
-            if hit and not request.done:
-                self._rescue(request, now)
-                if not request.pending() and not request.rule.idempotent:
-                    self._fail(request, "failed", f"{peer} went away; it may have run the request", now)
-            self._settle(request, now)
+        copies = self._requests.take_copies_at(peer)
+        if copies:
+            self._backlog.add(lambda: (partial(self._on_copy_dead, *each) for each in copies), now)
+
+    def _on_copy_dead(self, request: Request, copy: Copy, now: float) -> None:
+        if copy.state is not CopyState.PENDING:
+            return
+        copy.state = CopyState.DEAD
+        copy.message.newest.stand_down()
+        self._lost(request, copy, delivered=True)
+        if not request.done:
+            self._rescue(request, now)
+            if not request.pending():
+                if request.rule.idempotent:
+                    self._requests.strand(request)
+                else:
+                    self._fail(request, "failed", f"{copy.path.peer} went away; it may have run the request", now)
+        self._settle(request, now)
 
     def on_path_changed(self, path: PathId, state: PathState, now: float) -> None:
         """Bring requests whose copies are in trouble to another path."""
-        for request in list(self._requests.values()):
-            if request.done or request.answered_here:
-                continue
-            if state is not PathState.UP:
-                hit = [copy for copy in request.pending() if copy.path == path]
-                for copy in hit:
-                    copy.message.newest.stand_down()
-                if hit:
-                    self._rescue(request, now)
-                self._notice_unreachable(request)
-            else:
-                self._reconsider(request, now)
+        if state is PathState.UP:
+            self._backlog.add(self._in_trouble, now, "in trouble")
+            return
+        self._backlog.add(partial(self._look_after_path, path), now, path)
+        if state is PathState.DOWN and not self._parts.routes.reaches(path.peer):
+            for service in self._requests.services():
+                if not self._parts.routes.reaches_any(self._parts.offers.servers(service)):
+                    self._backlog.add(partial(self._unreachable, service), now, ("unreachable", service))
+
+    def _look_after_path(self, path: PathId) -> Iterator[Step]:
+        return self._each(self._look_after, self._requests.over(path))
+
+    @staticmethod
+    def _each(act: Callable[[Request, float], None], requests: Iterable[Request]) -> Iterator[Step]:
+        return (partial(act, request) for request in requests)
+
+    def _in_trouble(self) -> Iterator[Step]:
+        """Look after what is nowhere, or only where nothing is heard of it."""
+        yield from self._each(self._look_after, self._requests.stranded())
+        for path in self._requests.paths():
+            if self._parts.routes.state(path) is not PathState.UP:
+                yield from self._each(self._look_after, self._requests.over(path))
+
+    def _unreachable(self, service: ServiceName) -> Iterator[Step]:
+        return self._each(self._notice_unreachable, self._requests.of(service))
+
+    def _look_after(self, request: Request, now: float) -> None:
+        """A path of this request changed: its copies on others than those that are up are not relied on."""
+        if request.done or request.answered_here or request.id not in self._requests:
+            return
+        for copy in request.pending():
+            if self._parts.routes.state(copy.path) is not PathState.UP:
+                copy.message.newest.stand_down()
+        self._reconsider(request, now)
 
     def on_servers_gained(self, services: Collection[ServiceName], now: float) -> None:
         """Bring requests that wait for a server to one that offers their service from now on."""
-        for request in list(self._requests.values()):
-            if request.service in services and not request.done and not request.answered_here:
-                self._reconsider(request, now)
+        for service in services:
+            requests = self._requests.of(service)
+            if requests:
+                self._backlog.add(partial(self._each, self._look_after, requests), now, ("gained", service))
 
-    def on_withdrawn(self, service: ServiceName, reason: str, now: float) -> None:
-        """The service is not offered here any more: what waits gets no answer, and is told so now."""
-        for request in list(self._requests.values()):
-            if request.service == service and not request.done:
-                self._end(request, f"withdrawn: {reason}", now)
+    def withdraw(self, service: ServiceName, reason: str) -> list[Step]:
+        """Return what ends each request that waits at a service which is not offered here any more."""
+        why = f"withdrawn: {reason}"
+        return [partial(self._withdraw, request, why) for request in self._requests.of(service)]
+
+    def _withdraw(self, request: Request, why: str, now: float) -> None:
+        if not request.done:
+            self._end(request, why, now)
 
     def _reconsider(self, request: Request, now: float) -> None:
         """There is one more way to a server: send what had none, or whose copies are all in trouble."""
@@ -284,7 +320,7 @@ class RequestTable:
         else:
             self._dispatch(request, now)
 
-    def _notice_unreachable(self, request: Request) -> None:
+    def _notice_unreachable(self, request: Request, _now: float) -> None:
         if request.rule.fallback is None or request.found_unreachable or request.done:
             return
         if not any(self._parts.routes.reaches(server) for server in self._parts.offers.servers(request.service)):
@@ -293,12 +329,12 @@ class RequestTable:
 
     def on_copy_lost(self, message: OutboundMessage, now: float) -> None:
         """Nothing is heard of a message: if it is a copy with a backup, that one is sent now."""
-        for request in list(self._requests.values()):
-            if request.done or request.rule.redundancy is not RedundancyMode.BACKUP:
-                continue
-            waiting = request.relied_on()
-            if len(waiting) == 1 and waiting[0].message.newest is message:
-                self._rescue(request, now, insist=True)
+        request = None if message.copy_of is None else self._requests.get(message.copy_of)
+        if request is None or request.done or request.rule.redundancy is not RedundancyMode.BACKUP:
+            return
+        waiting = request.relied_on()
+        if len(waiting) == 1 and waiting[0].message.newest is message:
+            self._rescue(request, now, insist=True)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
@@ -309,8 +345,8 @@ class RequestTable:
         return self._timers[0][0] if self._timers else None
 
     def handle_timer(self, now: float) -> None:
-        """Deadlines and lifetimes that are over."""
-        while self._timers and self._timers[0][0] <= now:
+        """Deadlines and lifetimes that are over, as many as the turn has room for."""
+        while self._timers and self._timers[0][0] <= now and self._backlog.allows(now):
             _, request_id = heapq.heappop(self._timers)
             request = self._requests.get(request_id)
             if request is None:
@@ -391,6 +427,6 @@ class RequestTable:
                     self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
-            self._requests.pop(request.id, None)
+            self._requests.remove(request)
             request.messages.clear()
             self._measure(request, now)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, NodeName
 
+_order = attrgetter("order")
 _RANK = {PathState.UP: 0, PathState.UNSTABLE: 1, PathState.DOWN: 2}
 
 
@@ -28,11 +30,26 @@ class Route:
     max_datagram: int = BASE_BYTES
     """Bytes of UDP payload."""
     estimate: LossEstimate = field(default_factory=LossEstimate)
+    order: tuple[int, float, PathId] = field(init=False)
+    """Sorts the better path first; kept ready, as every request asks for that of every path."""
 
-    @property
-    def order(self) -> tuple[int, float, PathId]:
-        """Sorts the better path first."""
-        return (_RANK[self.state], self.smoothed_rtt_s, self.id)
+    def __post_init__(self) -> None:
+        self._set_order()
+
+    def set_state(self, state: PathState) -> None:
+        """Note its liveness."""
+        self.state = state
+        if state is PathState.DOWN:
+            self.max_datagram = BASE_BYTES
+        self._set_order()
+
+    def set_rtt(self, smoothed_rtt_s: float) -> None:
+        """Note its smoothed round-trip time."""
+        self.smoothed_rtt_s = smoothed_rtt_s
+        self._set_order()
+
+    def _set_order(self) -> None:
+        self.order = (_RANK[self.state], self.smoothed_rtt_s, self.id)
 
 
 class Routes:
@@ -41,13 +58,18 @@ class Routes:
     def __init__(self) -> None:
         self._routes: dict[PathId, Route] = {}
         self._by_peer: dict[NodeName, dict[PathId, Route]] = {}
+        self._reached: set[NodeName] = set()
 
     def set_state(self, path: PathId, state: PathState) -> None:
         """Note a path's liveness."""
-        route = self._get(path)
-        route.state = state
-        if state is PathState.DOWN:
-            route.max_datagram = BASE_BYTES
+        self._get(path).set_state(state)
+        self._look_whether_reached(path.peer)
+
+    def _look_whether_reached(self, peer: NodeName) -> None:
+        if any(route.state is not PathState.DOWN for route in self._by_peer.get(peer, {}).values()):
+            self._reached.add(peer)
+        else:
+            self._reached.discard(peer)
 
     def set_max_datagram(self, path: PathId, size: int) -> None:
         """Note how long a path's datagrams may be, in bytes of UDP payload."""
@@ -55,7 +77,7 @@ class Routes:
 
     def set_rtt(self, path: PathId, smoothed_rtt_s: float) -> None:
         """Note a path's smoothed round-trip time."""
-        self._get(path).smoothed_rtt_s = smoothed_rtt_s
+        self._get(path).set_rtt(smoothed_rtt_s)
 
     def rtt(self, path: PathId) -> float:
         """Return a path's smoothed round-trip time in seconds, 0 while none is known."""
@@ -82,6 +104,7 @@ class Routes:
         """The peer is not to be talked to any more."""
         for path in self._by_peer.pop(peer, {}):
             del self._routes[path]
+        self._reached.discard(peer)
 
     def forget_interface(self, interface: InterfaceName) -> list[PathId]:
         """The interface is gone; returns the paths it had."""
@@ -89,6 +112,7 @@ class Routes:
         for path in paths:
             del self._routes[path]
             del self._by_peer[path.peer][path]
+            self._look_whether_reached(path.peer)
         return paths
 
     def state(self, path: PathId) -> PathState:
@@ -98,7 +122,11 @@ class Routes:
 
     def reaches(self, peer: NodeName) -> bool:
         """Whether any path to the peer is not down."""
-        return any(route.state is not PathState.DOWN for route in self._by_peer.get(peer, {}).values())
+        return peer in self._reached
+
+    def reaches_any(self, peers: Iterable[NodeName]) -> bool:
+        """Whether any path to any of these peers is not down."""
+        return not self._reached.isdisjoint(peers)
 
     def dark(self, peers: Iterable[NodeName]) -> tuple[InterfaceName, ...]:
         """Return our interfaces over which there are paths to these peers, but none that is up."""
@@ -110,8 +138,16 @@ class Routes:
 
     def usable(self, peers: Iterable[NodeName]) -> list[Route]:
         """Return the paths to these peers that are not down, best first."""
-        routes = (route for peer in peers for route in self._by_peer.get(peer, {}).values())
-        return sorted((route for route in routes if route.state is not PathState.DOWN), key=lambda route: route.order)
+        return sorted(
+            (
+                route
+                for peer in peers
+                if peer in self._reached
+                for route in self._by_peer[peer].values()
+                if route.state is not PathState.DOWN
+            ),
+            key=_order,
+        )
 
     def all_to(self, peer: NodeName) -> list[Route]:
         """Return every known path to the peer."""
@@ -128,7 +164,7 @@ class Routes:
             for path, route in self._by_peer.get(peer, {}).items()
             if path.interface == interface and route.state is not PathState.DOWN
         ]
-        return min(routes, key=lambda route: route.order, default=None)
+        return min(routes, key=_order, default=None)
 
     def best_to(self, peer: NodeName, avoid: PathId | None = None, size: int = 0) -> PathId | None:
         """Return the best path to the peer that is not down, preferably one that carries datagrams of `size` bytes.
@@ -159,7 +195,7 @@ class Routes:
             and route.max_datagram >= size
             and route.smoothed_rtt_s <= slowest
         ]
-        best = min(others, key=lambda route: route.order, default=None)
+        best = min(others, key=_order, default=None)
         return None if best is None else best.id
 
     def max_datagram(self, path: PathId) -> int:

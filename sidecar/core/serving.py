@@ -11,7 +11,7 @@ from sidecar.core.events import ExecuteRequest, RejectReason
 from sidecar.core.forbidden import ForbiddenCalls
 from sidecar.core.messages import encode_message
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
+from sidecar.core.rules import MAX_LIFETIME_S, Rules
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 class ServingParts:
     """What the serving side works with."""
 
-    rules: tuple[ServiceRule, ...]
+    rules: Rules
     routes: Routes
     outbox: Outbox
     stats: EngineStats
@@ -77,7 +77,7 @@ class Serving:
         if refusal and not self.executions.knows(message.request_id):
             self._reply([self.executions.refuse_unseen(Waiter(path, message.copy), message, *refusal, now)])
             return
-        rule = find_rule(self._parts.rules, message.service)
+        rule = self._parts.rules.find(message.service)
         patience_s = rule.lifetime_s if rule else MAX_LIFETIME_S
         outcome = self.executions.on_request(path, message, now, patience_s=patience_s)
         if isinstance(outcome, ExecuteRequest):
@@ -126,7 +126,7 @@ class Serving:
     def _reply(self, replies: list[Reply]) -> None:
         routes = self._parts.routes
         for reply in replies:
-            rule = find_rule(self._parts.rules, reply.service)
+            rule = self._parts.rules.find(reply.service)
             path = reply.waiter.path
             if routes.state(path) is PathState.DOWN:
                 path = routes.best_to(path.peer) or path

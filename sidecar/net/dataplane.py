@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         SessionId,
     )
     from sidecar.core.events import ExecutionId, RejectReason, RequestId
+    from sidecar.core.inbound import Decoding
     from sidecar.core.link_events import LinkEvent
     from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
@@ -48,6 +49,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+EVENTS_A_TURN = 32
+"""A link's events that are taken without letting go of the lock: a path that goes down hands back thousands."""
+YIELD_S = 100e-6
+"""Between two turns of one thread, for whoever waits for the lock: the lock goes to who asks first, and a thread that
+must be woken for it is too late."""
 ERROR_PAUSE_S = 0.1
 """After an internal error, which may repeat itself at every turn."""
 
@@ -290,13 +296,17 @@ class ThreadedDataPlane:
         """Take what a link saw."""
         engine = self._engine
         while events:
-            now = self._clock()
-            with self._lock:
-                for event in events:
-                    engine.on_link_event(event, now)
-                decodings = engine.take_decodings()
-                woken = self._queue_outputs()
-            self._wake(woken)
+            decodings: list[Decoding] = []
+            for first in range(0, len(events), EVENTS_A_TURN):
+                if first:
+                    time.sleep(YIELD_S)
+                now = self._clock()
+                with self._lock:
+                    for event in events[first : first + EVENTS_A_TURN]:
+                        engine.on_link_event(event, now)
+                    decodings += engine.take_decodings()
+                    woken = self._queue_outputs()
+                self._wake(woken)
             # On this link's thread, with nothing locked.
             events = [decoding.run() for decoding in decodings]
 
@@ -360,6 +370,8 @@ class ThreadedDataPlane:
                 log.exception("internal error; the timers go on")
                 time.sleep(ERROR_PAUSE_S)
             else:
+                if self._timer.due <= self._clock():
+                    time.sleep(YIELD_S)
                 self._timer.wait()
 
     def _timer_turn(self) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import ServiceOffer
 from sidecar.core.events import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest, RejectReason
-from sidecar.core.rules import find_rule
+from sidecar.core.rules import Rules
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.service_runner import Execution, ServiceRunner
@@ -45,7 +45,7 @@ class CloudSide:
         limited_log: LimitedLog,
     ) -> None:
         self._loop = loop
-        self._rules = rules
+        self._rules = Rules(rules)
         self._data_plane = data_plane
         self._stats = stats
         self._limited = limited_log
@@ -190,7 +190,7 @@ class CloudSide:
         wanted: dict[ServiceName, str] = {}
         for name, service in served.items():
             types = service.applications()
-            if not types or find_rule(self._rules, name) is None:
+            if not types or self._rules.find(name) is None:
                 continue
             runner = self._runners.get(name)
             # Two types under one name: the one in use stays, else the choice is at least the same every time.
@@ -264,7 +264,7 @@ class CloudSide:
         offers = tuple(
             ServiceOffer(name, runner.type.name, rule.capacity, rule.charge)
             for name, runner in sorted(matched.items())
-            if (rule := find_rule(self._rules, name)) is not None
+            if (rule := self._rules.find(name)) is not None
         )
         if offers == self._offers:
             return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.core.rules import find_rule
+from sidecar.core.rules import Rules
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.service_proxy import ServiceProxy
@@ -51,7 +51,7 @@ class Proxies:
         """`on_closed` is told how many requests lay at a proxy unseen."""
         self._loop = loop
         self._own_node = loop.node.get_fully_qualified_name()
-        self._rules = rules
+        self._rules = Rules(rules)
         self._stats = stats
         self._on_request = on_request
         self._on_bad_request = on_bad_request
@@ -67,7 +67,7 @@ class Proxies:
 
     def offer(self, event: OfferService) -> None:
         """A server in the network offers this."""
-        if find_rule(self._rules, event.name) is None:
+        if self._rules.find(event.name) is None:
             self._stats.dropped["offer_not_in_rules"] += 1
             log.error("service %s is offered, but no rule of this sidecar carries it", event.name)
             return

@@ -43,9 +43,10 @@ def test_what_is_over_leaves_no_trace_among_those_that_wait_for_room() -> None:
     table = crowded()
     assert table.sent()
     table.table.answered_here(request_id(ASKED), 0.5)
-    table.table.handle_timer(1.0)
+    table.handle_timers(1.0)
     assert table.table.unanswered == ASKED - 1
-    table.table.on_withdrawn(ECHO, "", 2.0)
+    for step in table.table.withdraw(ECHO, ""):
+        step(2.0)
     assert table.table._no_room.services() == []
     table.table.on_room(2.0)
     assert table.sent() == []
@@ -54,7 +55,7 @@ def test_what_is_over_leaves_no_trace_among_those_that_wait_for_room() -> None:
 
 def test_a_request_that_found_no_room_until_its_end_says_so() -> None:
     table = crowded()
-    table.table.handle_timer(20.0)
+    table.handle_timers(20.0)
     reasons = {event.reason for event in table.events if hasattr(event, "reason")}
     assert reasons == {"no answer within 10 s", "no room to send it within 10 s"}
 

@@ -141,7 +141,7 @@ def test_hedges_that_win_do_not_make_the_next_ones_sooner() -> None:
     learn(table, 0.1, 60)
     for number in range(1, 60):
         table.submit(number)
-        table.table.handle_timer(0.3)
+        table.handle_timers(0.3)
         table.respond(B, 1, number, now=0.35)
     table.submit(500)
     timer = table.table.next_timer()
