@@ -80,5 +80,4 @@ def test_16_mb_both_ways_while_the_network_changes(lab: Lab, tmp_path: Path, tro
         assert len(ours.take_one_way()) == 22  # each ran once
     assert undisturbed is not None
     assert disturbed is not None
-    print(trouble.__name__, undisturbed, disturbed)
     assert disturbed < 2 * undisturbed + 2.0
