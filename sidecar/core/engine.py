@@ -368,6 +368,8 @@ class Engine:
         if state is PathState.UP:
             self._outbox.on_path_up(path)
             self._inbound.on_path_up(path)
+            if self._requests.unanswered:  # they wait: the other paths may be back as well, and share them
+                self._seek(frozenset((path.peer,)))
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
             self._drop_if_unlisted(path.peer, now)
         if self.routes.reaches(path.peer) is not reached:
