@@ -95,6 +95,7 @@ class Sidecar:
             self._control_session.stats,
             self._store.control_addresses(names),
             lambda addresses: self._store.remember_addresses(names, addresses),
+            self._data_plane.check_paths,
         )
         self._control = ControlClient(self._dialer, self._control_session, self, self._tls)
         self._interfaces = InterfaceManager(

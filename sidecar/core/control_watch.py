@@ -27,8 +27,13 @@ CONFIRMED_S = 0.25
 """While the data plane does not hear anybody over this interface either."""
 ROUND_TRIPS = 3.0
 """No silence is shorter than so many of the connection's round trips, at their worst."""
+DOUBT_S = 0.15
+"""Then the data plane is asked to find out now, whatever its paths have to do."""
 LOOK_S = 0.25
 """While something is unacknowledged, the kernel is asked this often."""
+KEEPALIVE_S = 1
+"""A connection that says nothing is asked for an acknowledgement after so long, the least that Linux knows, and as
+often: by kernels, so that it costs neither end a turn of Python."""
 LIVED_S = 600.0
 """A connection that lived so long proves its interface."""
 
@@ -40,7 +45,7 @@ class Seen:
     """What the kernel says of the connection."""
 
     unacked: bool
-    """Whether something sent is not acknowledged yet."""
+    """Whether something sent, if only by the kernel to ask for it, is not acknowledged yet."""
     quiet_s: float
     """Since the last acknowledgement or data."""
     rtt_s: float
@@ -71,6 +76,7 @@ class ControlWatch:
         self._waiting_since: float | None = None
         self._rtt_s = 0.0
         self._look_at = now
+        self._doubted_at = now
 
     @property
     def over(self) -> InterfaceName | None:
@@ -81,7 +87,7 @@ class ControlWatch:
         """Something that wants an acknowledgement was sent."""
         if self._waiting_since is None:
             self._waiting_since = now
-            self._look_at = now + LOOK_S
+            self._look_at = now + DOUBT_S
 
     def saw(self, seen: Seen, now: float) -> None:
         """The kernel was asked."""
@@ -93,11 +99,20 @@ class ControlWatch:
         if not seen.unacked:
             self._waiting_since = None
         elif self._waiting_since is None:
-            self._waiting_since = now
+            self._waiting_since = min(now, self._heard_at + KEEPALIVE_S)
         else:
             self._waiting_since = max(self._waiting_since, self._heard_at)
         if self._over is not None and now >= self._began + LIVED_S:
             self._ways.held_well(self._over)
+
+    def take_doubt(self, now: float) -> InterfaceName | None:
+        """The interface whose paths are to be probed now, once for each silence."""
+        if self._waiting_since is None or self._doubted_at >= self._waiting_since:
+            return None
+        if now < self._waiting_since + max(DOUBT_S, self._rtt_s) or self._ways.another(self._over, now) is None:
+            return None
+        self._doubted_at = now
+        return self._over
 
     def judge(self, now: float) -> Leave | None:
         """Whether to leave it now; call `saw` first."""
@@ -137,7 +152,9 @@ class ControlWatch:
 
     def next_timer(self, now: float) -> float | None:
         """When to ask the kernel and to `judge`, unless something is sent or the network changes."""
-        better_at = self._ways.next_better(self._over, now)
+        times = [self._ways.next_better(self._over, now)]
         if self._waiting_since is not None:
-            return self._look_at if better_at is None else min(self._look_at, better_at)
-        return better_at
+            times.append(self._look_at)
+        elif self._ways.another(self._over, now) is not None:
+            times.append(max(now + DOUBT_S, self._heard_at + KEEPALIVE_S + DOUBT_S))
+        return min((at for at in times if at is not None), default=None)

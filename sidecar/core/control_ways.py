@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceName
 
+MAX_STATES = 256
+"""Interfaces whose past is remembered, as many as the data plane has numbers for."""
 MAX_ADDRESSES = 16
 """Addresses of the control plane that are tried: eight names of two families."""
 
@@ -39,7 +41,7 @@ leave time to be back within two seconds."""
 
 WELL_S, MAX_WELL_S = 15.0, 600.0
 """A cheaper interface takes the stream back when it has been well for so long; twice that for each time that a stream
-over it fell silent."""
+over it had to be given up."""
 
 DIAL_DROPS = (ADDRESSES_FULL, STRANGER) = ("addresses_full", "stranger")
 """What is counted: addresses of the control plane beyond MAX_ADDRESSES; who else connects to gRPC's line."""
@@ -125,6 +127,8 @@ class ControlWays:
         self._interfaces: dict[InterfaceName, ControlInterface] = {}
         self._addresses: tuple[Address, ...] = ()
         self._states: dict[InterfaceName, _InterfaceState] = {}
+        """Of those that are away as well: who comes back has not earned more trust by it."""
+        self._paths: Mapping[InterfaceName, PathState] = {}
         self._failures: dict[Way, _Failure] = {}
         self._proven: Way | None = None
         self.can_bind = True
@@ -134,8 +138,15 @@ class ControlWays:
 
     def set_interfaces(self, interfaces: Sequence[ControlInterface], now: float) -> None:
         """These can carry something now, in this order."""
+        before = self._interfaces
         self._interfaces = {interface.name: interface for interface in interfaces}
-        self._states = {name: self._states.get(name) or _InterfaceState(since=now) for name in self._interfaces}
+        if len(self._states) > MAX_STATES:
+            self._states = {name: state for name, state in self._states.items() if name in self._interfaces}
+        for name in self._interfaces:
+            state = self._states.setdefault(name, _InterfaceState())
+            if name not in before:
+                state.life, state.since, state.down = Life.UNKNOWN, now, False
+        self.set_paths(self._paths, now)
         self._prune()
 
     def set_addresses(self, addresses: Iterable[Address]) -> None:
@@ -148,7 +159,9 @@ class ControlWays:
 
     def set_paths(self, best: Mapping[InterfaceName, PathState], now: float) -> None:
         """The best state of the data plane's paths over each interface that has some."""
-        for name, state in self._states.items():
+        self._paths = best
+        for name in self._interfaces:
+            state = self._states[name]
             path = best.get(name)
             if path is PathState.UP:
                 life = Life.LIVING
@@ -174,7 +187,7 @@ class ControlWays:
         self._failures.pop(way, None)
         self._proven = way
 
-    def fell_silent(self, name: InterfaceName | None) -> None:
+    def disappointed(self, name: InterfaceName | None) -> None:
         """What went over it had to be given up: the next time it must be well for longer."""
         state = None if name is None else self._states.get(name)
         if state is not None:
@@ -299,7 +312,7 @@ class ControlWays:
 
     def _others_live(self, name: InterfaceName | None) -> bool:
         """Whether somebody is heard over another interface: then it is not the peers that are gone."""
-        return any(state.life is Life.LIVING for other, state in self._states.items() if other != name)
+        return any(self._states[other].life is Life.LIVING for other in self._interfaces if other != name)
 
     def _head_start_s(self, ways: Sequence[Way]) -> float:
         living = any(self.life(way.interface) is Life.LIVING for way in ways)

@@ -73,14 +73,19 @@ class ControlDialer:
         stats: ControlStats,
         kept: Sequence[Address] = (),
         remember: Callable[[tuple[Address, ...]], None] = lambda addresses: None,
+        check_paths: Callable[[InterfaceName], None] = lambda interface: None,
     ) -> None:
-        """`names` are host:port; `kept` addresses that worked in an earlier run, of which `remember` is told."""
+        """`names` are host:port; `kept` addresses that worked in an earlier run, of which `remember` is told.
+
+        `check_paths` asks the data plane to find out now whether an interface carries anything; `set_paths` follows.
+        """
         self.names = names
         self.stats = stats
         self.ways = ControlWays(stats.dial_drops)
         self._found: tuple[Address, ...] = tuple(one for name in names if (one := numeric_host(name)) is not None)
         self._kept = tuple(kept)
         self._remember = remember
+        self.check_paths = check_paths
         self._has_names = len(self._found) < len(names)
         self._resolver = HostNames("control plane", lambda addresses: self._post(lambda: self._use(addresses)))
         self._line: ControlLine | None = None
@@ -235,6 +240,7 @@ class ControlLine:
         """The stream has ended; `refused` by the control plane's decision, and not by ours if it was not `welcomed`."""
         if self.way is not None and not welcomed and not self.ended.done():
             self._dialer.ways.failed(self.way, time.monotonic(), whole_address=refused)
+            self._dialer.ways.disappointed(self.way.interface)
 
     async def serve(self) -> None:
         """Do the work; cancelled when the stream is over."""
@@ -364,6 +370,9 @@ class ControlLine:
             self.wake.clear()
             watch.saw(look(outside), time.monotonic())
             leave = watch.judge(time.monotonic())
+            doubted = watch.take_doubt(time.monotonic())
+            if doubted is not None:
+                self._dialer.check_paths(doubted)
             if leave is not None and (leave.cause != CHEAPER or await self._moved(leave)):
                 break
             now = time.monotonic()
@@ -373,7 +382,8 @@ class ControlLine:
         self._dialer.stats.connections_left[leave.cause] += 1
         if leave.cause == SILENT and self.way is not None:
             self._dialer.ways.failed(self.way, time.monotonic())
-            self._dialer.ways.fell_silent(watch.over)
+        if leave.cause != CHEAPER:
+            self._dialer.ways.disappointed(watch.over)
         self._end(leave)
 
     async def _moved(self, leave: Leave) -> bool:

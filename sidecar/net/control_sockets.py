@@ -8,7 +8,7 @@ import socket
 import struct
 from typing import TYPE_CHECKING
 
-from sidecar.core.control_watch import Seen
+from sidecar.core.control_watch import KEEPALIVE_S, Seen
 
 if TYPE_CHECKING:
     from protos.model import Address
@@ -24,8 +24,9 @@ BACKLOG = 8
 """gRPC's own connection, and room beside those that others make meanwhile."""
 
 _UCRED = struct.Struct("3i")
-# struct tcp_info of linux/tcp.h: eight bytes, then 32-bit numbers of which these are some.
+# struct tcp_info of linux/tcp.h: eight bytes, then 32-bit numbers; these are some of them.
 _TCP_INFO_BYTES = 104
+_PROBES = 3
 _UNACKED, _LAST_DATA_RECV_MS, _LAST_ACK_RECV_MS, _RTT_US, _RTTVAR_US = 24, 52, 56, 68, 72
 
 
@@ -70,6 +71,9 @@ def open_stream(way: Way) -> socket.socket:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT_MS)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
         if way.interface is not None:
             try:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, way.interface.encode())
@@ -95,7 +99,7 @@ def look(sock: socket.socket) -> Seen:
         return int.from_bytes(info[offset : offset + 4], "little" if struct.pack("=H", 1)[0] else "big")
 
     return Seen(
-        unacked=number(_UNACKED) > 0,
+        unacked=number(_UNACKED) > 0 or info[_PROBES] > 0,
         quiet_s=min(number(_LAST_DATA_RECV_MS), number(_LAST_ACK_RECV_MS)) / 1e3,
         rtt_s=(number(_RTT_US) + 4 * number(_RTTVAR_US)) / 1e6,
     )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link_events import ResetPaths, SendClose, SetCredential
+from sidecar.core.link_events import CheckPaths, ResetPaths, SendClose, SetCredential
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
@@ -270,6 +270,13 @@ class ThreadedDataPlane:
         """Return what was measured since the last call."""
         with self._lock:
             return self._engine.take_report()
+
+    def check_paths(self, interface: InterfaceName) -> None:
+        """The control stream is not answered over this interface: find out whether anything else is."""
+        link = self._links.get(interface)
+        if link is not None:
+            link.post(CheckPaths())
+            link.wake()
 
     # -- what metrics and status read -----------------------------------------------------------------------------
 
