@@ -34,7 +34,7 @@ LOOK_S = 0.25
 KEEPALIVE_S = 1
 """A connection that says nothing is asked for an acknowledgement after so long, the least that Linux knows, and as
 often: by kernels, so that it costs neither end a turn of Python."""
-LIVED_S = 600.0
+LIVED_S = 60.0
 """A connection that lived so long proves its interface."""
 
 SILENT, GONE, CHEAPER = LEAVE_CAUSES = ("silent", "gone", "cheaper")
@@ -122,8 +122,6 @@ class ControlWatch:
         limit_s = self._limit_s(now)
         if limit_s is not None and self._waiting_since is not None and now >= self._waiting_since + limit_s:
             return Leave(SILENT, f"nothing comes over {over or 'its interface'}")
-        if self._silence_is_certain():
-            return Leave(SILENT, f"nothing comes over {over}, by its paths")
         better = self._ways.better(over, now)
         if better and self._waiting_since is None:
             return Leave(CHEAPER, f"{better[0].interface} is well, and costs less than {over}", tuple(better))
@@ -139,16 +137,6 @@ class ControlWatch:
         else:
             shortest = SILENT_S if another is Life.LIVING else SILENT_WITHOUT_NEWS_S
         return max(shortest, ROUND_TRIPS * self._rtt_s)
-
-    def _silence_is_certain(self) -> bool:
-        """Whether all paths are given up since the connection was last heard of: it need not carry anything to know."""
-        since = self._ways.silent_since(self._over)
-        return (
-            since is not None
-            and self._over is not None
-            and self._ways.is_down(self._over)
-            and max(self._heard_at, self._began) < since
-        )
 
     def next_timer(self, now: float) -> float | None:
         """When to ask the kernel and to `judge`, unless something is sent or the network changes."""

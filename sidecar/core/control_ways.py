@@ -107,8 +107,6 @@ class WayClass:
 class _InterfaceState:
     life: Life = Life.UNKNOWN
     since: float = 0.0
-    down: bool = False
-    """Silent for so long that all of its paths are given up."""
     well_s: float = WELL_S
 
 
@@ -145,7 +143,7 @@ class ControlWays:
         for name in self._interfaces:
             state = self._states.setdefault(name, _InterfaceState())
             if name not in before:
-                state.life, state.since, state.down = Life.UNKNOWN, now, False
+                state.life, state.since = Life.UNKNOWN, now
         self.set_paths(self._paths, now)
         self._prune()
 
@@ -171,7 +169,6 @@ class ControlWays:
                 life = Life.UNKNOWN
             if life is not state.life:
                 state.life, state.since = life, now
-            state.down = path is PathState.DOWN
 
     def failed(self, way: Way, now: float, *, whole_address: bool = False) -> None:
         """It led to no control plane, or no longer does; `whole_address`: whatever the interface."""
@@ -217,11 +214,6 @@ class ControlWays:
         if state is None or state.life is not Life.SILENT or not self._others_live(name):
             return None
         return state.since
-
-    def is_down(self, name: InterfaceName) -> bool:
-        """Whether the data plane has given up every path over it."""
-        state = self._states.get(name)
-        return state is not None and state.down
 
     def has(self, name: InterfaceName) -> bool:
         """Whether it can carry anything now."""

@@ -98,16 +98,6 @@ def test_what_is_acknowledged_stays_whatever_the_data_plane_says() -> None:
         assert net.cause(now + 0.3) is None
 
 
-def test_a_connection_that_says_nothing_goes_when_all_paths_are_given_up() -> None:
-    net = Net()
-    net.ways.set_paths({WLAN: UP, WWAN: UP}, 1.0)
-    net.see(9.0, unacked=False, heard_at=9.0)
-    net.ways.set_paths({WLAN: UNSTABLE, WWAN: UP}, 9.5)
-    assert net.cause(9.6) is None
-    net.ways.set_paths({WLAN: DOWN, WWAN: UP}, 10.0)
-    assert net.cause(10.0) == SILENT
-
-
 def test_the_kernels_unanswered_question_counts_since_it_was_asked() -> None:
     net = Net()
     net.ways.set_paths({WLAN: UP, WWAN: UP}, 1.0)
