@@ -128,6 +128,8 @@ class ControlWays:
         """Of those that are away as well: who comes back has not earned more trust by it."""
         self._paths: Mapping[InterfaceName, PathState] = {}
         self._failures: dict[Way, _Failure] = {}
+        self._silent: dict[Way, float] = {}
+        """Until when each way is avoided that fell silent."""
         self._proven: Way | None = None
         self.can_bind = True
         """Whether the system lets us bind to an interface."""
@@ -169,9 +171,11 @@ class ControlWays:
                 life = Life.UNKNOWN
             if life is not state.life:
                 state.life, state.since = life, now
+                if life is Life.LIVING:
+                    self._silent = {way: until for way, until in self._silent.items() if way.interface != name}
 
     def failed(self, way: Way, now: float, *, whole_address: bool = False) -> None:
-        """It led to no control plane, or no longer does; `whole_address`: whatever the interface."""
+        """It led to no control plane; `whole_address`: whatever the interface."""
         address = way.address
         for one in self._ways():
             if one == way or (whole_address and one.address == address):
@@ -179,9 +183,15 @@ class ControlWays:
                 pause_s = FAILED_FIRST_S if before is None else min(2.0 * before.pause_s, FAILED_MAX_S)
                 self._failures[one] = _Failure(now + pause_s, pause_s)
 
+    def fell_silent(self, way: Way, over: InterfaceName | None, now: float) -> None:
+        """A connection over it had to be left: avoided for a while, or until its interface is heard again."""
+        self._silent[way] = now + FAILED_FIRST_S
+        self.disappointed(over)
+
     def proven(self, way: Way) -> None:
         """A control plane let us in at its other end."""
         self._failures.pop(way, None)
+        self._silent.pop(way, None)
         self._proven = way
 
     def disappointed(self, name: InterfaceName | None) -> None:
@@ -294,9 +304,9 @@ class ControlWays:
         return ip_address(host).is_loopback or self.owner(host) is not None
 
     def _is_good(self, way: Way, now: float) -> bool:
-        return not self._has_failed(way, now) and (
-            self.life(way.interface) is not Life.SILENT or not self._others_live(way.interface)
-        )
+        if self._has_failed(way, now) or now < self._silent.get(way, now):
+            return False
+        return self.life(way.interface) is not Life.SILENT or not self._others_live(way.interface)
 
     def _has_failed(self, way: Way, now: float) -> bool:
         failure = self._failures.get(way)
@@ -313,6 +323,7 @@ class ControlWays:
     def _prune(self) -> None:
         ways = set(self._ways())
         self._failures = {way: failure for way, failure in self._failures.items() if way in ways}
+        self._silent = {way: until for way, until in self._silent.items() if way in ways}
 
 
 def _families_in_turn(addresses: Sequence[Address]) -> tuple[Address, ...]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from protos.config_fields import numeric_host
 from sidecar.core.control_race import ControlRace
-from sidecar.core.control_watch import CHEAPER, SILENT, ControlWatch, Leave
+from sidecar.core.control_watch import CHEAPER, GONE, SILENT, ControlWatch, Leave
 from sidecar.core.control_ways import STRANGER, ControlWays, Life, WayClass
 from sidecar.net.control_sockets import NotAllowedError, is_ours, listen_privately, look, open_stream, own_address
 from sidecar.net.host_names import HostNames
@@ -381,8 +381,8 @@ class ControlLine:
                 await asyncio.wait_for(self.wake.wait(), None if due is None else max(due - now, 0.0))
         self._dialer.stats.connections_left[leave.cause] += 1
         if leave.cause == SILENT and self.way is not None:
-            self._dialer.ways.failed(self.way, time.monotonic())
-        if leave.cause != CHEAPER:
+            self._dialer.ways.fell_silent(self.way, watch.over, time.monotonic())
+        elif leave.cause == GONE:
             self._dialer.ways.disappointed(watch.over)
         self._end(leave)
 

@@ -182,9 +182,7 @@ class Robot:
             return
         self.left[leave.cause] += 1
         if leave.cause == SILENT:
-            self.ways.failed(self.way, self.now)
-        if leave.cause != CHEAPER:
-            self.ways.disappointed(self.over.name)
+            self.ways.fell_silent(self.way, self.over.name, self.now)
         self._end(0.0 if leave.cause != CHEAPER else self.rng.uniform(0.0, RETRY_S))
 
     def longest_without(self) -> float:
@@ -193,13 +191,13 @@ class Robot:
 
 
 def darkness(rng: random.Random, until: float) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """When each of two carriers is dark: for 3 to 30 s, 5 to 60 s apart, never both."""
+    """When each of two carriers is dark: for 1 to 30 s, 1.5 to 60 s apart, never both."""
     dark: tuple[list[tuple[float, float]], list[tuple[float, float]]] = ([], [])
     at = rng.uniform(5.0, 20.0)
     while at < until:
-        end = at + rng.uniform(3.0, 30.0)
+        end = at + rng.uniform(1.0, 30.0)
         dark[rng.randrange(2)].append((at, end))
-        at = end + rng.uniform(5.0, 60.0)
+        at = end + rng.uniform(1.5, rng.choice((3.0, 60.0)))
     return dark
 
 

@@ -126,6 +126,22 @@ def test_a_way_that_failed_goes_to_the_end_for_longer_each_time_until_it_is_prov
     assert order(ways, now)[0] == Way(WLAN, V4)
 
 
+def test_a_way_that_fell_silent_is_avoided_until_its_interface_is_heard_again() -> None:
+    ways = ways_of(interface(WLAN), interface(WWAN))
+    ways.set_paths({WLAN: UP, WWAN: UP}, 0.0)
+    ways.fell_silent(Way(WLAN, V4), WLAN, 1.0)
+    assert order(ways, 1.0)[0] == Way(WWAN, V4)
+    assert ways.another(WWAN, 1.0) is None
+    assert order(ways, 1.0 + FAILED_FIRST_S)[0] == Way(WLAN, V4)
+    ways.set_paths({WLAN: UNSTABLE, WWAN: UP}, 1.1)
+    ways.set_paths({WLAN: UP, WWAN: UP}, 2.0)
+    assert order(ways, 2.0)[0] == Way(WLAN, V4)
+    assert ways.another(WWAN, 2.0) is Life.LIVING
+    ways.fell_silent(Way(WLAN, V4), WLAN, 3.0)
+    ways.proven(Way(WLAN, V4))
+    assert order(ways, 3.0)[0] == Way(WLAN, V4)
+
+
 def test_a_control_plane_that_refuses_does_so_over_every_interface() -> None:
     ways = ways_of(interface(WLAN), interface(WWAN, BILLED), addresses=(V4, OTHER))
     ways.failed(Way(WLAN, V4), 0.0, whole_address=True)
