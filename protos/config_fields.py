@@ -65,6 +65,15 @@ def _check_listen(text: str) -> str:
     return text
 
 
+def numeric_host(host_port: str) -> tuple[str, int] | None:
+    """The address that host:port, already checked, is; None if it is a name."""
+    host, port = split_host_port(host_port)
+    try:
+        return canonical_ip(host), port
+    except ValueError:
+        return None
+
+
 def is_loopback(host_port: str) -> bool:
     """Whether host:port, already checked, stays on this machine; a name other than localhost may lead anywhere."""
     host, _ = split_host_port(host_port)

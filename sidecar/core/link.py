@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from sidecar.core import frame
 from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
 from sidecar.core.link_events import (
+    CheckPaths,
     FinishedLost,
     FragmentsLost,
     LinkCommand,
@@ -141,6 +142,11 @@ class Link:
             case Seek(peers):
                 for path in self._paths.values():
                     if path.peer in peers and path.state is PathState.DOWN:
+                        path.hasten_probe(now)
+                        self._dirty[path.id] = path
+            case CheckPaths():
+                for path in self._paths.values():
+                    if path.state is PathState.UP:
                         path.hasten_probe(now)
                         self._dirty[path.id] = path
             case SetMtu(mtu):

@@ -75,6 +75,11 @@ class Seek:
 
 
 @dataclass(frozen=True, slots=True)
+class CheckPaths:
+    """Something else than datagrams is not answered over this interface: probe what is up now, however idle."""
+
+
+@dataclass(frozen=True, slots=True)
 class SetMtu:
     """The interface's MTU: bytes, IP header included."""
 
@@ -132,7 +137,17 @@ class SendClose:
 PathCommand = Send | Resend | SendFinished | SendAbandon | SendForgotten
 """What is for one path."""
 LinkCommand = (
-    SetPeers | SetCredential | SetReady | SetCarrier | ResetPaths | Rebind | Seek | SetMtu | PathCommand | SendClose
+    SetPeers
+    | SetCredential
+    | SetReady
+    | SetCarrier
+    | ResetPaths
+    | Rebind
+    | Seek
+    | CheckPaths
+    | SetMtu
+    | PathCommand
+    | SendClose
 )
 
 

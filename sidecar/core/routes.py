@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import BASE_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from protos.model import InterfaceName, NodeName
 
@@ -59,10 +60,15 @@ class Routes:
         self._routes: dict[PathId, Route] = {}
         self._by_peer: dict[NodeName, dict[PathId, Route]] = {}
         self._reached: set[NodeName] = set()
+        self._counts: dict[InterfaceName, Counter[PathState]] = {}
+        self.best: Mapping[InterfaceName, PathState] = {}
+        """The best state of the paths over each of our interfaces that has some; another object when one changes."""
 
     def set_state(self, path: PathId, state: PathState) -> None:
         """Note a path's liveness."""
-        self._get(path).set_state(state)
+        route = self._get(path)
+        self._count(path, route.state, state)
+        route.set_state(state)
         self._look_whether_reached(path.peer)
 
     def _look_whether_reached(self, peer: NodeName) -> None:
@@ -98,19 +104,33 @@ class Routes:
         if route is None:
             route = self._routes[path] = Route(path)
             self._by_peer.setdefault(path.peer, {})[path] = route
+            self._count(path, None, route.state)
         return route
+
+    def _count(self, path: PathId, before: PathState | None, after: PathState | None) -> None:
+        """A path's state is another; None: there is no such path."""
+        interface = path.interface
+        counts = self._counts.setdefault(interface, Counter())
+        if before is not None:
+            counts[before] -= 1
+        if after is not None:
+            counts[after] += 1
+        best = next((state for state in _RANK if counts[state]), None)
+        if best is not self.best.get(interface):
+            others = {name: state for name, state in self.best.items() if name != interface}
+            self.best = others if best is None else others | {interface: best}
 
     def forget_peer(self, peer: NodeName) -> None:
         """The peer is not to be talked to any more."""
         for path in self._by_peer.pop(peer, {}):
-            del self._routes[path]
+            self._count(path, self._routes.pop(path).state, None)
         self._reached.discard(peer)
 
     def forget_interface(self, interface: InterfaceName) -> list[PathId]:
         """The interface is gone; returns the paths it had."""
         paths = [path for path in self._routes if path.interface == interface]
         for path in paths:
-            del self._routes[path]
+            self._count(path, self._routes.pop(path).state, None)
             del self._by_peer[path.peer][path]
             self._look_whether_reached(path.peer)
         return paths

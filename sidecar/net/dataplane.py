@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link_events import ResetPaths, SendClose, SetCredential
+from sidecar.core.link_events import CheckPaths, ResetPaths, SendClose, SetCredential
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from sidecar.core.events import ExecutionId, RejectReason, RequestId
     from sidecar.core.inbound import Decoding
     from sidecar.core.link_events import LinkEvent
+    from sidecar.core.path_id import PathState
     from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
@@ -68,6 +69,8 @@ class DataPlaneHooks:
     """Offers or uses may have changed: the control plane wants to know."""
     reach_changed: Callable[[], None]
     """Interfaces or peers may have come: a mapping that was refused for want of them may fit now."""
+    paths_changed: Callable[[Mapping[InterfaceName, PathState]], None]
+    """The best state of the paths over each interface that has some; called with the engine's lock held."""
 
 
 class ThreadedDataPlane:
@@ -82,6 +85,7 @@ class ThreadedDataPlane:
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
         self._watchdog = Watchdog(self._clock())
+        self._told_paths = self._engine.routes.best
         self._stopping = False
         self._logged_refusals: dict[NodeName, str] = {}
         """Their causes."""
@@ -273,6 +277,13 @@ class ThreadedDataPlane:
         with self._lock:
             return self._engine.take_report()
 
+    def check_paths(self, interface: InterfaceName) -> None:
+        """The control stream is not answered over this interface: find out whether anything else is."""
+        link = self._links.get(interface)
+        if link is not None:
+            link.post(CheckPaths())
+            link.wake()
+
     # -- what metrics and status read -----------------------------------------------------------------------------
 
     @property
@@ -325,6 +336,10 @@ class ThreadedDataPlane:
                 woken.add(link)
         for event in self._engine.take_events():
             self._hooks.application.handle(event)
+        best = self._engine.routes.best
+        if best is not self._told_paths:
+            self._told_paths = best
+            self._hooks.paths_changed(best)
         # The kernel's timer, not its thread: nearly every request has a deadline, and is answered long before it.
         self._timer.arm_at_latest(self._engine.next_timer())
         return woken

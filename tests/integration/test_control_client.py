@@ -49,6 +49,7 @@ from sidecar import control_client
 from sidecar.control_client import ControlClient
 from sidecar.core import control_session
 from sidecar.core.control_session import ControlSession
+from sidecar.net.control_dialer import ControlDialer
 from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedControlPlane
 
@@ -123,7 +124,7 @@ class Rig:
         )
         self.hooks = Recorder()
         session = ControlSession(registration, random.Random(1))
-        self.client = ControlClient(target, session, self.hooks)
+        self.client = ControlClient(ControlDialer((target,), session.stats), session, self.hooks)
 
 
 @pytest.fixture
