@@ -251,7 +251,7 @@ def test_a_full_table_refuses_one_robot_and_still_serves_another() -> None:
     assert isinstance(executions.on_request(OTHER, request(100_000), 1.0), ExecuteRequest)
     executions.complete(ExecutionId(0), b"", 0.0, 1.1)
     executions.complete(ExecutionId(1), b"", 0.0, 1.1)
-    run(executions, request(99_999), 1.2)
+    run(executions, request(99_999, copy=1), 1.2)
 
 
 def test_remembered_ids_are_capped_per_robot(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,7 +261,7 @@ def test_remembered_ids_are_capped_per_robot(monkeypatch: pytest.MonkeyPatch) ->
         executions.complete(run(executions, request(number)).execution, b"", 0.0, 1.0)
     assert isinstance(executions.on_request(ROBOT, request(10), 1.0), Reply)
     assert isinstance(executions.on_request(OTHER, request(11), 1.0), ExecuteRequest)
-    run(executions, request(10), 1.0 + MIN_REMEMBER_S)
+    run(executions, request(10, copy=1), 1.0 + MIN_REMEMBER_S)
 
 
 def test_what_is_over_leaves_no_timers_behind() -> None:
