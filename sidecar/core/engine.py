@@ -15,7 +15,6 @@ from sidecar.core.events import (
     ApplicationEvent,
     ExecutionId,
     RejectReason,
-    RequestFailed,
     RequestId,
     WithdrawService,
 )
@@ -139,9 +138,7 @@ class Engine:
         rule = find_rule(self._config.rules, service)
         kind = self._offers.offered.get(service)
         if rule is None or kind is None:
-            self.stats.requests[service, "rejected"] += 1
-            why = "no server offers this service any more"
-            self._events.append(RequestFailed(request_id, service, "rejected", why, 0.0))
+            self._requests.reject(request_id, service, "no server offers this service any more")
             return
         self._requests.submit(request_id, service, kind, rule, payload, now)
         self.stats.in_flight = self._requests.unanswered
@@ -274,7 +271,6 @@ class Engine:
                 self._outbox.on_forgotten(peer, number)
             case MessageFinished(peer, number):
                 self._outbox.on_finished(peer, number)
-                self._requests.on_room(now)
             case FinishedLost(path, numbers) if path.peer in self.peers:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
             case FragmentsLost():
@@ -298,7 +294,14 @@ class Engine:
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
                     self._on_peer_closed(peer, now)
+        if self._outbox.take_made_room():
+            self._use_room(now)
         self.stats.in_flight = self._requests.unanswered + self._serving.running
+
+    def _use_room(self, now: float) -> None:
+        """Less is under way than before."""
+        self._requests.on_room(now)
+        self._serving.on_room(now)
 
     def _is_current(self, path: PathId, session: SessionId) -> bool:
         if self.peers.session(path.peer) == session:
@@ -359,6 +362,7 @@ class Engine:
             self.routes.set_state(route.id, PathState.DOWN)
         self._outbox.drop_peer(name)
         self._serving.on_session_over(name)
+        self._serving.on_robot_gone(name)
         self._update_offers(now)
         self._requests.on_peer_gone(name, now)
         self._drop_if_unlisted(name, now)
@@ -367,6 +371,7 @@ class Engine:
         """`may_return`: it was only silent for long, and may be back with the same session, for its answers."""
         if not may_return:
             self._serving.on_session_over(name)
+        self._serving.on_robot_gone(name)
         self._inbound.forget_peer(name)
         self._outbox.drop_peer(name)
         self.routes.forget_peer(name)
@@ -397,7 +402,8 @@ class Engine:
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
             self._outbox.expire(now)
-            self._requests.on_room(now)
+            self._outbox.ask_again()
+            self._use_room(now)
             self._inbound.expire(now)
         dark_until = self._offers.next_timer()
         if dark_until is not None and dark_until <= now:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
-"""Payloads of those requests, which may wait for the first path to a server: as much as the outbox takes."""
+"""Payloads of requests until the last copy of each has ended, also while they wait for a path or for room."""
 
 
 class RequestTable:
@@ -60,7 +60,7 @@ class RequestTable:
         self._timers: list[tuple[float, RequestId]] = []
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
-        self._no_room = NoRoom()
+        self._no_room = NoRoom(self._dispatching, parts.routes)
         self.unanswered = 0
         self._held_bytes = 0
 
@@ -80,17 +80,24 @@ class RequestTable:
         request = Request(request_id, service, kind, rule, payload, now, size_class)
         problem = self._problem(request)
         if problem:
-            self._parts.stats.requests[service, "rejected"] += 1
-            self._parts.measurements.outcome(service, "rejected")
-            self._parts.emit(RequestFailed(request_id, service, "rejected", problem, 0.0))
+            self.reject(request_id, service, problem)
             return
+        request.size = self._dispatching.encode(request, payload, now).size
         self._requests[request_id] = request
         self.unanswered += 1
-        self._held_bytes += len(payload)
+        self._held_bytes += request.held
         heapq.heappush(self._timers, (request.deadline_at, request_id))
         request.dark = self._parts.routes.dark(self._parts.offers.servers(service))
         self._dispatch(request, now)
+        if request in self._no_room:
+            self.on_room(now)  # it may be more urgent than those that wait, or small enough
         self._notice_unreachable(request)
+
+    def reject(self, request_id: RequestId, service: ServiceName, why: str) -> None:
+        """A request is not taken on."""
+        self._parts.stats.requests[service, "rejected"] += 1
+        self._parts.measurements.outcome(service, "rejected")
+        self._parts.emit(RequestFailed(request_id, service, "rejected", why, 0.0))
 
     def answered_here(self, request_id: RequestId, now: float) -> None:
         """The application has its answer, not from the network. The request ends at its deadline at the latest."""
@@ -110,39 +117,38 @@ class RequestTable:
             return f"{MAX_IN_FLIGHT} requests are in flight already"
         if self._held_bytes + size > MAX_HELD_BYTES:
             return f"the requests in flight have {self._held_bytes} bytes already"
-        servers = self._parts.offers.servers(request.service)
-        if servers and not self._dispatching.with_room(servers, size):
-            return "too much waits to be sent already"
         if request.id in self._requests:
             return "a request with this identity is in flight already"
         return None
 
     def _dispatch(self, request: Request, now: float) -> None:
-        self._look_at(request, self._dispatching.start(request, now))
-        if request.copies:
-            self._no_room.remove(request)
-        elif self._finds_no_room(request):
-            self._no_room.add(request)
+        """Send a request without copies, unless others wait for the same room."""
+        if request not in self._no_room:
+            self._start(request, self._no_room.open_to(request), now)
 
-    def _finds_no_room(self, request: Request) -> bool:
-        servers = self._parts.offers.servers(request.service)
-        reached = tuple(server for server in servers if self._parts.routes.reaches(server))
-        return bool(reached) and not self._dispatching.with_room(reached, len(request.payload or b""))
+    def _start(self, request: Request, servers: list[NodeName], now: float) -> None:
+        self._look_at(request, self._dispatching.start(request, servers, now))
+        self._no_room.consider(request)
 
     def on_room(self, now: float) -> None:
-        """Less waits to be sent than before: send what found no room, in order of arrival."""
-        for service in self._no_room.services():
-            while (request := self._no_room.first(service)) and not self._finds_no_room(request):
-                self._no_room.remove(request)
-                if not request.answered_here:
-                    self._dispatch(request, now)
+        """Less waits to be sent than before: send what found no room, each in its turn."""
+        for request, servers in self._no_room.going(now):
+            if request.answered_here:
+                continue
+            if request.copies:
+                self._rescue(request, now)
+            else:
+                self._start(request, servers, now)
 
     def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
         """See `Dispatching.rescue`. A copy that is alone is looked at as the first one was."""
         alone = not request.relied_on()
         self._dispatching.rescue(request, now, insist=insist, rejected=rejected)
         if alone and request.relied_on():
+            self._no_room.remove(request)
             self._look_at(request, self._dispatching.first_look(request, now))
+        elif alone:
+            self._no_room.consider(request, rejected=rejected)
 
     def _look_at(self, request: Request, when: float | None) -> None:
         if when is not None:
@@ -213,7 +219,7 @@ class RequestTable:
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
         if not request.done:
             self._rescue(request, now, rejected=True)
-            if not request.pending():
+            if not request.pending() and request not in self._no_room:
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
                 self._fail(request, "rejected", reason, now)
         self._settle(request, now)
@@ -241,12 +247,15 @@ class RequestTable:
         for request in list(self._requests.values()):
             hit = [copy for copy in request.pending() if copy.path.peer == peer]
             for copy in hit:
+                if not copy.message.may_have_left:
+                    self._dispatching.never_left(request, copy, now)
+                    continue
                 copy.state = CopyState.DEAD
                 copy.message.newest.stand_down()
                 self._lost(request, copy, delivered=True)
             if hit and not request.done:
                 self._rescue(request, now)
-                if not request.pending() and not request.rule.idempotent:
+                if not request.pending() and not request.may_be_sent():
                     self._fail(request, "failed", f"{peer} went away; it may have run the request", now)
             self._settle(request, now)
 
@@ -264,12 +273,14 @@ class RequestTable:
                 self._notice_unreachable(request)
             else:
                 self._reconsider(request, now)
+        self.on_room(now)
 
     def on_servers_gained(self, services: Collection[ServiceName], now: float) -> None:
         """Bring requests that wait for a server to one that offers their service from now on."""
         for request in list(self._requests.values()):
             if request.service in services and not request.done and not request.answered_here:
                 self._reconsider(request, now)
+        self.on_room(now)
 
     def on_withdrawn(self, service: ServiceName, reason: str, now: float) -> None:
         """The service is not offered here any more: what waits gets no answer, and is told so now."""
@@ -356,7 +367,7 @@ class RequestTable:
 
     def _expire(self, request: Request, now: float) -> None:
         unsent = "no room to send it" if request in self._no_room else "no path to any server"
-        why = "no answer" if request.copies else unsent
+        why = unsent if request.certainly_not_run() else "no answer"
         self._end(request, f"{why} within {request.rule.lifetime_s:g} s", now)
 
     def _end(self, request: Request, reason: str, now: float) -> None:
@@ -376,7 +387,6 @@ class RequestTable:
     def _finish(self, request: Request, outcome: str) -> None:
         request.done = True
         self._no_room.remove(request)
-        self._held_bytes -= len(request.payload or b"")
         request.payload = None
         self.unanswered -= 1
         self._parts.stats.requests[request.service, outcome] += 1
@@ -391,6 +401,7 @@ class RequestTable:
                     self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
-            self._requests.pop(request.id, None)
+            if self._requests.pop(request.id, None) is not None:
+                self._held_bytes -= request.held
             request.messages.clear()
             self._measure(request, now)

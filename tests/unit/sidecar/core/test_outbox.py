@@ -2,23 +2,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core import outbox as outbox_module
 from sidecar.core.events import RequestId
 from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
 from sidecar.core.messages import Encoded
-from sidecar.core.outbox import MAX_BYTES, MAX_GENERATIONS, MAX_MESSAGES, Outbox
+from sidecar.core.outbox import MAX_GENERATIONS, Outbox
 from sidecar.core.path_id import PathState
 from sidecar.core.pmtu import BASE_BYTES
 from sidecar.core.priority import Priority
 from sidecar.core.redundancy import MAX_COPIES
+from sidecar.core.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
 
 if TYPE_CHECKING:
-    import pytest
-
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_id import PathId
 
@@ -268,15 +266,18 @@ def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
     assert box.outbox.has_room(B, 1000)
 
 
-def test_one_peer_never_gets_more_bytes_than_it_can_reassemble(monkeypatch: pytest.MonkeyPatch) -> None:
-    box = Box(OVER_WLAN)
-    size = MAX_PEER_BYTES // 4
-    for _ in range(4):
-        box.send(size=size)
-    assert not box.outbox.has_room(A, 1)
-    assert box.outbox.has_room(B, size)
-    monkeypatch.setattr(outbox_module, "REASSEMBLED_PEER_BYTES", MAX_BYTES)
-    assert box.outbox.has_room(A, 1)
+def test_one_peer_never_gets_more_bytes_than_it_can_reassemble() -> None:
+    box = Box(OVER_WLAN, TO_B)
+    assert SMALL_ROOM_BYTES + LARGE_ROOM_BYTES == MAX_PEER_BYTES
+    for _ in range(3):
+        box.send(size=LARGE_ROOM_BYTES // 3)
+    assert not box.outbox.has_room(A, SMALL_BYTES + 1)
+    assert box.outbox.has_room(B, LARGE_ROOM_BYTES // 3)
+    for _ in range(SMALL_ROOM_BYTES // SMALL_BYTES):
+        box.send(size=SMALL_BYTES)
+    assert not box.outbox.has_room(A, BASE_BYTES)
+    assert box.outbox.held_bytes == MAX_PEER_BYTES
+    assert box.outbox.has_room(A, 1000), "what one datagram holds takes nothing there"
 
 
 def carries(box: Box, over: PathId, size: int) -> None:
