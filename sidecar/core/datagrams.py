@@ -207,6 +207,8 @@ class DatagramBuilder:
                 end = plain_end + TAG_BYTES
                 view[start + FRAGMENT_DATAGRAM_BYTES : plain_end] = data
                 seal_into(view[start + NONCE_OFFSET : body], view[body:plain_end], view[start:body], view[body:end])
+        if message.over:
+            return 0  # whoever ended it meanwhile may count on nothing having left; numbers may be left out
         del buffer[end:]
         last = end - segment * (count - 1)
         path.recovery.on_run_sent(first_number, count, now, segment, last, message, indices.start)
@@ -221,7 +223,11 @@ class DatagramBuilder:
         message, index = run.message, run.first
         number = path.recovery.take_numbers()
         head = frame.encode_fragment_head(message.number, message.total, message.symbol, index)
-        datagram = self._sealed(path, number, now, *control, head, message.symbol_data(index))
+        symbol = message.symbol_data(index)
+        if message.over:  # as in `_add_symbols`
+            self._add_control(path, control, burst, now)
+            return 0
+        datagram = self._sealed(path, number, now, *control, head, symbol)
         size = len(datagram)
         path.recovery.on_run_sent(number, 1, now, size, size, message, index, _finished(control))
         self._stats.datagrams["sent", "data" if index < message.count else "repair"] += 1

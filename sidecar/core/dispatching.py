@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import NodeName
+    from sidecar.core.messages import Encoded
     from sidecar.core.path_id import PathId
     from sidecar.core.request_parts import RequestParts
 
@@ -53,15 +54,23 @@ class Dispatching:
         self._adaptive = Adaptive(parts.routes, self._paces)
         self._budgets = Budgets(parts.budgets, parts.stats)
 
-    def with_room(self, servers: tuple[NodeName, ...], size: int) -> list[NodeName]:
-        """Those of the servers to which a request of `size` bytes may be sent now."""
+    def with_room(self, servers: Iterable[NodeName], request: Request) -> list[NodeName]:
+        """Those of the servers to which the request may be sent now."""
         has_room = self._parts.outbox.has_room
-        return [server for server in servers if has_room(server, size)]
+        return [server for server in servers if has_room(server, request.size)]
 
-    def start(self, request: Request, now: float) -> float | None:
-        """Send the first copies; returns when `look_again` is wanted, if at all."""
+    def candidates(self, request: Request, *, rejected: bool = False) -> tuple[NodeName, ...]:
+        """The servers that may be sent a copy of a request, another one if it has copies; `rejected` as in `rescue`."""
+        servers = self._parts.offers.servers(request.service)
+        if not request.copies:
+            return servers
+        if not request.rule.idempotent and not request.certainly_not_run():
+            return ()
+        return request.worth_another_copy(servers, rejected=rejected)
+
+    def start(self, request: Request, servers: list[NodeName], now: float) -> float | None:
+        """Send the first copies to some of these servers; returns when `look_again` is wanted, if at all."""
         rule = request.rule
-        servers = self.with_room(self._parts.offers.servers(request.service), len(request.payload or b""))
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
         if rule.redundancy is RedundancyMode.REPLICATE:
             paths = self._best_first(request, chosen, now) if self._budgets else chosen
@@ -174,6 +183,8 @@ class Dispatching:
             return
         path = self._next_withheld(request) or self._elsewhere(request, rejected=rejected)
         if path is None:
+            path = self._take_back(request, waiting, now)
+        if path is None:
             return
         if any(copy.path.interface == path.interface and self._is_on_its_way(copy) for copy in waiting):
             return  # another one behind it would only make it later
@@ -195,15 +206,43 @@ class Dispatching:
         for path in request.withheld:
             if self._parts.routes.state(path) is not PathState.UP or path.peer in refused:
                 continue
+            if not self._parts.outbox.has_room(path.peer, request.size):
+                continue
             if request.rule.idempotent or path.peer in waiting:
                 return path
         return None
 
     def _elsewhere(self, request: Request, *, rejected: bool) -> PathId | None:
-        if not request.rule.idempotent and not request.certainly_not_run():
+        return self._parts.mapping.rescue(self.with_room(self.candidates(request, rejected=rejected), request))
+
+    def _take_back(self, request: Request, waiting: list[Copy], now: float) -> PathId | None:
+        """Free a request that is not idempotent from a server that nothing leads to, if nothing has left for it.
+
+        Returns where it can go instead; without such a path it stays where it is.
+        """
+        routes, outbox = self._parts.routes, self._parts.outbox
+        if request.rule.idempotent or not waiting or len(request.pending()) > len(waiting):
             return None
-        servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=rejected)
-        return self._parts.mapping.rescue(self.with_room(servers, len(request.payload or b"")))
+        if any(routes.reaches(copy.path.peer) or copy.message.may_have_left for copy in waiting):
+            return None
+        servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=False)
+        path = self._parts.mapping.rescue(self.with_room(servers, request))
+        if path is None:
+            return None
+        for copy in waiting:
+            outbox.drop(copy.message)
+        if any(copy.message.may_have_left for copy in waiting):
+            return None  # its link was faster
+        for copy in waiting:
+            self.never_left(request, copy, now)
+        return path
+
+    def never_left(self, request: Request, copy: Copy, now: float) -> None:
+        """A copy is over before anything of it left: it has not run, and says nothing of its path or server."""
+        copy.state, copy.ended_at, copy.certainly_not_run = CopyState.DEAD, now, True
+        copy.message.newest.stand_down()
+        if request.observed and not copy.hedges:
+            self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
 
     def answered(self, request: Request, copy: Copy, processing_s: float, now: float) -> None:
         """A copy was answered. After the deadline it had to wait for what is fresh, so its pace means nothing."""
@@ -217,21 +256,26 @@ class Dispatching:
             paths = (*request.withheld, *(copy.path for copy in request.copies))
             self._budgets.earn(request.copies[0].message.total, {path.interface for path in paths})
 
+    def encode(self, request: Request, payload: bytes, now: float) -> Encoded:
+        """Return the next copy as a message; all copies are equally long."""
+        return encode_message(
+            RequestMessage(
+                request.id,
+                len(request.copies),
+                request.rule.priority,
+                request.deadline_at - now,
+                request.expires_at - now,
+                request.service,
+                request.type,
+                payload,
+            )
+        )
+
     def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
         if request.payload is None or len(request.copies) >= MAX_COPIES:
             return False
         rule, stats = request.rule, self._parts.stats
-        head = RequestMessage(
-            request.id,
-            len(request.copies),
-            rule.priority,
-            request.deadline_at - now,
-            request.expires_at - now,
-            request.service,
-            request.type,
-            request.payload,
-        )
-        content = encode_message(head)
+        content = self.encode(request, request.payload, now)
         extra = bool(request.relied_on())
         if extra and not self._budgets.allows(path.interface, request.service, content.size, now):
             return False

@@ -18,7 +18,6 @@ from sidecar.core.events import (
     ExecutionId,
     OfferService,
     RejectReason,
-    RequestFailed,
     RequestId,
     WithdrawService,
 )
@@ -145,9 +144,7 @@ class Engine:
         rule = self._rules.find(service)
         kind = self._offers.offered.get(service)
         if rule is None or kind is None:
-            self.stats.requests[service, "rejected"] += 1
-            why = "no server offers this service any more"
-            self._events.append(RequestFailed(request_id, service, "rejected", why, 0.0))
+            self._requests.reject(request_id, service, "no server offers this service any more")
             return
         self._requests.submit(request_id, service, kind, rule, payload, now)
         self._count_in_flight()
@@ -203,7 +200,7 @@ class Engine:
         self._interfaces = new
         for interface in gone:
             paths = self.routes.forget_interface(interface)
-            self._outbox.on_interface_gone(interface, now)
+            self._backlog.add_steps(self._outbox.on_interface_gone(interface), now)
             for path in paths:
                 self._requests.on_path_changed(path, PathState.DOWN, now)
             for peer in {path.peer for path in paths}:
@@ -226,7 +223,7 @@ class Engine:
         ended = [name for name, session in before.items() if self.peers.session(name) != session]
         for name in ended:
             over = name in self.peers or name in left or name in self.peers.refused
-            self._forget_session(name, may_return=not over)
+            self._forget_session(name, now, may_return=not over)
         self._follow_gone(ended, now)
         return None
 
@@ -254,7 +251,7 @@ class Engine:
         self._commands.append((None, SetPeers(self.peers.for_links())))
         self._follow_offers(now)
         for name in gone:
-            self._forget_session(name)
+            self._forget_session(name, now)
         self._follow_gone(gone, now)
         return taken
 
@@ -300,7 +297,6 @@ class Engine:
                 self._outbox.on_forgotten(peer, number)
             case MessageFinished(peer, number):
                 self._outbox.on_finished(peer, number)
-                self._requests.on_room(now)
             case FinishedLost(path, numbers) if path.peer in self.peers:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
             case FragmentsLost():
@@ -324,10 +320,17 @@ class Engine:
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
                     self._on_peer_closed(peer, now)
+        if self._outbox.take_made_room():
+            self._use_room(now)
         self._count_in_flight()
 
     def _count_in_flight(self) -> None:
         self.stats.in_flight = self._requests.unanswered + self._serving.running
+
+    def _use_room(self, now: float) -> None:
+        """Less is under way than before."""
+        self._requests.on_room(now)
+        self._serving.on_room(now)
 
     def _is_current(self, path: PathId, session: SessionId) -> bool:
         if self.peers.session(path.peer) == session:
@@ -366,7 +369,7 @@ class Engine:
         reached = self.routes.reaches(path.peer)
         self.routes.set_state(path, state)
         if state is PathState.UP:
-            self._outbox.on_path_up(path)
+            self._backlog.add_steps(self._outbox.on_path_up(path), now)
             self._inbound.on_path_up(path)
             if self._requests.unanswered:  # they wait: the other paths may be back as well, and share them
                 self._seek(frozenset((path.peer,)))
@@ -390,22 +393,28 @@ class Engine:
         """It said goodbye: nothing new goes there; the control plane will say the same."""
         for route in self.routes.all_to(name):
             self.routes.set_state(route.id, PathState.DOWN)
-        self._outbox.drop_peer(name)
-        self._serving.on_session_over(name)
+        self._backlog.add_steps(
+            [
+                *self._outbox.drop_peer(name),
+                *self._serving.on_session_over(name),
+                *self._serving.on_robot_gone(name),
+            ],
+            now,
+        )
         self._update_offers(now)
         self._requests.on_peer_gone(name, now)
         self._drop_if_unlisted(name, now)
 
     def _end_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
-        self._forget_session(name, may_return=may_return)
+        self._forget_session(name, now, may_return=may_return)
         self._follow_gone((name,), now)
 
-    def _forget_session(self, name: NodeName, *, may_return: bool = False) -> None:
+    def _forget_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
         """`may_return`: it was only silent for long, and may be back with the same session, for its answers."""
-        if not may_return:
-            self._serving.on_session_over(name)
+        called_off = [] if may_return else self._serving.on_session_over(name)
+        let_go = [*self._outbox.drop_peer(name), *self._serving.on_robot_gone(name)]
+        self._backlog.add_steps(called_off + let_go, now)
         self._inbound.forget_peer(name)
-        self._outbox.drop_peer(name)
         self.routes.forget_peer(name)
 
     def _follow_gone(self, names: Collection[NodeName], now: float) -> None:
@@ -446,15 +455,17 @@ class Engine:
         self._backlog.begin_turn(now)
         self._backlog.run(now)
         self._requests.handle_timer(now)
-        self._serving.handle_timer(now)
+        self._serving.handle_timer(now, self._backlog)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
-            self._outbox.expire(now)
-            self._requests.on_room(now)
+            self._backlog.add_steps(self._outbox.expired(now), now)
+            self._outbox.ask_again()
             self._inbound.expire(now)
         dark_until = self._offers.next_timer()
         if dark_until is not None and dark_until <= now:
             self._update_offers(now)
+        if self._outbox.take_made_room():
+            self._use_room(now)
         self._count_in_flight()
 
 

@@ -115,7 +115,7 @@ class Link:
                     self._events.append(FinishedLost(path_id, (number,)))
                 else:
                     by = now if at_once else now + MAX_FINISHED_DELAY_S
-                    self._table.owe(path, frame.encode_finished(frame.Finished(number)), by)
+                    self._table.owe_finished(path, number, by)
             case SendAbandon(path_id, number):
                 path = self._paths.get((path_id.peer, path_id.remote))
                 if path is not None and path.state is not PathState.DOWN:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core import frame
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
@@ -13,6 +12,7 @@ from sidecar.core.link_events import (
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
+    from sidecar.core import frame
     from sidecar.core.link_mtu import LinkMtu
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_table import PathTable
@@ -137,7 +137,7 @@ class PathKeeper:
                 finished += run.finished
             else:
                 for number in run.finished:
-                    self._table.owe(path, frame.encode_finished(frame.Finished(number)))
+                    self._table.owe_finished(path, number)
         if finished:
             self._events.append(FinishedLost(path.id, tuple(finished)))
         for message, indices in by_message.values():

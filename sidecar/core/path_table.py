@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from sidecar.core.path_keys import KeyLimits
 
 MAX_PENDING_FRAMES = 256
-"""Control frames waiting on one path; a peer that makes us owe more is not honest."""
+"""Control frames waiting on one path besides FINISHED; a peer that makes us owe more is not honest."""
+MAX_PENDING_FINISHED = 8192
+"""FINISHED waiting on one path: as many as an honest peer has undelivered messages to us (`room.py`)."""
 MAX_PATHS_OF_A_PEER = 32
 """Those that a peer introduces itself by included. A further introduction takes the place of one that nothing
 authentic followed; if there is none, it waits for the control plane's word."""
@@ -107,6 +109,16 @@ class PathTable:
             self.stats.dropped["pending_frames_full"] += 1
             return
         path.pending.append(encoded)
+        path.pending_by = min(path.pending_by, by)
+        self.dirty[path.id] = path
+
+    def owe_finished(self, path: Path, number: int, by: float = 0.0) -> None:
+        """As `owe`: the peer's message with this number is whole."""
+        # A sender that hears nothing asks again (`Outbox.ask_again`).
+        if len(path.finished) >= MAX_PENDING_FINISHED and number not in path.finished:
+            self.stats.dropped["pending_frames_full"] += 1
+            return
+        path.finished[number] = None
         path.pending_by = min(path.pending_by, by)
         self.dirty[path.id] = path
 

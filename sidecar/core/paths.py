@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.congestion import CongestionController
-from sidecar.core.frame import FINISHED_TYPE, encode_ack, finished_number
+from sidecar.core.frame import Finished, encode_ack, encode_finished
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
@@ -58,6 +58,7 @@ class Path:
         "bytes_sent",
         "candidates",
         "control",
+        "finished",
         "id",
         "introductions",
         "keys",
@@ -108,6 +109,8 @@ class Path:
         """Where the peer introduced itself from, and the probe that it wants answered there."""
         self.pending: list[bytes] = []
         """Encoded control frames that wait for the next datagram ..."""
+        self.finished: dict[int, None] = {}
+        """... and messages to be reported FINISHED in it ..."""
         self.pending_by = NEVER
         """... which leaves at this moment (s) at the latest; NEVER when none waits."""
         self.probe_at: float | None = now
@@ -233,20 +236,18 @@ class Path:
 
     def take_control(self, now: float) -> list[bytes]:
         """Remove and return the control frames that wait, the acknowledgement that is owed included."""
-        if self.received.ack_at is not None:
-            ranges, delay_s = self.received.take_ack(now)
-            self.pending.append(encode_ack(ranges, delay_s))
         taken, self.pending = self.pending, []
+        taken += [encode_finished(Finished(number)) for number in self.take_pending_finished()]
+        if self.received.ack_at is not None:
+            taken.append(encode_ack(*self.received.take_ack(now)))
         self.pending_by = NEVER
         return taken
 
     def take_pending_finished(self) -> tuple[int, ...]:
-        """Remove the FINISHED from the frames that wait, and return which messages they are of."""
-        waiting = [encoded for encoded in self.pending if encoded[0] == FINISHED_TYPE]
-        if waiting:
-            self.pending = [encoded for encoded in self.pending if encoded[0] != FINISHED_TYPE]
-            self.pending_by = self.pending_by if self.pending else NEVER
-        return tuple(map(finished_number, waiting))
+        """Return which messages are to be reported FINISHED, and forget it."""
+        finished = tuple(self.finished)
+        self.finished.clear()
+        return finished
 
     def note_rtt(self) -> None:
         """Keep the latest round-trip time for the next report."""

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
-"""Payloads of those requests, which may wait for the first path to a server: as much as the outbox takes."""
+"""Payloads of requests until the last copy of each has ended, also while they wait for a path or for room."""
 
 
 class RequestTable:
@@ -63,7 +63,7 @@ class RequestTable:
         self._timers: list[tuple[float, RequestId]] = []
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
-        self._no_room = NoRoom()
+        self._no_room = NoRoom(self._dispatching, parts.routes)
         self.unanswered = 0
         self._held_bytes = 0
 
@@ -83,17 +83,24 @@ class RequestTable:
         request = Request(request_id, service, kind, rule, payload, now, size_class)
         problem = self._problem(request)
         if problem:
-            self._parts.stats.requests[service, "rejected"] += 1
-            self._parts.measurements.outcome(service, "rejected")
-            self._parts.emit(RequestFailed(request_id, service, "rejected", problem, 0.0))
+            self.reject(request_id, service, problem)
             return
+        request.size = self._dispatching.encode(request, payload, now).size
         self._requests.add(request)
         self.unanswered += 1
-        self._held_bytes += len(payload)
+        self._held_bytes += request.held
         heapq.heappush(self._timers, (request.deadline_at, request_id))
         request.dark = self._parts.routes.dark(self._parts.offers.servers(service))
         self._dispatch(request, now)
+        if request in self._no_room:
+            self.on_room(now)  # it may be more urgent than those that wait, or small enough
         self._notice_unreachable(request, now)
+
+    def reject(self, request_id: RequestId, service: ServiceName, why: str) -> None:
+        """A request is not taken on."""
+        self._parts.stats.requests[service, "rejected"] += 1
+        self._parts.measurements.outcome(service, "rejected")
+        self._parts.emit(RequestFailed(request_id, service, "rejected", why, 0.0))
 
     def answered_here(self, request_id: RequestId, now: float) -> None:
         """The application has its answer, not from the network. The request ends at its deadline at the latest."""
@@ -113,39 +120,45 @@ class RequestTable:
             return f"{MAX_IN_FLIGHT} requests are in flight already"
         if self._held_bytes + size > MAX_HELD_BYTES:
             return f"the requests in flight have {self._held_bytes} bytes already"
-        servers = self._parts.offers.servers(request.service)
-        if servers and not self._dispatching.with_room(servers, size):
-            return "too much waits to be sent already"
         if request.id in self._requests:
             return "a request with this identity is in flight already"
         return None
 
     def _dispatch(self, request: Request, now: float) -> None:
-        self._look_at(request, self._dispatching.start(request, now))
-        if request.copies:
-            self._no_room.remove(request)
-        elif self._finds_no_room(request):
-            self._no_room.add(request)
+        """Send a request without copies, unless others wait for the same room."""
+        if request not in self._no_room:
+            self._start(request, self._no_room.open_to(request), now)
 
-    def _finds_no_room(self, request: Request) -> bool:
-        servers = self._parts.offers.servers(request.service)
-        reached = tuple(server for server in servers if self._parts.routes.reaches(server))
-        return bool(reached) and not self._dispatching.with_room(reached, len(request.payload or b""))
+    def _start(self, request: Request, servers: list[NodeName], now: float) -> None:
+        self._look_at(request, self._dispatching.start(request, servers, now))
+        self._no_room.consider(request)
 
     def on_room(self, now: float) -> None:
-        """Less waits to be sent than before: send what found no room, in order of arrival."""
-        for service in self._no_room.services():
-            while (request := self._no_room.first(service)) and not self._finds_no_room(request):
-                self._no_room.remove(request)
-                if not request.answered_here:
-                    self._dispatch(request, now)
+        """Less waits to be sent than before: send what found no room, each in its turn."""
+        if len(self._no_room):
+            self._backlog.add(partial(self._those_with_room, now), now, "room")
+
+    def _those_with_room(self, now: float) -> Iterator[Step]:
+        for request, servers in self._no_room.going(now):
+            yield partial(self._go, request, servers)
+
+    def _go(self, request: Request, servers: list[NodeName], now: float) -> None:
+        if request.done or request.answered_here:
+            return
+        if request.copies:
+            self._rescue(request, now)
+        else:
+            self._start(request, servers, now)
 
     def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
         """See `Dispatching.rescue`. A copy that is alone is looked at as the first one was."""
         alone = not request.relied_on()
         self._dispatching.rescue(request, now, insist=insist, rejected=rejected)
         if alone and request.relied_on():
+            self._no_room.remove(request)
             self._look_at(request, self._dispatching.first_look(request, now))
+        elif alone:
+            self._no_room.consider(request, rejected=rejected)
 
     def _look_at(self, request: Request, when: float | None) -> None:
         if when is not None:
@@ -216,7 +229,7 @@ class RequestTable:
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
         if not request.done:
             self._rescue(request, now, rejected=True)
-            if not request.pending():
+            if not request.pending() and request not in self._no_room:
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
                 self._fail(request, "rejected", reason, now)
         self._settle(request, now)
@@ -248,13 +261,16 @@ class RequestTable:
     def _on_copy_dead(self, request: Request, copy: Copy, now: float) -> None:
         if copy.state is not CopyState.PENDING:
             return
-        copy.state = CopyState.DEAD
-        copy.message.newest.stand_down()
-        self._lost(request, copy, delivered=True)
+        if copy.message.may_have_left:
+            copy.state = CopyState.DEAD
+            copy.message.newest.stand_down()
+            self._lost(request, copy, delivered=True)
+        else:
+            self._dispatching.never_left(request, copy, now)
         if not request.done:
             self._rescue(request, now)
             if not request.pending():
-                if request.rule.idempotent:
+                if request.may_be_sent():
                     self._requests.strand(request)
                 else:
                     self._fail(request, "failed", f"{copy.path.peer} went away; it may have run the request", now)
@@ -264,6 +280,7 @@ class RequestTable:
         """Bring requests whose copies are in trouble to another path."""
         if state is PathState.UP:
             self._backlog.add(self._in_trouble, now, "in trouble")
+            self.on_room(now)
             return
         self._backlog.add(partial(self._look_after_path, path), now, path)
         if state is PathState.DOWN and not self._parts.routes.reaches(path.peer):
@@ -303,6 +320,7 @@ class RequestTable:
             requests = self._requests.of(service)
             if requests:
                 self._backlog.add(partial(self._each, self._look_after, requests), now, ("gained", service))
+        self.on_room(now)
 
     def withdraw(self, service: ServiceName, reason: str) -> list[Step]:
         """Return what ends each request that waits at a service which is not offered here any more."""
@@ -392,7 +410,7 @@ class RequestTable:
 
     def _expire(self, request: Request, now: float) -> None:
         unsent = "no room to send it" if request in self._no_room else "no path to any server"
-        why = "no answer" if request.copies else unsent
+        why = unsent if request.certainly_not_run() else "no answer"
         self._end(request, f"{why} within {request.rule.lifetime_s:g} s", now)
 
     def _end(self, request: Request, reason: str, now: float) -> None:
@@ -412,7 +430,6 @@ class RequestTable:
     def _finish(self, request: Request, outcome: str) -> None:
         request.done = True
         self._no_room.remove(request)
-        self._held_bytes -= len(request.payload or b"")
         request.payload = None
         self.unanswered -= 1
         self._parts.stats.requests[request.service, outcome] += 1
@@ -427,6 +444,8 @@ class RequestTable:
                     self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
-            self._requests.remove(request)
+            if request.id in self._requests:
+                self._requests.remove(request)
+                self._held_bytes -= request.held
             request.messages.clear()
             self._measure(request, now)

@@ -1,0 +1,46 @@
+"""A copy that was refused stays refused, also cut anew: its request may be running elsewhere by then."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.sim.mesh import Mesh, rule
+
+
+@pytest.mark.audit("dp-14")
+@pytest.mark.parametrize("light_after_s", [0.6, 0.8, 2.0])
+def test_a_refused_copy_that_is_cut_anew_does_not_run_beside_the_rescue(light_after_s: float) -> None:
+    """The request gets to a server that is just being restarted, over a path that dies before it can say so.
+
+    Then another path comes that carries shorter datagrams only: the robot cuts the request anew, the refusal crosses
+    it on its way, and the server is back.
+    """
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(idempotent=False, deadline_s=2.0, lifetime_s=20.0),))
+    near, far = mesh.cloud("cloud-a"), mesh.cloud("cloud-b")
+    mesh.push_views()
+    for interface, delay_s in (("wlan0", 0.010), ("wwan0", 0.060)):
+        for cloud, more_s in ((near, 0.0), (far, 0.02)):
+            for wire in mesh.both_ways(f"robot.{interface}", f"{cloud.name}.eth0"):
+                wire.delay_s = delay_s + more_s
+                wire.mtu = 1280 if interface == "wwan0" else 1500
+                wire.cut = interface == "wwan0"
+    mesh.run(8.0)
+
+    def light() -> None:
+        for wire in mesh.all_wires_of("robot.wwan0"):
+            wire.cut = False
+
+    near.engine.set_offers(())
+    for cloud in (near, far):
+        mesh.wire(f"{cloud.name}.eth0", "robot.wlan0").cut = True
+    robot.submit(bytes(3000))
+    mesh.run(0.011)
+    assert near.engine.stats.dropped["request_for_unknown_service"] == 1
+    for wire in mesh.all_wires_of("robot.wlan0"):
+        wire.cut = True
+    mesh.at(0.5, lambda: near.engine.set_offers(near.offers))
+    mesh.at(light_after_s, light)
+    mesh.run(20.0)
+    assert [len(cloud.executed) for cloud in (near, far)] == [0, 1]
+    assert len(robot.responses()) == 1
