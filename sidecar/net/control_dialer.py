@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import socket
 import time
 from dataclasses import dataclass
@@ -23,7 +22,8 @@ from protos.config_fields import numeric_host
 from sidecar.core.control_race import ControlRace
 from sidecar.core.control_watch import CHEAPER, GONE, SILENT, ControlWatch, Leave
 from sidecar.core.control_ways import STRANGER, ControlWays, Life, WayClass
-from sidecar.net.control_sockets import NotAllowedError, is_ours, listen_privately, look, open_stream, own_address
+from sidecar.net.control_attempts import Attempts, words
+from sidecar.net.control_sockets import NotAllowedError, is_ours, listen_privately, look, own_address
 from sidecar.net.host_names import HostNames
 
 if TYPE_CHECKING:
@@ -47,9 +47,6 @@ TRY_CHEAPER_S = 2.0
 
 PREPARED_S = 5.0
 """A connection made in advance is used within this time, or not at all."""
-
-STALE_ATTEMPT_S = 1.0
-"""When the network changes, an attempt this old begins again: the kernel repeats its first packet ever more rarely."""
 
 ACCEPT_PAUSE_S = 0.1
 """After the system refused to accept."""
@@ -153,6 +150,7 @@ class ControlDialer:
             self._line = None
             serving.cancel()
             await asyncio.wait([serving])
+            line.close()
 
     def let_in(self, way: Way) -> None:
         """A control plane registered us at the other end of this way."""
@@ -223,6 +221,10 @@ class ControlLine:
         """What the kernel said when the connection broke."""
         self._race: ControlRace | None = None
 
+    def close(self) -> None:
+        """Stop listening, which `serve` does only if it came to run."""
+        self._listening.close()
+
     def describe(self) -> str | None:
         """Why there is no connection yet; None if there is one."""
         if self.way is not None:
@@ -255,7 +257,7 @@ class ControlLine:
                 with connection.sock:
                     await self._carry(inside, connection)
         except OSError as error:
-            self._end(f"the line to the control plane failed: {_words(error)}")
+            self._end(f"the line to the control plane failed: {words(error)}")
         except Exception:
             log.exception("the line to the control plane failed")
             self._end("internal error")
@@ -282,7 +284,7 @@ class ControlLine:
     async def _connect(self) -> _Connection | None:
         """Race over all ways; None when every one has failed."""
         ways = self._dialer.ways
-        attempts = _Attempts()
+        attempts = Attempts()
         try:
             while True:
                 self.wake.clear()
@@ -294,7 +296,7 @@ class ControlLine:
         finally:
             attempts.close()
 
-    async def _run(self, race: ControlRace, attempts: _Attempts, wake: asyncio.Event) -> _Connection | None:
+    async def _run(self, race: ControlRace, attempts: Attempts, wake: asyncio.Event) -> _Connection | None:
         """Run a race until somebody wins, everybody has failed, or `wake` is set."""
         while not wake.is_set():
             now = time.monotonic()
@@ -310,12 +312,12 @@ class ControlLine:
                 if isinstance(outcome, NotAllowedError):
                     self._dialer.may_not_bind(outcome)
                     wake.set()
-                race.failed(way, _words(outcome), time.monotonic())
+                race.failed(way, words(outcome), time.monotonic())
         return None
 
     async def _connect_cheaper(self, ways: tuple[Way, ...]) -> _Connection | None:
         now = time.monotonic()
-        attempts = _Attempts()
+        attempts = Attempts()
         try:
             async with asyncio.timeout(TRY_CHEAPER_S):
                 return await self._run(ControlRace([WayClass(ways, 0.0)], now), attempts, asyncio.Event())
@@ -353,7 +355,7 @@ class ControlLine:
         for task in tasks:
             error = None if task.cancelled() else task.exception()
             if isinstance(error, OSError):
-                self.broken = f"{_words(error)} ({way})"
+                self.broken = f"{words(error)} ({way})"
             elif error is not None:
                 raise error
         with contextlib.suppress(OSError):
@@ -395,75 +397,3 @@ class ControlLine:
             return False
         self._dialer.prepare(connection)
         return True
-
-
-class _Attempts:
-    """Connections being made."""
-
-    def __init__(self) -> None:
-        self._tasks: dict[Way, tuple[asyncio.Task[socket.socket], float]] = {}
-
-    def start(self, way: Way, now: float) -> None:
-        """Begin to connect."""
-        self._tasks[way] = asyncio.create_task(_connected(way)), now
-
-    def keep(self, now: float, ways: ControlWays) -> list[Way]:
-        """Give up those that have no interface any more or are old; returns the others."""
-        for way, (task, began) in list(self._tasks.items()):
-            gone = way.interface is not None and not ways.has(way.interface)
-            if gone or now > began + STALE_ATTEMPT_S:
-                task.cancel()
-                task.add_done_callback(_discard)
-                del self._tasks[way]
-        return list(self._tasks)
-
-    async def wait(self, wake: asyncio.Event, timeout_s: float | None) -> None:
-        """Wait until one ends, something changes, or the time is over."""
-        waking = asyncio.create_task(wake.wait())
-        try:
-            tasks = [waking, *(task for task, _ in self._tasks.values())]
-            await asyncio.wait(
-                tasks, timeout=None if timeout_s is None else max(timeout_s, 0.0), return_when=asyncio.FIRST_COMPLETED
-            )
-        finally:
-            waking.cancel()
-
-    def take_ended(self) -> list[tuple[Way, socket.socket | OSError]]:
-        """Remove those that have ended, up to the first that connected."""
-        ended: list[tuple[Way, socket.socket | OSError]] = []
-        for way, (task, _) in list(self._tasks.items()):
-            if not task.done():
-                continue
-            del self._tasks[way]
-            error = task.exception()
-            if error is None:
-                return [(way, task.result())]
-            ended.append((way, error if isinstance(error, OSError) else OSError(str(error))))
-        return ended
-
-    def close(self) -> None:
-        """Give up all."""
-        for task, _ in self._tasks.values():
-            task.cancel()
-            task.add_done_callback(_discard)
-        self._tasks.clear()
-
-
-def _words(error: OSError) -> str:
-    """The kernel's words; asyncio puts its own, with the address, in their place."""
-    return str(error) if error.errno is None else os.strerror(error.errno)
-
-
-def _discard(task: asyncio.Task[socket.socket]) -> None:
-    if not task.cancelled() and task.exception() is None:
-        task.result().close()
-
-
-async def _connected(way: Way) -> socket.socket:
-    sock = open_stream(way)
-    try:
-        await asyncio.get_running_loop().sock_connect(sock, way.address)
-    except BaseException:
-        sock.close()
-        raise
-    return sock

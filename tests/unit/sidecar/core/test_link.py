@@ -10,6 +10,7 @@ from sidecar.core.frame import Probe, ProbeReply
 from sidecar.core.introduction import Introduction
 from sidecar.core.link import Link
 from sidecar.core.link_events import (
+    CheckPaths,
     FragmentsLost,
     PathChanged,
     PathMeasured,
@@ -235,6 +236,17 @@ def test_a_link_whose_driver_hangs_keeps_packet_numbers_for_what_it_may_yet_seal
     bench.execute(Send(PATH, message(size=30_000)))
     memory = bench.link.remember(hangs=True)
     assert max(numbers(bench.sent())) < memory.next_number
+
+
+def test_an_idle_path_is_probed_when_its_interface_is_doubted_but_not_without_end() -> None:
+    bench = up()
+    bench.wait(0.1)
+    bench.sent()
+    bench.execute(CheckPaths())
+    assert [type(one) for one in bench.frames(bench.wait(0.01))] == [Probe]
+    for _ in range(10):
+        bench.execute(CheckPaths())
+    assert bench.wait(0.01) == []
 
 
 def test_the_peers_newest_address_is_followed() -> None:

@@ -81,3 +81,21 @@ def test_forgetting_a_peer_or_an_interface_leaves_nothing_of_it() -> None:
     assert not table.reaches(A)
     assert table.all_to(A) == []
     assert not table._routes
+
+
+def test_the_best_state_of_each_interface_is_told_when_it_changes() -> None:
+    table = routes()
+    assert table.best == {WLAN: PathState.UP, WWAN: PathState.UP}
+    before = table.best
+    table.set_state(SHAKY, PathState.UP)
+    table.set_state(FAST, PathState.UNSTABLE)
+    assert table.best is before
+    table.set_state(SHAKY, PathState.DOWN)
+    assert table.best == {WLAN: PathState.UNSTABLE, WWAN: PathState.UP}
+    assert before == {WLAN: PathState.UP, WWAN: PathState.UP}
+    table.forget_peer(A)
+    assert table.best == {WLAN: PathState.DOWN}
+    table.forget_interface(WLAN)
+    assert table.best == {}
+    table.set_state(FAST, PathState.UP)
+    assert table.best == {WLAN: PathState.UP}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import os
 import socket
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from sidecar.core.control_session import ControlStats
 from sidecar.core.control_watch import CHEAPER, GONE, SILENT, Leave, Seen
 from sidecar.core.control_ways import STRANGER, ControlInterface, Price, Way
 from sidecar.core.path_id import PathState
-from sidecar.net import control_dialer, control_sockets
+from sidecar.net import control_attempts, control_dialer, control_sockets
 from sidecar.net.control_dialer import ControlDialer
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Echo:
         self.refuse: Callable[[Way], BaseException | None] = lambda way: None
         self.dark: set[InterfaceName | None] = set()
         self.unacked = False
-        monkeypatch.setattr(control_dialer, "open_stream", self.open_stream)
+        monkeypatch.setattr(control_attempts, "open_stream", self.open_stream)
         monkeypatch.setattr(control_dialer, "look", self.look)
         monkeypatch.setattr(control_dialer, "own_address", lambda sock: "10.0.0.2")
 
@@ -357,6 +358,30 @@ def test_a_name_without_any_address_is_waited_for(monkeypatch: pytest.MonkeyPatc
 
 def unknown(*_: Any, **__: Any) -> list[Any]:
     raise socket.gaierror("no such host")
+
+
+def test_many_streams_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test(echo: Echo) -> None:
+        dialer = make()
+        dialer.start(lambda: None)
+        open_before: set[str] = set()
+        for number in range(60):
+            echo.dark = {WLAN} if number % 3 == 0 else set()
+            async with dialer.line() as line:
+                if number % 5:
+                    with grpc_end(line) as end:
+                        await asyncio.get_running_loop().sock_connect(end, name_of(line))
+                        if number % 7:
+                            await says(end, b"x")
+            await asyncio.sleep(0.02)
+            if number == 9:
+                open_before = set(os.listdir("/proc/self/fd"))
+        await asyncio.sleep(0.1)
+        assert len(os.listdir("/proc/self/fd")) <= len(open_before) + 4, "the server's ends close a moment later"
+        assert len(asyncio.all_tasks()) <= 5
+        dialer.close()
+
+    run(test, monkeypatch)
 
 
 def test_the_kernel_tells_how_a_connection_fares() -> None:

@@ -39,6 +39,31 @@ def test_numeric_addresses_are_found_at_once_and_again_only_when_they_change(
     assert results.empty()
 
 
+def test_numeric_addresses_do_not_wait_for_names_and_names_keep_what_they_had(
+    found: tuple[HostNames, queue.Queue[tuple[Address, ...]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answering = threading.Event()
+    lost = threading.Event()
+
+    def getaddrinfo(host: str, port: int, **_: Any) -> list[Any]:
+        assert answering.wait(TIMEOUT_S)
+        if lost.is_set():
+            raise socket.gaierror("no such host")
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("192.0.2.9", port))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
+    names, results = found
+    wanted = ("name.example:1", "192.0.2.1:2")
+    names.look_up(wanted)
+    names.start()
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.1", 2),)
+    answering.set()
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.9", 1), ("192.0.2.1", 2))
+    lost.set()
+    names.look_up((*wanted, "192.0.2.3:3"))
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.9", 1), ("192.0.2.1", 2), ("192.0.2.3", 3))
+
+
 def test_a_name_without_address_is_logged_once_and_tried_again(
     found: tuple[HostNames, queue.Queue[tuple[Address, ...]]],
     monkeypatch: pytest.MonkeyPatch,
