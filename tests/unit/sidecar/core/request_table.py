@@ -120,6 +120,10 @@ class Table:
         self.table.on_path_changed(changed, state, now)
         self.finish(now)
 
+    def use_room(self, now: float) -> None:
+        self.table.on_room(now)
+        self.finish(now)
+
     def finish(self, now: float) -> None:
         """Let the table do what it had no time for in one turn."""
         while len(self.parts.backlog):

@@ -37,7 +37,7 @@ def test_what_found_no_room_is_sent_as_answers_make_it() -> None:
     assert 0 < fit < ASKED
     for number in range(1, fit + 1):
         table.respond(number=number, now=1.0)
-        table.table.on_room(1.0)
+        table.use_room(1.0)
     assert table.sent() == [WLAN_A] * (ASKED - fit), "one after the other, not all that wait for each that is answered"
     for number in range(fit + 1, ASKED + 1):
         table.respond(number=number, now=2.0)
@@ -53,7 +53,7 @@ def test_what_is_over_leaves_no_trace_among_those_that_wait_for_room() -> None:
     for step in table.table.withdraw(ECHO, ""):
         step(2.0)
     assert len(table.table._no_room) == 0
-    table.table.on_room(2.0)
+    table.use_room(2.0)
     assert table.sent() == []
     assert table.table.unanswered == 0
 
@@ -72,7 +72,7 @@ def test_another_path_is_no_room(state: PathState) -> None:
     fit = len(table.sent())
     table.change(WLAN_A, PathState.UNSTABLE)
     table.change(WLAN_A, state)
-    table.table.on_room(1.0)
+    table.use_room(1.0)
     assert table.sent() == []
     assert table.outbox.messages_to(A) == fit
 
@@ -93,7 +93,7 @@ def test_six_requests_of_16_mb_at_once_wait_and_all_go() -> None:
     assert table.sent() == [WLAN_A] * 3
     for number in range(1, 7):
         table.respond(number=number)
-        table.table.on_room(0.2)
+        table.use_room(0.2)
     assert table.sent() == [WLAN_A] * 3
     assert len(table.events) == 6
     table.table.handle_timer(1.0)
@@ -112,7 +112,7 @@ def test_a_small_request_does_not_wait_for_a_large_one_nor_take_its_turn() -> No
     table.submit(6, bytes(300_000), now=0.1)
     assert table.sent() == []
     table.respond(number=1)
-    table.table.on_room(0.2)
+    table.use_room(0.2)
     waited = [len(message.content.payload) for message in table.outbox._messages.values()][-2:]
     assert waited == [16_000_000, 300_000]
 
@@ -136,7 +136,7 @@ def test_a_request_whose_head_makes_it_too_long_waits_as_well() -> None:
     table.submit(5, bytes(LARGE_ROOM_BYTES - table.outbox.held_bytes))
     assert table.sent() == []
     table.respond(number=1)
-    table.table.on_room(0.2)
+    table.use_room(0.2)
     assert table.sent() == [WLAN_A]
 
 
@@ -172,5 +172,5 @@ def test_what_never_left_waits_for_room_at_the_other_server() -> None:
     assert not table.events
     assert others[0] is not None
     table.outbox.drop(others[0])
-    table.table.on_room(0.3)
+    table.use_room(0.3)
     assert table.sent() == [WWAN_B]

@@ -36,6 +36,10 @@ class Box:
         self.stats = EngineStats()
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
 
+    def come_up(self, path: PathId) -> None:
+        self.routes.set_state(path, PathState.UP)
+        self.do(self.outbox.on_path_up(path))
+
     def do(self, steps: list[Step], now: float = 0.0) -> None:
         for step in steps:
             step(now)
@@ -164,7 +168,7 @@ def test_copies_do_not_hold_back_what_waited_for_a_path() -> None:
     box.routes.set_state(OVER_WLAN, PathState.DOWN)
     box.lost(message, 0, 1)
     box.commands.clear()
-    box.do(box.outbox.on_path_up(OVER_WWAN))
+    box.come_up(OVER_WWAN)
     assert box.commands == [Resend(OVER_WWAN, message, (0, 1, 2))]
 
 
@@ -178,11 +182,11 @@ def test_without_a_path_messages_wait_and_all_missing_symbols_leave_with_the_fir
     message.acked[1] = 1
     box.outbox.on_finished(A, delivered.number)
     box.outbox.drop(called_off)
-    box.do(box.outbox.on_path_up(TO_B))
+    box.come_up(TO_B)
     assert not box.commands
-    box.do(box.outbox.on_path_up(OVER_WWAN))
+    box.come_up(OVER_WWAN)
     assert box.commands == [Resend(OVER_WWAN, message, (0, 2))]
-    box.do(box.outbox.on_path_up(OVER_WLAN))
+    box.come_up(OVER_WLAN)
     assert len(box.commands) == 1, "they wait no more"
 
 
@@ -194,7 +198,7 @@ def test_expired_messages_are_dropped_and_counted_also_when_they_wait() -> None:
     assert message.over
     assert not longer.over
     assert box.stats.dropped["message_expired"] == 1
-    box.do(box.outbox.on_path_up(OVER_WLAN))
+    box.come_up(OVER_WLAN)
     assert not box.commands
 
 
@@ -345,7 +349,7 @@ def test_what_waits_for_a_path_is_cut_to_the_one_that_comes() -> None:
     box.lost(message, 0)
     assert not box.commands
     box.routes.set_state(OVER_WLAN, PathState.UP)
-    box.do(box.outbox.on_path_up(OVER_WLAN))
+    box.come_up(OVER_WLAN)
     assert box.commands == [Send(OVER_WLAN, message.newest)]
     assert message.newest.datagram_bytes == BASE_BYTES
 

@@ -86,4 +86,4 @@ def test_a_name_without_address_is_logged_once_and_tried_again(
     names.look_up(("stun.example:3478",))
     names.start()
     assert results.get(timeout=TIMEOUT_S) == (("192.0.2.9", 3478),)
-    assert caplog.text.count("no such host") == 1
+    assert caplog.text.count("stun.example:3478: no such host") == 1
