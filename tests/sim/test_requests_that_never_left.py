@@ -57,6 +57,7 @@ def test_also_when_the_others_have_no_room_for_all_of_them(monkeypatch: pytest.M
     monkeypatch.setattr("sidecar.core.room._ROOM_BYTES", dict.fromkeys(Lane, 150_000))
     near.start()
     mesh.push_views()
+    mesh.run(0.001)
     assert len(robot.engine._requests._no_room) > COUNT / 3
     mesh.run(30.0)
     near.executed += ran_before
