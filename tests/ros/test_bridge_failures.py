@@ -12,6 +12,7 @@ import pytest
 
 from protos.model import ServiceName
 from sidecar.core.events import CancelExecution, RejectReason
+from sidecar.ros import graph
 from tests.ros.mesh import wait_until
 from tests.ros.notice_listener import NoticeListener
 
@@ -126,16 +127,19 @@ def test_a_service_comes_goes_and_comes_back(mesh: Mesh) -> None:
 
 def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """The name never leaves the graph: only the server's endpoint tells that the old requests are lost."""
+    monkeypatch.setattr("sidecar.ros.server_processes.ServerProcesses.watch", lambda _processes, _endpoint: None)
     mesh.start()
     old = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
     mesh.call("/plan", "--count", "4", "--tolerance", "-1", "--timeout-s", "1")
     wait_until(lambda: mesh.cloud.stats.pending == 4, "4 requests at the server")
-    monkeypatch.setattr("sidecar.ros.graph.SCAN_PERIOD_S", 5.0)
-    scans = mesh.cloud.stats.scans
-    wait_until(lambda: mesh.cloud.stats.scans >= scans + 2, "the last look before the long pause")
-    old.stop(signal.SIGTERM)
-    mesh.serve("--plan", "/plan")
+    with monkeypatch.context() as blind:
+        blind.setattr("sidecar.ros.looks.Looks.turn", lambda _looks, _now: None)
+        blind.setattr("sidecar.ros.looks.Looks.next_due", lambda _looks: time.monotonic() + 0.1)
+        old.stop(signal.SIGTERM)
+        mesh.serve("--plan", "/plan")
+        node = mesh.cloud._loop.node  # type: ignore[union-attr]  # a started bridge has one
+        wait_until(lambda: list(graph.server_endpoints(node, PLAN).values()) == [True], "only the new one")
     wait_until(lambda: len(mesh.link.refusals) == 4, "refusals")
     assert mesh.link.refusals[0] == (RejectReason.SERVER_LOST, "the server was replaced")
     assert mesh.result(mesh.call("/plan"))["answered"] == 1

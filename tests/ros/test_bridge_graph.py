@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -24,6 +24,21 @@ pytestmark = pytest.mark.ros
 
 PLAN = ServiceName("/plan")
 PLAN_TYPE = "nav_msgs/srv/GetPlan"
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Look at the graph often also while it does not change."""
+    monkeypatch.setattr("sidecar.ros.looks.IDLE_PERIOD_S", 0.1)
+
+
+def scanned(node: Any) -> dict[ServiceName, graph.Served]:
+    steps = graph.scan(node)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return dict(end.value)
 
 
 def test_globs_do_not_open_parameters(mesh: Mesh) -> None:
@@ -73,6 +88,7 @@ def test_a_server_that_appears_on_the_robot_takes_over(mesh: Mesh) -> None:
     assert (result["answered"], result["twice"]) == (8, 0)
 
 
+@pytest.mark.usefixtures("often")
 def test_two_cloud_sidecars_and_a_robot_in_one_domain(mesh: Mesh) -> None:
     """A robot's proxies are no services to offer, and a real server beside a robot sidecar is left alone."""
     mesh.robot = RosBridge(name="robot-1", role=Role.ROBOT, rules=RULES, domain_id=mesh.cloud_domain)
@@ -99,6 +115,7 @@ def test_two_cloud_sidecars_and_a_robot_in_one_domain(mesh: Mesh) -> None:
         second_link.stop()
 
 
+@pytest.mark.usefixtures("often")
 def test_two_robot_sidecars_in_one_domain_offer_a_name_once(mesh: Mesh) -> None:
     """Two proxies would answer each request twice."""
     other = RosBridge(name="robot-0", role=Role.ROBOT, rules=RULES, domain_id=mesh.robot_domain)
@@ -118,6 +135,7 @@ def test_two_robot_sidecars_in_one_domain_offer_a_name_once(mesh: Mesh) -> None:
         other_link.stop()
 
 
+@pytest.mark.usefixtures("often")
 def test_a_type_that_is_not_installed_on_the_robot(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
     mesh.start()
     for name, kind in {
@@ -161,4 +179,4 @@ def test_hidden_from_node_lists_and_without_services_of_its_own(mesh: Mesh) -> N
     mesh.wait_carried("/plan")
     node = mesh.robot._loop.node  # type: ignore[union-attr]  # a started bridge has one
     assert node.get_name() == "_plr_sidecar_robot_1"
-    assert set(graph.scan(node)) == {"/plan"}
+    assert set(scanned(node)) == {"/plan"}
