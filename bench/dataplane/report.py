@@ -38,7 +38,7 @@ class Report:
     def ranges(self) -> dict[str, str]:
         """The intervals for people, by the figure's name."""
         return {
-            key: f"{text_of(found.low)} to {text_of(found.high)}, of {found.samples} samples"
+            key: f"{text_of(found.low)} to {text_of(found.high)}, {found.samples} samples"
             for key, found in self.intervals.items()
         }
 

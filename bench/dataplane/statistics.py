@@ -37,6 +37,21 @@ def quantile(values: Iterable[float], fraction: float) -> float | None:
     return ordered[max(0, math.ceil(fraction * len(ordered)) - 1)] if ordered else None
 
 
+def p99(values: Iterable[float]) -> float | None:
+    """The 99th percentile; None of no values."""
+    return quantile(values, 0.99)
+
+
+def p99_ratio(samples: Sequence[float], others: Sequence[float]) -> float | None:
+    """The P99 of the one over that of the others."""
+    return ratio(p99(samples), p99(others))
+
+
+def median_ratio(samples: Sequence[float], others: Sequence[float]) -> float | None:
+    """The median of the one over that of the others."""
+    return ratio(median(samples), median(others))
+
+
 def median(values: Iterable[float | None]) -> float | None:
     """Median of what was measured; None when nothing was."""
     known = [value for value in values if value is not None]
@@ -70,6 +85,7 @@ def interval(
     """How far `of(*sets)` moves when each set is drawn again from itself, `block` samples in a row at a time.
 
     None when there are fewer than two samples in a set, or a draw gives no figure. `samples` is the smallest set's.
+    Blocks are a quarter of a small set at most: drawn as a whole it would never differ from itself.
     """
     smallest = min(map(len, sets), default=0)
     if smallest < 2:
@@ -77,7 +93,7 @@ def interval(
     rng = random.Random(seed)
     found = []
     for _ in range(DRAWS):
-        value = of(*(_drawn_again(samples, min(block, len(samples)), rng) for samples in sets))
+        value = of(*(_drawn_again(samples, max(1, min(block, len(samples) // 4)), rng) for samples in sets))
         if value is None:
             return None
         found.append(value)

@@ -36,7 +36,11 @@ def show_verdicts(
     """Show what is met and what is missed; `notes`, by the figure's name, say what it comes from."""
     table = RichTable(title="targets", title_justify="left")
     for column in ("figure", "value", "wanted", "verdict", *(("from",) if notes is not None else ())):
-        shape: dict[str, Any] = {"justify": "right"} if column == "value" else {"no_wrap": column != "wanted"}
+        shape: dict[str, Any] = {"no_wrap": column in ("value", "verdict")}
+        if column == "value":
+            shape["justify"] = "right"
+        elif column == "figure":
+            shape["overflow"] = "fold"
         table.add_column(column, **shape)
     for target in targets:
         note = () if notes is None else (notes.get(target.key, ""),)

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 SIZE = 120_000
 RATE_HZ = 10.0
-BEFORE_S = 20.0
+BEFORE_S = 15.0
 LONG_S = 10.0
-DARK_S = (LONG_S, 2.0, LONG_S, 6.0, 4.0, LONG_S, 8.0)
+DARK_S = (LONG_S, 2.0, LONG_S, 6.0, 3.0, LONG_S, 4.0)
 """Of each run, to which up to one request's time is added at random. Three long ones: what the figure was at first."""
 QUICK_DARK_S = (4.0, 2.0)
 AFTER_S = 2.5
