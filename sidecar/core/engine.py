@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
+from sidecar.core.attention import Attention
 from sidecar.core.events import (
     ApplicationEvent,
     ExecutionId,
@@ -21,6 +22,7 @@ from sidecar.core.events import (
 )
 from sidecar.core.inbound import Decoding, Inbound
 from sidecar.core.link_events import (
+    Attend,
     FinishedLost,
     FragmentsLost,
     FragmentsReceived,
@@ -85,6 +87,7 @@ class Engine:
         self._interfaces: set[InterfaceName] = set()
         self._carried: Mapping[ServiceName, bool | None] = {}
         self._sweep_at = now + SWEEP_EVERY_S
+        self._attention = Attention(now)
         self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
         self.peers = Peers(own, self.stats.dropped)
         self.routes = Routes()
@@ -143,6 +146,9 @@ class Engine:
             why = "no server offers this service any more"
             self._events.append(RequestFailed(request_id, service, "rejected", why, 0.0))
             return
+        servers = frozenset(self._offers.servers(service))
+        if self._attention.needs(servers, now):
+            self._commands.append((None, Attend(servers)))
         self._requests.submit(request_id, service, kind, rule, payload, now)
         self.stats.in_flight = self._requests.unanswered
 
