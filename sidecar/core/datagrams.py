@@ -134,7 +134,7 @@ class DatagramBuilder:
         """Add what the path may send now; False when the burst got full first. `probing` allows probes."""
         if path.introductions:
             self._answer_introductions(path, burst, now)
-        if probing and path.probe_at is not None and path.probe_at <= now:
+        if probing and path.probe_at <= now:
             self._add_probe(path, burst, now)
         if probing and path.mtu.timer is not None and path.mtu.timer <= now:
             self._add_mtu_probe(path, burst, now)
@@ -170,6 +170,7 @@ class DatagramBuilder:
         """Add a run's datagrams and return their bytes. Control frames that wait go with it or before it."""
         end, sources = run.first + run.symbols, run.message.count
         path.waits_for_answer(now)
+        path.probing.used(now)
         if path.control_at < NEVER:
             control = path.take_control(now)
             size = run.message.datagram_bytes + sum(map(len, control))
@@ -258,7 +259,11 @@ class DatagramBuilder:
         probe_id = path.next_probe(now, self._rng)
         probe = frame.encode_probe(frame.Probe(probe_id))
         me = self.identity
-        for address in path.destinations():
+        destinations = path.destinations()
+        if destinations == (path.remote,) and path.state is not PathState.DOWN:
+            self._add_control(path, [*path.take_control(now), probe], burst, now)
+            return
+        for address in destinations:
             number = path.recovery.take_numbers()
             if path.state is PathState.DOWN:
                 header = Header(me.interface_id, path.remote_id, me.session, number)
@@ -272,13 +277,13 @@ class DatagramBuilder:
         introductions, path.introductions = path.introductions, []
         for address, probe_id in introductions:
             reply = frame.encode_probe_reply(frame.ProbeReply(probe_id))
-            probe = frame.encode_probe(frame.Probe(path.counter_probe(now)))
+            probe = frame.encode_probe(frame.Probe(path.probing.ask_back(now)))
             datagram = self._sealed(path, path.recovery.take_numbers(), now, reply, probe)
             self._add_alone(path, address, datagram, burst)
 
     def _add_mtu_probe(self, path: Path, burst: Burst, now: float) -> None:
         """Add a padded probe. Nobody waits for its acknowledgement, and its loss says nothing of the rest."""
-        probe_id = path.take_probe_id()
+        probe_id = path.probing.take_id()
         size = path.mtu.next_probe(probe_id, now, MTU_PROBE_TIMEOUTS * path.recovery.rtt.probe_timeout(0.0))
         if size is None or path.remote is None:
             return

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
+from sidecar.core.attention import Attention
 from sidecar.core.backlog import Backlog, Step
 from sidecar.core.events import (
     ApplicationEvent,
@@ -23,6 +24,7 @@ from sidecar.core.events import (
 )
 from sidecar.core.inbound import Decoding, Inbound
 from sidecar.core.link_events import (
+    Attend,
     FinishedLost,
     FragmentsLost,
     FragmentsReceived,
@@ -89,6 +91,7 @@ class Engine:
         self._interfaces: set[InterfaceName] = set()
         self._carried: Mapping[ServiceName, bool | None] = {}
         self._sweep_at = now + SWEEP_EVERY_S
+        self._attention = Attention(now)
         self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
         self.peers = Peers(own, self.stats.dropped)
         self.routes = Routes()
@@ -146,6 +149,9 @@ class Engine:
         if rule is None or kind is None:
             self._requests.reject(request_id, service, "no server offers this service any more")
             return
+        servers = frozenset(self._offers.servers(service))
+        if self._attention.needs(servers, now):
+            self._commands.append((None, Attend(servers)))
         self._requests.submit(request_id, service, kind, rule, payload, now)
         self._count_in_flight()
 

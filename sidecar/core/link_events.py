@@ -57,7 +57,13 @@ class ResetPaths:
 
 @dataclass(frozen=True, slots=True)
 class Rebind:
-    """The interface's address or gateway changed: what was measured is void, and peers must learn where we are."""
+    """Addresses or gateways of the interface changed: of paths which that concerns, what was measured is void, and
+    their peers must learn where we are."""
+
+    lost: frozenset[str]
+    """Addresses that nothing leaves from any more."""
+    rerouted: frozenset[int]
+    """Families (4, 6) whose gateways are others now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +83,13 @@ class Seek:
 @dataclass(frozen=True, slots=True)
 class CheckPaths:
     """Something else than datagrams is not answered over this interface: probe what is up now, however idle."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attend:
+    """Requests go to these peers: whether a path to one of them lives must be known soon, also of those that rest."""
+
+    peers: frozenset[NodeName]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +158,7 @@ LinkCommand = (
     | Rebind
     | Seek
     | CheckPaths
+    | Attend
     | SetMtu
     | PathCommand
     | SendClose

@@ -285,7 +285,11 @@ class InterfaceManager:
         elif set(interface.addresses) != set(was.addresses):
             log.info("%s: addresses changed to %s", interface.name, ", ".join(interface.addresses))
         elif interface.gateways != was.gateways:
-            log.info("%s: gateways changed to %s", interface.name, ", ".join(interface.gateways) or "none")
+            log.info(
+                "%s: gateways changed to %s",
+                interface.name,
+                ", ".join(hop or "no hop" for _, hop in interface.gateways) or "none",
+            )
         return changed
 
     def _links(self) -> dict[InterfaceName, InterfaceThread]:

@@ -115,7 +115,12 @@ class Rogue:
         for link in self.victim.links.values():
             for path in link._paths.values():
                 if path.peer == self.node.name:
-                    self.send([frame.encode_probe_reply(ProbeReply(number)) for number in list(path._probes_out)])
+                    self.send(
+                        [
+                            frame.encode_probe_reply(ProbeReply(number))
+                            for number in [*path.probing._out, *path.probing._back]
+                        ]
+                    )
 
     def attack(self, kind: str, count: int) -> None:
         self.send(ATTACKS[kind](self.rng) for _ in range(count))

@@ -13,7 +13,7 @@ from sidecar.core.introduction import Introduction
 from sidecar.core.link_events import (
     Send,
 )
-from sidecar.core.paths import FIRST_PROBE_S
+from sidecar.core.probing import FIRST_PROBE_S
 from tests.unit.sidecar.core.builders import (
     Bench,
     message,
