@@ -155,7 +155,7 @@ def test_a_pair_that_misses_loses_its_place() -> None:
     for number in range(1, 3):
         table.submit(number)
         assert table.sent() == [WLAN_A]
-        table.table.handle_timer(1.0)
+        table.handle_timers(1.0)
     table.submit(3)
     assert table.sent() == [WWAN_B]
 
