@@ -1,18 +1,20 @@
 """Symbols that wait for one path, and which of them leave next.
 
 Urgent before bulk: a message's priority comes first. Fresh before late: within a priority, those that can still make
-their deadline go first, earliest deadline first; those that can not go after them, what is begun first and then the
-newest. So a backlog or an overload makes some messages miss, instead of each message make the next one late, and what
-comes late comes as little late as can be. What comes with its deadline over goes last: after an outage the pace is low
-at first, and what is asked then may seem hopeless, but must not wait for the backlog. What another path is sending, and
-in time, comes after all that (`turn`). No priority starves: while a lower one waits, it gets one symbol in SHARE.
+their deadline go first, earliest deadline first; those that can not go after them. So a backlog or an overload makes
+some messages miss, instead of each message make the next one late. Among the late, what is begun goes first and then
+the oldest that can still be of use: the newest would overtake the others again and again until these expire. What comes
+with its deadline over goes after those: after an outage the pace is low at first, and what is asked then may seem
+hopeless, but must not wait for the backlog. What can not even be answered before it expires goes last, as the pace may
+rise. What another path is sending, and in time, comes after all that (`turn`). No
+priority starves: while a lower one waits, it gets one symbol in SHARE.
 """
 
 from __future__ import annotations
 
 import heapq
 from itertools import count
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.priority import Priority
@@ -43,22 +45,31 @@ class Run(NamedTuple):
     symbols: int
 
 
-class _Class:
-    """Messages of one priority: in time, late, too late when they came, and those that another path takes care of."""
+_Entry: TypeAlias = "tuple[float, int, Turn]"
+"""What it is sorted by, the order of arrival, and the message."""
 
-    __slots__ = ("covered", "fresh", "hopeless", "passed_over", "stale")
+
+class _Class:
+    """Messages of one priority by what is to be expected of them: each heap goes after those named before it."""
+
+    __slots__ = ("covered", "fresh", "hopeless", "passed_over", "stale", "useless")
 
     def __init__(self) -> None:
-        self.fresh: list[tuple[float, int, Turn]] = []
-        self.hopeless: list[tuple[float, int, Turn]] = []
-        self.stale: list[tuple[float, int, Turn]] = []
-        self.covered: list[tuple[float, int, Turn]] = []
-        """By when they are to be looked at again."""
+        self.fresh: list[_Entry] = []
+        """Can make their deadline; by that, as the next two."""
+        self.hopeless: list[_Entry] = []
+        """Could not make it any more when it was still to come."""
+        self.stale: list[_Entry] = []
+        """Came when it was over."""
+        self.useless: list[_Entry] = []
+        """Expire sooner than they can be answered, if the pace stays; by when they expire, the last one first."""
+        self.covered: list[_Entry] = []
+        """Another path takes care of them; by when they are to be looked at again."""
         self.passed_over = 0
         """Symbols of higher priorities that left while something waited here."""
 
-    def heaps(self) -> tuple[list[tuple[float, int, Turn]], ...]:
-        return self.fresh, self.hopeless, self.stale, self.covered
+    def heaps(self) -> tuple[list[_Entry], ...]:
+        return self.fresh, self.hopeless, self.stale, self.useless, self.covered
 
 
 class SendQueue:
@@ -148,13 +159,13 @@ class SendQueue:
             run = entry.take(max(1, min(most, budget // size, MAX_RUN_BYTES // size)))
             if run is not None:
                 entry.goes_on(now, pace, round_trip_s)
-                if heap is chosen.hopeless or heap is chosen.stale:
+                if heap is not chosen.fresh and heap is not chosen.covered:
                     heapq.heapreplace(heap, (BEGUN, heap[0][1], entry))
                 return Run(message, *run)
             self._drop(heap)
         return None
 
-    def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[tuple[float, int, Turn]] | None:
+    def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[_Entry] | None:
         """Return the heap whose head goes next; heads that are over go, those that change places do so."""
         covered = each.covered
         while covered and covered[0][2].covered_until(now, pace, round_trip_s) is None:
@@ -169,21 +180,29 @@ class SendQueue:
                 elif message.expires <= now:
                     self.expired += 1
                     self._drop(heap)
+                elif heap is each.hopeless or heap is each.stale:
+                    if entry.can_end_by(message.expires, now, pace, round_trip_s):
+                        return heap
+                    self._move(heap, each.useless, -message.expires)
                 elif heap is not each.fresh:
                     return heap
                 elif (until := entry.covered_until(now, pace, round_trip_s)) is not None:
                     entry.waits()
                     heapq.heappop(heap)
                     heapq.heappush(covered, (until, order, entry))
-                elif entry.is_hopeless(now, pace, round_trip_s):
-                    late = each.hopeless if message.deadline > now else each.stale
-                    heapq.heappop(heap)
-                    heapq.heappush(late, (BEGUN if entry.begun else -message.deadline, order, entry))
+                elif not entry.can_end_by(message.deadline, now, pace, round_trip_s):
+                    self._move(heap, each.hopeless if message.deadline > now else each.stale, message.deadline)
                 else:
                     return heap
         return None
 
-    def _drop(self, heap: list[tuple[float, int, Turn]]) -> None:
+    @staticmethod
+    def _move(heap: list[_Entry], to: list[_Entry], by: float) -> None:
+        """Move the head; what is begun stays in front."""
+        _, order, entry = heapq.heappop(heap)
+        heapq.heappush(to, (BEGUN if entry.begun else by, order, entry))
+
+    def _drop(self, heap: list[_Entry]) -> None:
         del self._entries[heapq.heappop(heap)[2].message.number]
 
     def clear(self) -> list[tuple[OutboundMessage, tuple[int, ...]]]:
