@@ -6,8 +6,8 @@ some messages miss, instead of each message make the next one late. Among the la
 the oldest that can still be of use: the newest would overtake the others again and again until these expire. What comes
 with its deadline over goes after those: after an outage the pace is low at first, and what is asked then may seem
 hopeless, but must not wait for the backlog. What can not even be answered before it expires goes last, as the pace may
-rise. What another path is sending, and in time, comes after all that (`turn`). No
-priority starves: while a lower one waits, it gets one symbol in SHARE.
+rise; when it did, what can make its deadline after all is fresh again. What another path is sending, and in time, comes
+after all that (`turn`). No priority starves: while a lower one waits, it gets one symbol in SHARE.
 """
 
 from __future__ import annotations
@@ -52,13 +52,15 @@ _Entry: TypeAlias = "tuple[float, int, Turn]"
 class _Class:
     """Messages of one priority by what is to be expected of them: each heap goes after those named before it."""
 
-    __slots__ = ("covered", "fresh", "hopeless", "passed_over", "stale", "useless")
+    __slots__ = ("covered", "fresh", "hopeless", "newest", "passed_over", "stale", "useless")
 
     def __init__(self) -> None:
         self.fresh: list[_Entry] = []
         """Can make their deadline; by that, as the next two."""
         self.hopeless: list[_Entry] = []
         """Could not make it any more when it was still to come."""
+        self.newest: list[_Entry] = []
+        """Of those, what has its deadline still to come, the last one first; some that left may lie there."""
         self.stale: list[_Entry] = []
         """Came when it was over."""
         self.useless: list[_Entry] = []
@@ -70,6 +72,12 @@ class _Class:
 
     def heaps(self) -> tuple[list[_Entry], ...]:
         return self.fresh, self.hopeless, self.stale, self.useless, self.covered
+
+    def look_for_newest(self, now: float) -> None:
+        """Make `newest` again from `hopeless`."""
+        ahead = ((-entry.message.deadline, order, entry) for _, order, entry in self.hopeless)
+        self.newest[:] = [item for item in ahead if -item[0] > now]
+        heapq.heapify(self.newest)
 
 
 class SendQueue:
@@ -118,6 +126,8 @@ class SendQueue:
             for heap in each.heaps():
                 heap[:] = [item for item in heap if not item[2].message.over]
                 heapq.heapify(heap)
+            each.newest[:] = [item for item in each.newest if not item[2].message.over]
+            heapq.heapify(each.newest)
         self._entries = {number: entry for number, entry in self._entries.items() if not entry.message.over}
         self._purge_at = max(PURGE_AT, 2 * len(self._entries))
 
@@ -167,6 +177,7 @@ class SendQueue:
 
     def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[_Entry] | None:
         """Return the heap whose head goes next; heads that are over go, those that change places do so."""
+        self._hope_again(each, now, pace, round_trip_s)
         covered = each.covered
         while covered and covered[0][2].covered_until(now, pace, round_trip_s) is None:
             _, order, entry = heapq.heappop(covered)
@@ -192,9 +203,37 @@ class SendQueue:
                     heapq.heappush(covered, (until, order, entry))
                 elif not entry.can_end_by(message.deadline, now, pace, round_trip_s):
                     self._move(heap, each.hopeless if message.deadline > now else each.stale, message.deadline)
+                    if message.deadline > now:
+                        heapq.heappush(each.newest, (-message.deadline, order, entry))
+                        if len(each.newest) > 2 * len(each.hopeless) + PURGE_AT:
+                            each.look_for_newest(now)
                 else:
                     return heap
         return None
+
+    def _hope_again(self, each: _Class, now: float, pace: float, round_trip_s: float) -> None:
+        """Bring back what can make its deadline after all, as the pace rose: if any, then the newest."""
+        newest = each.newest
+        while newest:
+            message = newest[0][2].message
+            if message.deadline <= now:
+                newest.clear()
+            elif self._entries.get(message.number) is not newest[0][2]:
+                heapq.heappop(newest)
+            else:
+                break
+        if not newest or not newest[0][2].can_end_by(newest[0][2].message.deadline, now, pace, round_trip_s):
+            return
+        still: list[_Entry] = []
+        for item in each.hopeless:
+            _, order, entry = item
+            if entry.can_end_by(entry.message.deadline, now, pace, round_trip_s):
+                heapq.heappush(each.fresh, (entry.message.deadline, order, entry))
+            else:
+                still.append(item)
+        each.hopeless[:] = still
+        heapq.heapify(each.hopeless)
+        each.look_for_newest(now)
 
     @staticmethod
     def _move(heap: list[_Entry], to: list[_Entry], by: float) -> None:
@@ -213,6 +252,7 @@ class SendQueue:
         for each in self._classes:
             for heap in each.heaps():
                 heap.clear()
+            each.newest.clear()
         self._entries.clear()
         self._purge_at = PURGE_AT
         return [(message, indices) for message, indices in left if indices]

@@ -143,6 +143,26 @@ def test_of_what_is_hopeless_at_this_pace_the_oldest_goes_first() -> None:
     assert take(queue, now=1.0, pace=PACE)[0] == 1
 
 
+@pytest.mark.audit("dp-13")
+def test_what_seemed_hopeless_is_fresh_again_when_the_pace_rises() -> None:
+    queue = SendQueue()
+    for number, size, deadline in ((1, 400_000, 1.0), (2, 150_000, 1.1), (3, 120_000, 1.2)):
+        queue.add(message(number, size, deadline=deadline, expires=100.0))
+    assert take(queue, pace=PACE)[0] == 1
+    assert take(queue, now=0.1, pace=PACE)[0] == 1
+    assert take(queue, now=0.1, pace=2 * PACE)[0] == 2
+    assert take(queue, now=0.1, pace=2 * PACE)[0] == 2
+
+
+def test_what_seemed_hopeless_is_not_remembered_when_it_has_left() -> None:
+    queue = SendQueue()
+    for number in range(1, 2000):
+        queue.add(message(number, 100, deadline=number + 0.001, expires=1e9))
+        assert take(queue, now=float(number), pace=PACE)[0] == number
+    held = queue._classes[Priority.NORMAL].newest
+    assert len(held) <= 2 * PURGE_AT
+
+
 def test_the_late_wait_for_all_that_can_still_make_it() -> None:
     queue = SendQueue()
     for number, deadline in ((1, 1.0), (2, 2.0), (3, 6.0), (4, 7.0)):
