@@ -14,6 +14,7 @@ from sidecar.core.frame import (
     FRAGMENT_OVERHEAD_BYTES,
     FRAGMENT_TYPE,
     HEADER_BYTES,
+    MAX_LEFT_US,
     NONCE_OFFSET,
     REPAIR_TYPE,
     Header,
@@ -188,6 +189,7 @@ class DatagramBuilder:
         """Build a datagram for each symbol, all but the last equally long, and seal each where it lies."""
         count = len(indices)
         symbol, message_number, total = message.symbol, message.number, message.total
+        left_us = _left_us(path, message, now)
         segment = FRAGMENT_OVERHEAD_BYTES + symbol
         first_number = path.recovery.take_numbers(count)
         sealing = path.sealing
@@ -201,7 +203,7 @@ class DatagramBuilder:
         end = 0
         with memoryview(buffer) as view:
             for number, index in enumerate(indices, first_number):
-                pack(buffer, end, head, session, number, kind, message_number, total, symbol, index)
+                pack(buffer, end, head, session, number, kind, message_number, total, symbol, index, left_us)
                 data = symbol_data(index)
                 start, body = end, end + HEADER_BYTES
                 plain_end = start + FRAGMENT_DATAGRAM_BYTES + len(data)
@@ -223,7 +225,8 @@ class DatagramBuilder:
         """Build one datagram of control frames and a symbol: a small answer and what its request is owed, say."""
         message, index = run.message, run.first
         number = path.recovery.take_numbers()
-        head = frame.encode_fragment_head(message.number, message.total, message.symbol, index)
+        left_us = _left_us(path, message, now)
+        head = frame.encode_fragment_head(message.number, message.total, message.symbol, index, left_us)
         symbol = message.symbol_data(index)
         if message.over:  # as in `_add_symbols`
             self._add_control(path, control, burst, now)
@@ -306,6 +309,13 @@ class DatagramBuilder:
         sealed = bytearray(len(plain) + TAG_BYTES)
         sealing.encrypt_into(clear[NONCE_OFFSET:], plain, clear, sealed)
         return clear + sealed
+
+
+def _left_us(path: Path, message: OutboundMessage, now: float) -> int:
+    """How long the message will be of use when what is sent now arrives. One way is taken for half a round trip: where
+    that is too much, the way back is longer than that, and its answer would come no sooner."""
+    left_s = message.expires - now - path.recovery.rtt.smoothed / 2
+    return min(max(0, int(left_s * 1e6)), MAX_LEFT_US) if left_s < NEVER else MAX_LEFT_US
 
 
 def _fill(control: list[bytes]) -> list[bytes]:

@@ -148,6 +148,8 @@ class ExecutionTable:
     ) -> ExecuteRequest | Reply | None:
         """Take one copy: run the request, answer from the cache, refuse, or (None) let it wait for the result.
 
+        What comes first when its lifetime is over is neither run nor answered: its robot has given it up.
+
         The local server is waited for as long as the robot waits, but at most `patience_s`.
         """
         waiter = Waiter(path, message.copy)
@@ -171,6 +173,9 @@ class ExecutionTable:
                 return None
             count[message.service, "cached"] += 1
             return self._reply(execution, waiter, now + lifetime)
+        if lifetime <= 0:
+            self._stats.dropped["request_expired"] += 1
+            return None
         self._forget_old(now)
         if self._early_cancels.holds(path.peer, message.request_id, now):
             count[message.service, "cancelled"] += 1

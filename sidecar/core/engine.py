@@ -291,11 +291,11 @@ class Engine:
         match event:
             case FragmentsReceived(path, session, fragments):
                 if self._is_current(path, session):
-                    for content in self._inbound.add(path, session, fragments, now):
-                        self._on_message(path, content, now)
-            case MessageDecoded(path, session, content):
+                    for content, ends_at in self._inbound.add(path, session, fragments, now):
+                        self._on_message(path, content, ends_at, now)
+            case MessageDecoded(path, session, content, ends_at):
                 if self._is_current(path, session):
-                    self._on_message(path, content, now)
+                    self._on_message(path, content, ends_at, now)
             case MessageAbandoned(peer, session, number):
                 if self.peers.session(peer) == session:
                     self._inbound.abandon(peer, number)
@@ -344,7 +344,7 @@ class Engine:
         self.stats.dropped["fragment_of_old_session"] += 1
         return False
 
-    def _on_message(self, path: PathId, content: memoryview, now: float) -> None:
+    def _on_message(self, path: PathId, content: memoryview, ends_at: float, now: float) -> None:
         try:
             message = decode_message(content)
         except DecodeError:
@@ -355,7 +355,7 @@ class Engine:
             if robot:
                 self.stats.dropped["request_to_a_robot"] += 1
             else:
-                self._serving.on_request(path, message, now)
+                self._serving.on_request(path, message.when_left(ends_at - now), now)
         elif isinstance(message, CancelMessage):
             if robot:
                 self.stats.dropped["cancel_to_a_robot"] += 1

@@ -208,6 +208,8 @@ class MessageDecoded:
     path: PathId
     session: SessionId
     content: memoryview
+    ends_at: float
+    """When it is of no use any more."""
 
 
 @dataclass(frozen=True, slots=True)

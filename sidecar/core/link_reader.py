@@ -83,7 +83,7 @@ class LinkReader:
             size = len(plain) - FRAGMENT_HEAD_BYTES
             if size < 0 or number <= high or its_path is not path:
                 break
-            kind, message, total, symbol, index = unpack(plain)
+            kind, message, total, symbol, index, left_us = unpack(plain)
             if kind == FRAGMENT_TYPE:
                 length = total - index * symbol
                 if length > symbol:
@@ -103,7 +103,7 @@ class LinkReader:
                 received.add_run(low, high, now)
                 low = number
             high = number
-            fragments.append(new(Fragment, (message, total, symbol, index, plain[FRAGMENT_HEAD_BYTES:])))
+            fragments.append(new(Fragment, (message, total, symbol, index, plain[FRAGMENT_HEAD_BYTES:], left_us)))
         if fragments:
             received.add_run(low, high, now)
             self._heard(path, source, now, newest=True)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.rcl import Message, send_request, take_response
-from sidecar.ros.request_window import MAX_SIZE
 from sidecar.ros.ros_loop import service_qos
+from sidecar.ros.server_capacity import MOST_AT_ONCE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -32,7 +32,7 @@ class LocalServer:
         self.type = service_type
         self._node = node
         try:
-            self._client = node.create_client(service_type.service, name, qos_profile=service_qos(MAX_SIZE))
+            self._client = node.create_client(service_type.service, name, qos_profile=service_qos(MOST_AT_ONCE))
         # rclpy validates names with exceptions of several unrelated classes.
         except Exception as error:
             raise RosBridgeError(f"rmw refuses a client of {name}, type {service_type.name}: {error}") from error

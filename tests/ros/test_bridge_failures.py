@@ -70,14 +70,24 @@ def test_what_the_robot_calls_off_runs_only_if_the_server_has_it_already(mesh: M
 
 
 def test_a_server_that_answers_nothing_at_first(mesh: Mesh) -> None:
-    """More requests than the window are ignored one after another; those behind them are answered all the same."""
+    """More requests than the window are ignored; those behind them are answered all the same, after a silence."""
     mesh.start()
     mesh.serve("--plan", "/plan", "--deep")
     mesh.wait_carried("/plan")
-    ignored = ["-1"] * 12
-    result = mesh.result(mesh.call("/plan", "--count", "24", "--tolerance", *ignored, *["0"] * 12, "--timeout-s", "8"))
-    assert sorted(result["order"]) == list(range(12, 24))
+    ignored = ["-1"] * 2
+    result = mesh.result(mesh.call("/plan", "--count", "24", "--tolerance", *ignored, *["0"] * 22, "--timeout-s", "12"))
+    assert sorted(result["order"]) == list(range(2, 24))
     assert mesh.cloud.stats.requests_paced > 0
+
+
+@pytest.mark.audit("dp-3")
+def test_a_server_that_ignores_a_full_queue_gets_more_when_nobody_waits_for_those(mesh: Mesh) -> None:
+    mesh.faults.lifetime_s = 4.0
+    mesh.start()
+    mesh.serve("--plan", "/plan")
+    mesh.wait_carried("/plan")
+    assert mesh.result(mesh.call("/plan", "--count", "12", "--tolerance", "-1", "--timeout-s", "6"))["answered"] == 0
+    assert mesh.result(mesh.call("/plan", "--count", "12", "--timeout-s", "6"))["answered"] == 12
 
 
 def test_the_server_ends_with_requests_pending(mesh: Mesh) -> None:
