@@ -103,6 +103,10 @@ class Request:
     """The application has its answer, not from the network: copies are sent no more, and are awaited until the deadline
     for what they tell of their paths."""
     found_unreachable: bool = False
+    retry_at: float | None = None
+    """When servers that refused it for the moment are asked again (s); None: not at all."""
+    refusal: str = ""
+    """Why the last of them refused it."""
     outcomes_measured: bool = False
     """Which of its copies missed the deadline has been counted."""
 

@@ -49,6 +49,10 @@ if TYPE_CHECKING:
 
 MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""
+RETRY_S = 0.05
+"""Twice this, doubled with each copy, until a request that was refused for the moment is asked again, ..."""
+MAX_RETRY_S = 2.0
+"""... and never longer than this."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
 """Payloads of requests until the last copy of each has ended, also while they wait for a path or for room."""
 
@@ -231,8 +235,19 @@ class RequestTable:
             self._rescue(request, now, rejected=True)
             if not request.pending() and request not in self._no_room:
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
-                self._fail(request, "rejected", reason, now)
+                if rejection.reason.may_pass and request.may_be_sent():
+                    self._wait_out(request, reason, now)
+                else:
+                    self._fail(request, "rejected", reason, now)
         self._settle(request, now)
+
+    def _wait_out(self, request: Request, reason: str, now: float) -> None:
+        """Its servers restart, as it seems: it waits for the first that is back, and asks them now and then."""
+        request.refusal = reason
+        self._requests.strand(request)
+        request.retry_at = now + min(RETRY_S * 2 ** len(request.copies), MAX_RETRY_S)
+        self._look_at(request, request.retry_at)
+        self._tell_unreachable(request)
 
     def _find(self, server: NodeName, request_id: RequestId, number: int) -> tuple[Request, Copy] | None:
         dropped = self._parts.stats.dropped
@@ -341,7 +356,11 @@ class RequestTable:
     def _notice_unreachable(self, request: Request, _now: float) -> None:
         if request.rule.fallback is None or request.found_unreachable or request.done:
             return
-        if not any(self._parts.routes.reaches(server) for server in self._parts.offers.servers(request.service)):
+        if not self._parts.routes.reaches_any(self._parts.offers.servers(request.service)):
+            self._tell_unreachable(request)
+
+    def _tell_unreachable(self, request: Request) -> None:
+        if request.rule.fallback is not None and not request.found_unreachable:
             request.found_unreachable = True
             self._parts.emit(Unreachable(request.id, request.service))
 
@@ -372,6 +391,9 @@ class RequestTable:
             if request.expires_at <= now:
                 self._expire(request, now)
                 continue
+            if request.retry_at is not None and request.retry_at <= now:
+                request.retry_at = None
+                self._look_after(request, now)
             if now < request.deadline_at:
                 self._look_at(request, self._dispatching.look_again(request, now))
                 continue
@@ -409,7 +431,7 @@ class RequestTable:
             self._parts.measurements.lost(request.carried(copy), delivered=delivered)
 
     def _expire(self, request: Request, now: float) -> None:
-        unsent = "no room to send it" if request in self._no_room else "no path to any server"
+        unsent = request.refusal or ("no room to send it" if request in self._no_room else "no path to any server")
         why = unsent if request.certainly_not_run() else "no answer"
         self._end(request, f"{why} within {request.rule.lifetime_s:g} s", now)
 
