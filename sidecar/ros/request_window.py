@@ -30,10 +30,13 @@ if TYPE_CHECKING:
 
     from sidecar.core.priority import Priority
 
-STALL_S = 1.0
-"""A silence, where it is not known how long the server takes ..."""
 STALL_TIMES = 3.0
-"""... and otherwise at least so many times what its requests usually take. A late request that is out for STALL_S is no
+"""A silence lasts so many times what the server's requests usually take ..."""
+SHORT_STALL_S = 0.1
+"""... but at least this long. So does the first one of a server of which nothing is known: one request may wait there,
+and the other may have been lost."""
+STALL_S = 1.0
+"""Further silences of such a server are twice this, four times, and so on. A late request that is out for STALL_S is no
 reason any more to hold the next one back."""
 LATE_ONLY_S = 2.0
 """When nothing but late requests came for so long, they may fill the window: then the deadline is shorter than the
@@ -180,8 +183,11 @@ class RequestWindow(Generic[T]):
         """When one more may go although the window is full; None: never, or it is open."""
         if not self.size <= len(self._unseen) < SAFE_SIZE:
             return None
-        patience_s = max(STALL_S, STALL_TIMES * self._capacity.usual_s)
-        return self._progress_at + patience_s * 2.0**self._silences
+        if self._capacity.usual_s:
+            patience_s = max(SHORT_STALL_S, STALL_TIMES * self._capacity.usual_s) * 2.0**self._silences
+        else:
+            patience_s = STALL_S * 2.0**self._silences if self._silences else SHORT_STALL_S
+        return self._progress_at + patience_s
 
     def _late_may_go(self, now: float) -> bool:
         only_late = self._only_late_since is not None and now - self._only_late_since >= LATE_ONLY_S

@@ -17,33 +17,20 @@ from tests.ros.mesh import wait_until
 from tests.ros.notice_listener import NoticeListener
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tests.ros.mesh import Mesh
 
 pytestmark = pytest.mark.ros
 
 PLAN = ServiceName("/plan")
 
-SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8" ?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <participant profile_name="short_lease" is_default_profile="true">
-    <rtps><builtin><discovery_config>
-      <leaseDuration><sec>2</sec></leaseDuration>
-      <leaseAnnouncement><sec>0</sec><nanosec>500000000</nanosec></leaseAnnouncement>
-    </discovery_config></builtin></rtps>
-  </participant>
-</profiles>
-"""
-
 
 def test_a_request_that_is_never_answered_costs_itself_only(mesh: Mesh) -> None:
-    mesh.faults.lifetime_s = 2.0
+    mesh.faults.lifetime_s = 12.0
     mesh.start()
     mesh.serve("--plan", "/plan", "--deep")
     mesh.wait_carried("/plan")
     # Every second request is ignored by the server; far more than fit in its window.
-    result = mesh.result(mesh.call("/plan", "--count", "120", "--tolerance", "0", "-1", "--timeout-s", "6"))
+    result = mesh.result(mesh.call("/plan", "--count", "120", "--tolerance", "0", "-1", "--timeout-s", "16"))
     assert (result["answered"], result["wrong"], result["twice"]) == (60, 0, 0)
     wait_until(lambda: not mesh.robot.stats.pending and not mesh.cloud.stats.pending, "empty tables")
     assert mesh.robot.stats.unanswered == {("/plan", "failed"): 60}
@@ -104,24 +91,6 @@ def test_the_server_ends_with_requests_pending(mesh: Mesh) -> None:
     assert mesh.result(app)["answered"] == 0
     mesh.wait_carried()
     assert mesh.robot.stats.pending == mesh.cloud.stats.pending == 0
-
-
-def test_a_killed_server_is_noticed_when_its_lease_ends(
-    mesh: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    profile = tmp_path / "short-lease.xml"
-    profile.write_text(SHORT_LEASE)
-    mesh.start()
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
-    server = mesh.serve("--plan", "/plan")
-    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE")
-    mesh.wait_carried("/plan")
-    mesh.call("/plan", "--count", "3", "--tolerance", "-1", "--timeout-s", "1")
-    wait_until(lambda: mesh.cloud.stats.pending == 3, "3 requests at the server")
-    server.stop(signal.SIGKILL)
-    wait_until(lambda: len(mesh.link.refusals) == 3, "refusals")
-    assert {reason for reason, _ in mesh.link.refusals} == {RejectReason.SERVER_LOST}
-    mesh.wait_carried()
 
 
 def test_a_service_comes_goes_and_comes_back(mesh: Mesh) -> None:

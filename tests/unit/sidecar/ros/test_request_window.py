@@ -9,7 +9,7 @@ from itertools import count
 import pytest
 
 from sidecar.core.priority import Priority
-from sidecar.ros.request_window import LATE_ONLY_S, STALL_S, STALL_TIMES, RequestWindow
+from sidecar.ros.request_window import LATE_ONLY_S, SHORT_STALL_S, STALL_S, STALL_TIMES, RequestWindow
 from sidecar.ros.server_capacity import SAFE_SIZE
 
 _items = count()
@@ -81,8 +81,19 @@ def test_a_silent_server_gets_one_more_after_ever_longer_silences_but_no_more_th
         assert len(release(window, due, numbers)) == 1
         times.append(due - now)
         now = due
-    assert times == [pytest.approx(STALL_S * 2**silence) for silence in range(SAFE_SIZE - 1)]
+    assert times == [
+        pytest.approx(STALL_S * 2**silence if silence else SHORT_STALL_S) for silence in range(SAFE_SIZE - 1)
+    ]
     assert release(window, now + 1e6, numbers) == []
+
+
+def test_a_server_that_is_quick_as_a_rule_is_not_waited_for_so_long(numbers: deque[int]) -> None:
+    window: RequestWindow[int] = RequestWindow()
+    fill(window, 200)
+    release(window, 0.0, numbers)
+    window.answered(1, 0.002)
+    release(window, 0.002, numbers)
+    assert window.next_due() == pytest.approx(0.002 + SHORT_STALL_S)
 
 
 def test_a_silence_is_longer_than_what_requests_take(numbers: deque[int]) -> None:
