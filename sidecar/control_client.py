@@ -240,7 +240,7 @@ class ControlClient:
 
     async def _await_end(self, line: ControlLine) -> None:
         """End the stream when there is no way to the control plane, or a better one than the stream's."""
-        end = await line.ended
+        end = await asyncio.shield(line.ended)  # `over` asks it, after this task was cancelled
         if isinstance(end, str):
             raise _StreamEndedError(end)
         raise _StreamEndedError(end.reason, wanted=end.cause == CHEAPER, moved=True)
