@@ -198,7 +198,7 @@ class CloudSide:
             runner = self._runners.get(name)
             if runner is not None:
                 self._look_at(runner, time.monotonic())
-                self._notice_several_servers(name, served[name].applications().get(type_name, frozenset()))
+                self._notice_several_servers(runner, served[name].applications().get(type_name, frozenset()))
             elif retry_types or name not in self._missing_types:
                 self._open_runner(name, type_name)
         yield
@@ -226,16 +226,18 @@ class CloudSide:
         for endpoint in runner.server.endpoints:
             self._processes.watch(endpoint)
 
-    def _notice_several_servers(self, name: ServiceName, nodes: frozenset[str]) -> None:
+    def _notice_several_servers(self, runner: ServiceRunner, nodes: frozenset[str]) -> None:
         """ROS gives each request to all servers of a name: at most once on each, but more than once here."""
-        if len(nodes) < 2:
+        name = runner.name
+        servers = max(len(nodes), runner.server.living)  # nodes may share a name
+        if servers < 2:
             self._several_servers.discard(name)
         elif name not in self._several_servers:
             self._several_servers.add(name)
             log.warning(
                 "service %s has %d servers here (%s): each request runs on all of them, the first answer counts",
                 name,
-                len(nodes),
+                servers,
                 ", ".join(sorted(nodes)),
             )
 

@@ -6,6 +6,7 @@ rmw says that the graph has changed, not what of it; `looks.py` says when it is 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +53,8 @@ class Served:
 def scan(node: Any) -> Generator[None, None, dict[ServiceName, Served]]:
     """Return every service of the graph whose node is known, node after node."""
     found: dict[ServiceName, dict[str, set[str]]] = {}
-    for name, namespace in set(node.get_node_names_and_namespaces()):
+    names = Counter(node.get_node_names_and_namespaces())
+    for name, namespace in names:
         if name == _UNKNOWN_NODE:
             continue  # its endpoints are discovered before its name, which is a change of its own
         full_name = f"{namespace.rstrip('/')}/{name}"
@@ -65,6 +67,15 @@ def scan(node: Any) -> Generator[None, None, dict[ServiceName, Served]]:
             for kind in types:
                 by_type.setdefault(kind, set()).add(full_name)
         yield
+    if any(count > 1 for node_name, count in names.items() if node_name[0] != _UNKNOWN_NODE):
+        # Of several nodes of one name, as of a server that was started twice, rmw shows the services of one only.
+        for service in [s for s, _ in node.get_service_names_and_types() if s not in found]:
+            for info in _reply_writers(node, service):
+                if info["node_name"] != _UNKNOWN_NODE:
+                    full_name = f"{info['node_namespace'].rstrip('/')}/{info['node_name']}"
+                    by_type = found.setdefault(ServiceName(service), {})
+                    by_type.setdefault(_service_type(info["topic_type"]), set()).add(full_name)
+            yield
     return {
         service: Served({kind: frozenset(nodes) for kind, nodes in by_type.items()})
         for service, by_type in found.items()
@@ -76,9 +87,18 @@ def server_endpoints(node: Any, service: ServiceName) -> dict[bytes, bool]:
 
     Nothing where rmw is not DDS.
     """
+    return {bytes(info["endpoint_gid"]): info["node_name"] != _UNKNOWN_NODE for info in _reply_writers(node, service)}
+
+
+def _reply_writers(node: Any, service: str) -> list[dict[str, Any]]:
     # Not through the node's own method, which makes an object of each endpoint's QoS: it takes twice as long.
-    infos = _rclpy.rclpy_get_publishers_info_by_topic(node.handle, f"rr{service}Reply", True)
-    return {bytes(info["endpoint_gid"]): info["node_name"] != _UNKNOWN_NODE for info in infos}
+    infos: list[dict[str, Any]] = _rclpy.rclpy_get_publishers_info_by_topic(node.handle, f"rr{service}Reply", True)
+    return infos
+
+
+def _service_type(dds_type: str) -> str:
+    """Return `std_srvs/srv/Trigger` for `std_srvs::srv::dds_::Trigger_Response_`."""
+    return dds_type.replace("dds_::", "").replace("::", "/").removesuffix("_Response_")
 
 
 def participants(node: Any) -> frozenset[bytes]:

@@ -58,6 +58,11 @@ class LocalServer:
         """True while all that the graph shows for it are dead."""
         return bool(self.endpoints) and not self._alive
 
+    @property
+    def living(self) -> int:
+        """How many of those that the graph shows live; each of them gets every request."""
+        return len(self._alive)
+
     def is_usable(self, now: float) -> bool:
         """Whether one of those that the graph shows lives and knows of us by now."""
         if not self.endpoints:

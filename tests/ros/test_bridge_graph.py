@@ -88,6 +88,38 @@ def test_a_server_that_appears_on_the_robot_takes_over(mesh: Mesh) -> None:
     assert (result["answered"], result["twice"]) == (8, 0)
 
 
+@pytest.mark.audit("dp-16")
+def test_servers_whose_nodes_share_a_name_are_all_carried(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
+    """As when one program is started twice: rmw, asked by node name, shows the services of one of them only."""
+    caplog.set_level(logging.WARNING, "sidecar")
+    mesh.start()
+    mesh.serve("--plan", "/plan")
+    mesh.serve("--negate", "/negate")
+    mesh.serve("--plan", "/plan_too", "--negate", "/negate_too")
+    mesh.wait_carried("/plan", "/negate", "/plan_too", "/negate_too")
+    assert {offer.name: offer.type for offer in mesh.link.offers} == {
+        "/plan": PLAN_TYPE,
+        "/plan_too": PLAN_TYPE,
+        "/negate": "std_srvs/srv/SetBool",
+        "/negate_too": "std_srvs/srv/SetBool",
+    }
+    assert [r for r in caplog.records if "servers here" in r.getMessage()] == []
+
+
+@pytest.mark.audit("dp-16")
+def test_two_servers_of_a_service_are_told_of_though_their_nodes_share_a_name(
+    mesh: Mesh, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING, "sidecar")
+    mesh.start()
+    mesh.serve("--plan", "/plan")
+    mesh.serve("--plan", "/plan")
+    wait_until(lambda: [r for r in caplog.records if "servers here" in r.getMessage()], "the warning")
+    assert [r.getMessage() for r in caplog.records if "servers here" in r.getMessage()] == [
+        "service /plan has 2 servers here (/test_server): each request runs on all of them, the first answer counts"
+    ]
+
+
 @pytest.mark.usefixtures("often")
 def test_two_cloud_sidecars_and_a_robot_in_one_domain(mesh: Mesh) -> None:
     """A robot's proxies are no services to offer, and a real server beside a robot sidecar is left alone."""
