@@ -39,7 +39,7 @@ A message of `total size` bytes is cut into symbols of `symbol size` bytes, the 
 `left` is how long the message is still of use when the datagram arrives, as far as its sender can tell: written when
 the datagram is built, so that it is true for each copy and each retransmission, while the symbol's bytes never change.
 Only FRAGMENT, REPAIR and FINISHED are ack-eliciting (RFC 9002 section 2): a PROBE is answered by its reply, the rest
-is not waited for.
+is not waited for. A datagram holds one ACK at most: each is work, and the newest says what all before it did.
 """
 
 from __future__ import annotations
@@ -293,6 +293,7 @@ def decode_frames(view: memoryview) -> list[Frame]:
     frames: list[Frame] = []
     position = 0
     end = len(view)
+    acknowledged = False
     try:
         while position < end:
             kind = view[position]
@@ -303,6 +304,9 @@ def decode_frames(view: memoryview) -> list[Frame]:
                 fragment, position = _decode_fragment(kind, view, position)
                 frames.append(fragment)
             elif kind == _ACK:
+                if acknowledged:
+                    raise DecodeError("more than one acknowledgement")
+                acknowledged = True
                 ack, position = _decode_ack(view, position)
                 frames.append(ack)
             elif kind in _ABOUT_A_MESSAGE:

@@ -10,6 +10,7 @@ are never used twice, so each such acknowledgement tells how long the path takes
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from enum import Enum, auto
 from itertools import takewhile
@@ -103,6 +104,8 @@ class Reordering:
         """Take an acknowledgement's ranges (inclusive); returns what of the lost it acknowledges."""
         if not self._lost:
             return []
+        rising = ranges[::-1]
+        highs = [high for _, high in rising]
         overtaken_since = now - MEMORY_FACTOR * rtt.probe_timeout(0.0)
         arrived: list[Sent] = []
         kept: list[_Lost] = []
@@ -110,7 +113,7 @@ class Reordering:
             run, why = lost
             if run.at < now - LONGEST_ANSWER_S:
                 continue
-            parts = _covered(run, ranges)
+            parts = _covered(run, rising, highs)
             if not parts:
                 kept.append(lost)
                 continue
@@ -148,13 +151,16 @@ class Reordering:
         self._lost.clear()
 
 
-def _covered(run: Sent, ranges: Sequence[tuple[int, int]]) -> list[Sent]:
-    """The parts of a run that inclusive ranges, highest first, cover; lowest first."""
+def _covered(run: Sent, ranges: Sequence[tuple[int, int]], highs: Sequence[int]) -> list[Sent]:
+    """The parts of a run that inclusive ranges cover; `highs` are their ends. All lowest first."""
     parts = []
-    for low, high in reversed(ranges):
-        first, end = max(low, run.first), min(high + 1, run.end)
-        if first < end:
-            parts.append(run.cut(first, end))
+    position = bisect_left(highs, run.first)
+    while position < len(ranges):
+        low, high = ranges[position]
+        if low >= run.end:
+            break
+        position += 1
+        parts.append(run.cut(max(low, run.first), min(high + 1, run.end)))
     return parts
 
 

@@ -130,3 +130,11 @@ BROKEN = {
 def test_broken_frames_are_refused(kind: str) -> None:
     with pytest.raises(DecodeError):
         frame.decode_frames(memoryview(bytes.fromhex(BROKEN[kind])))
+
+
+@pytest.mark.audit("dp-2")
+def test_one_datagram_acknowledges_once() -> None:
+    """Each acknowledgement is work, and a peer could put 64 of them into a datagram."""
+    ack = frame.encode_ack([(90, 100)], 0.0)
+    with pytest.raises(DecodeError, match="more than one"):
+        frame.decode_frames(memoryview(ack + frame.encode_probe(Probe(1)) + ack))

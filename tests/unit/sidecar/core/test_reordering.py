@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from sidecar.core.frame import MAX_ACK_RANGES
 from sidecar.core.reordering import MAX_REMEMBERED, PACKET_THRESHOLD, PERSISTS, Reordering
 from sidecar.core.rtt import LONGEST_ANSWER_S, RttEstimator
 from sidecar.core.sent import Sent
@@ -128,3 +129,29 @@ def test_no_message_that_is_over_is_held() -> None:
     (late,) = known.late([(1, 1)], steady(), 10.2)
     assert late.message is None
     assert not known.remembers
+
+
+@pytest.mark.audit("dp-2")
+def test_ranges_that_acknowledge_nothing_are_hardly_looked_at() -> None:
+    """A peer may say 32 of them in each datagram, of its choice, while the most that can be is remembered."""
+    looked_at = 0
+
+    class Numbers(int):
+        """A range's end that counts how often it is compared."""
+
+        def __lt__(self, other: int) -> bool:
+            nonlocal looked_at
+            looked_at += 1
+            return int(self) < int(other)
+
+        def __add__(self, other: int) -> int:
+            nonlocal looked_at
+            looked_at += 1
+            return int(self) + other
+
+    known = Reordering()
+    known.note_lost([run(1000 + 4 * number) for number in range(MAX_REMEMBERED)], by_threshold=True)
+    none = [(number, Numbers(number)) for number in range(990, 990 - 2 * MAX_ACK_RANGES, -2)]
+    assert known.late(none, steady(), 10.1) == []
+    assert looked_at <= 7 * MAX_REMEMBERED, "not 32 times as often"
+    assert len(known.late([(1000, 1004), (0, 9)], steady(), 10.1)) == 2
