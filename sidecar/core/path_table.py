@@ -148,6 +148,7 @@ class PathTable:
         self.paths.clear()
         self._by_peer.clear()
         for peer in peers:
+            crowd = sum(len(addresses) for _, addresses in peer.addresses)
             for remote, addresses in peer.addresses:
                 path = before.pop((peer.name, remote), None)
                 if path is not None and path.session == peer.session:
@@ -157,6 +158,7 @@ class PathTable:
                         before[peer.name, remote] = path
                     path = self._new_path(peer, remote, addresses, first_number, now)
                     self.dirty[path.id] = path
+                path.probing.crowd = crowd
                 self._enter(path)
         for key, path in list(before.items()):
             known = self.by_session.get(path.session)

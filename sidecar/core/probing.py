@@ -31,6 +31,9 @@ MAX_PROBE_S = 1.0
 """... and back off to this, so that a path that comes back is seen within a second, ..."""
 MAX_WATCH_PROBE_S = 15.0
 """... or to this at the end that does not lead: a thousand robots that are out of reach must not keep it busy."""
+FREE_ADDRESSES = 16
+"""A peer that announces more addresses has all of them probed that much less often until they answer: it gets no more
+datagrams out of us, wherever they lead."""
 PROBE_BACKOFF = 1.5
 RETURN_BACKOFF = 1.02
 """A path that was up is likely to come back, and requests may wait for it: its probes are as far apart as a fiftieth of
@@ -53,13 +56,15 @@ class Probing:
     """The plan of one path's probes, and the memory of them. Times in seconds."""
 
     __slots__ = ("_asked_at", "_asked_every", "_back", "_gap", "_leads", "_next_id", "_out", "_proven_at", "_used_at",
-                 "_was_up", "at", "last_at")  # fmt: skip
+                 "_was_up", "at", "crowd", "last_at")  # fmt: skip
 
     def __init__(self, now: float, *, leads: bool) -> None:
         self.at = now
         """When the next one leaves."""
         self.last_at = now - FIRST_PROBE_S
         """When the last one left."""
+        self.crowd = 0
+        """How many addresses the peer announced, over all its interfaces."""
         self._leads = leads
         self._gap = FIRST_PROBE_S
         self._was_up = False
@@ -125,7 +130,12 @@ class Probing:
         """As `plan_up`, for a path that is down."""
         self.at = now + self._gap * rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
         backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
-        self._gap = min(self._gap * backoff, MAX_PROBE_S if self._leads else MAX_WATCH_PROBE_S)
+        self._gap = min(self._gap * backoff, self._patience * (MAX_PROBE_S if self._leads else MAX_WATCH_PROBE_S))
+
+    @property
+    def _patience(self) -> float:
+        """How many times longer than usual a path that is not up waits between two probes."""
+        return max(1.0, self.crowd / FREE_ADDRESSES)
 
     def _pause(self, now: float) -> float:
         pause = min(max(IDLE_PROBE_S, (now - self._used_at) / IDLE_SHARE), MAX_IDLE_PROBE_S)
@@ -170,7 +180,7 @@ class Probing:
 
     def hasten(self, now: float, smoothed_rtt_s: float) -> None:
         """It is time to ask again: but what was asked a round trip ago may still be answered, whoever wishes it."""
-        self.at = min(self.at, max(now, self.last_at + max(FIRST_PROBE_S, smoothed_rtt_s)))
+        self.at = min(self.at, max(now, self.last_at + max(self._patience * FIRST_PROBE_S, smoothed_rtt_s)))
 
     def begin_again(self, now: float) -> None:
         """The path may have come back: probe at once, and the first ones close together."""

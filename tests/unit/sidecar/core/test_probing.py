@@ -7,6 +7,7 @@ import pytest
 
 from sidecar.core.probing import (
     FIRST_PROBE_S,
+    FREE_ADDRESSES,
     IDLE_PROBE_S,
     IDLE_SPREAD,
     MAX_IDLE_PROBE_S,
@@ -129,6 +130,24 @@ def test_what_is_down_is_looked_for_more_rarely_by_who_does_not_lead() -> None:
                 subject.plan_down(now, RNG)
                 now = subject.at
             assert subject.at - subject.last_at == pytest.approx(slowest, rel=0.11)
+
+
+@pytest.mark.audit("dp-11")
+@pytest.mark.parametrize("was_up", [False, True])
+def test_a_peer_of_many_addresses_gets_no_more_probes_than_one_of_some(was_up: bool) -> None:
+    def asked(addresses: int) -> float:
+        subject = up() if was_up else Probing(100.0, leads=True)
+        subject.crowd = addresses
+        now, probes = 100.0, 0
+        while now < 1100.0:
+            subject.ask(now, sealed=False)
+            subject.plan_down(now, RNG)
+            subject.hasten(now, 0.0)
+            probes += now > 600.0
+            now = subject.at
+        return probes * addresses
+
+    assert asked(256) == pytest.approx(asked(FREE_ADDRESSES), rel=0.05)
 
 
 def test_no_wish_makes_it_ask_twice_in_a_round_trip() -> None:
