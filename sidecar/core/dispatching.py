@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""
+MAX_ASKED = 16
+"""As MAX_COPIES, while it is certain that no server ran any of them, and each was given its time to become ready."""
 
 
 class _Why(enum.Enum):
@@ -175,6 +177,8 @@ class Dispatching:
         waiting = request.relied_on()
         if request.answered_here or (waiting and not request.rule.redundancy.helps):
             return
+        if rejected and len(request.copies) >= MAX_COPIES:
+            return  # its retry asks on, without haste
         alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
         if alive and not insist and request.rule.redundancy is RedundancyMode.ADAPTIVE:
             self._adapt(request, now)
@@ -272,7 +276,7 @@ class Dispatching:
         )
 
     def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
-        if request.payload is None or len(request.copies) >= MAX_COPIES:
+        if request.payload is None or len(request.copies) >= _most_copies(request):
             return False
         rule, stats = request.rule, self._parts.stats
         content = self.encode(request, request.payload, now)
@@ -304,3 +308,8 @@ class Dispatching:
         elif why is _Why.HEDGE:
             stats.hedged[path.interface, path.peer, request.service] += 1
         return True
+
+
+def _most_copies(request: Request) -> int:
+    patient = request.retry_at is None and request.certainly_not_run()
+    return MAX_ASKED if patient else MAX_COPIES

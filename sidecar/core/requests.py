@@ -20,7 +20,7 @@ from protos.model import Assignment
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
-from sidecar.core.dispatching import Dispatching
+from sidecar.core.dispatching import MAX_COPIES, Dispatching
 from sidecar.core.events import (
     DeadlineMissed,
     RequestFailed,
@@ -52,7 +52,8 @@ MAX_IN_FLIGHT = 8192
 RETRY_S = 0.05
 """Twice this, doubled with each copy, until a request that was refused for the moment is asked again, ..."""
 MAX_RETRY_S = 2.0
-"""... and never longer than this."""
+"""... and no longer than this for the first MAX_COPIES; after that the time doubles again, so that a server that takes
+minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
 """Payloads of requests until the last copy of each has ended, also while they wait for a path or for room."""
 
@@ -245,7 +246,9 @@ class RequestTable:
         """Its servers restart, as it seems: it waits for the first that is back, and asks them now and then."""
         request.refusal = reason
         self._requests.strand(request)
-        request.retry_at = now + min(RETRY_S * 2 ** len(request.copies), MAX_RETRY_S)
+        copies = len(request.copies)
+        retry_s = min(RETRY_S * 2**copies, MAX_RETRY_S) * 2 ** max(0, copies - MAX_COPIES)
+        request.retry_at = now + retry_s
         self._look_at(request, request.retry_at)
         self._tell_unreachable(request)
 
@@ -334,8 +337,13 @@ class RequestTable:
         for service in services:
             requests = self._requests.of(service)
             if requests:
-                self._backlog.add(partial(self._each, self._look_after, requests), now, ("gained", service))
+                self._backlog.add(partial(self._each, self._ask_now, requests), now, ("gained", service))
         self.on_room(now)
+
+    def _ask_now(self, request: Request, now: float) -> None:
+        """Whoever refused it for the moment, another server has come, or the same one anew."""
+        request.retry_at = None
+        self._look_after(request, now)
 
     def withdraw(self, service: ServiceName, reason: str) -> list[Step]:
         """Return what ends each request that waits at a service which is not offered here any more."""

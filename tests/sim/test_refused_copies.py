@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
+from sidecar.core.dispatching import MAX_ASKED, MAX_COPIES
 from tests.sim.mesh import Mesh, rule
 
 
@@ -44,3 +47,31 @@ def test_a_refused_copy_that_is_cut_anew_does_not_run_beside_the_rescue(light_af
     mesh.run(20.0)
     assert [len(cloud.executed) for cloud in (near, far)] == [0, 1]
     assert len(robot.responses()) == 1
+
+
+@pytest.mark.audit("dp-7")
+@pytest.mark.parametrize("idempotent", [True, False])
+@pytest.mark.parametrize("away_s", [3.0, 12.0, 25.0])
+def test_a_server_that_takes_long_to_start_is_asked_until_it_is_there(away_s: float, *, idempotent: bool) -> None:
+    """The control plane says nothing, so the robot has to ask; it does not do so at every whim of a path."""
+    mesh = Mesh(2)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(idempotent=idempotent, deadline_s=0.5, lifetime_s=60.0),))
+    cloud = mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(2.0)
+    cloud.engine.set_offers(())
+    robot.submit(b"job")
+    mesh.at(away_s, lambda: cloud.engine.set_offers(cloud.offers))
+    for second in range(0, int(away_s), 2):
+        for cut in (True, False):
+            mesh.at(second + (0.1 if cut else 1.1), partial(_cut, mesh, cut=cut))
+    mesh.run(60.0)
+    assert len(robot.responses()) == 1
+    assert len(cloud.executed) == 1
+    asked = cloud.engine.stats.dropped["request_for_unknown_service"]
+    assert asked <= (MAX_COPIES if away_s < 7.0 else MAX_ASKED)
+
+
+def _cut(mesh: Mesh, *, cut: bool) -> None:
+    for wire in mesh.both_ways("robot.wwan0", "cloud-a.eth0"):
+        wire.cut = cut
