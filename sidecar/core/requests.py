@@ -238,6 +238,11 @@ class RequestTable:
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
                 if rejection.reason.may_pass and request.may_be_sent():
                     self._wait_out(request, reason, now)
+                elif request.may_be_sent() and self._dispatching.candidates(request, rejected=True):
+                    # Another server offers it, and is out of reach at present: its first path that is up takes it.
+                    request.refusal = reason
+                    self._requests.strand(request)
+                    self._tell_unreachable(request)
                 else:
                     self._fail(request, "rejected", reason, now)
         self._settle(request, now)

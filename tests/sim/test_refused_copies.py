@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 
 from sidecar.core.dispatching import MAX_ASKED, MAX_COPIES
+from sidecar.core.events import ApplicationEvent, ExecuteRequest, RejectReason, RequestFailed
 from tests.sim.mesh import Mesh, rule
 
 
@@ -75,3 +76,53 @@ def test_a_server_that_takes_long_to_start_is_asked_until_it_is_there(away_s: fl
 def _cut(mesh: Mesh, *, cut: bool) -> None:
     for wire in mesh.both_ways("robot.wwan0", "cloud-a.eth0"):
         wire.cut = cut
+
+
+@pytest.mark.audit("dp-7")
+@pytest.mark.parametrize("reason", [RejectReason.OVERLOADED, RejectReason.BAD_PAYLOAD, RejectReason.SERVER_LOST])
+def test_who_is_refused_waits_for_the_server_that_is_out_of_reach(reason: RejectReason) -> None:
+    """One cloud is of no use, and the path to the other one is dark for a moment: the request has the time."""
+    mesh = Mesh(3)
+    robot = mesh.robot("wlan0", rules=(rule(deadline_s=0.5, lifetime_s=20.0),))
+    bad = mesh.cloud("cloud-a")
+    mesh.cloud("cloud-b")
+
+    def refuse(event: ApplicationEvent) -> None:
+        if isinstance(event, ExecuteRequest):
+            bad.engine.refuse(event.execution, reason, "no", bad.now)
+
+    bad.server = refuse
+    mesh.push_views()
+    mesh.run(2.0)
+    wires = mesh.both_ways("robot.wlan0", "cloud-b.eth0")
+    for wire in wires:
+        wire.cut = True
+    mesh.run(5.0)
+    robot.submit(b"job")
+    mesh.run(3.0)
+    assert not any(isinstance(event, RequestFailed) for event in robot.events)
+    for wire in wires:
+        wire.cut = False
+    mesh.run(1.0)
+    assert [response.server for response in robot.responses()] == ["cloud-b"]
+
+
+@pytest.mark.audit("dp-7")
+def test_who_waits_for_a_server_out_of_reach_ends_with_the_reason_of_the_one_that_refused() -> None:
+    mesh = Mesh(3)
+    robot = mesh.robot("wlan0", rules=(rule(deadline_s=0.5, lifetime_s=4.0),))
+    bad = mesh.cloud("cloud-a")
+    mesh.cloud("cloud-b")
+    bad.server = lambda event: (
+        bad.engine.refuse(event.execution, RejectReason.OVERLOADED, "too much", bad.now)
+        if isinstance(event, ExecuteRequest)
+        else None
+    )
+    mesh.push_views()
+    for wire in mesh.both_ways("robot.wlan0", "cloud-b.eth0"):
+        wire.cut = True
+    mesh.run(2.0)
+    robot.submit(b"job")
+    mesh.run(5.0)
+    (failed,) = [event for event in robot.events if isinstance(event, RequestFailed)]
+    assert "overloaded: too much" in failed.reason
