@@ -162,8 +162,9 @@ class RequestTable:
         if alone and request.relied_on():
             self._no_room.remove(request)
             self._look_at(request, self._dispatching.first_look(request, now))
-        elif alone:
+        elif request.may_be_sent():
             self._no_room.consider(request, rejected=rejected)
+            self._requests.strand(request)
 
     def _look_at(self, request: Request, when: float | None) -> None:
         if when is not None:
