@@ -54,8 +54,8 @@ class Backlog:
     def add(self, steps: Callable[[], Iterable[Step]], now: float, name: Hashable = None) -> None:
         """Do these steps, as many of them now as the turn has room for.
 
-        A job that has the name of one under way begins when that one ends, and there is one such job at most: whatever
-        happens meanwhile, nothing is looked at more than twice.
+        A job that has the name of one under way begins when that one has ended and all others had their turn, and there
+        is one such job at most: whatever happens meanwhile, nothing is looked at more than twice.
         """
         if name is None:
             self._unnamed += 1
@@ -89,15 +89,16 @@ class Backlog:
         self._now = now
         self._left = SLICE
 
-    def run(self, now: float) -> None:
-        """Do what the turn has room for."""
-        while self._jobs and self.allows(now):
+    def run(self, now: float, leave: int = 0) -> None:
+        """Do what the turn has room for, but for the last `leave` steps."""
+        while self._jobs and (self._left > leave or now != self._now) and self.allows(now):
             name, job = next(iter(self._jobs.items()))
             step = next(job.steps, None)
             if step is not None:
                 step(now)
             elif job.again is not None:
                 job.begin_again()
+                self._jobs.move_to_end(name)
             else:
                 del self._jobs[name]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.attention import Attention
-from sidecar.core.backlog import Backlog, Step
+from sidecar.core.backlog import SLICE, Backlog, Step
 from sidecar.core.events import (
     ApplicationEvent,
     ExecutionId,
@@ -459,9 +459,10 @@ class Engine:
     def handle_timer(self, now: float) -> None:
         """Do what is due by now, or as much of it as one turn has room for."""
         self._backlog.begin_turn(now)
-        self._backlog.run(now)
+        self._backlog.run(now, leave=SLICE // 2)  # deadlines must not wait until all is done
         self._requests.handle_timer(now)
         self._serving.handle_timer(now, self._backlog)
+        self._backlog.run(now)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
             self._backlog.add_steps(self._outbox.expired(now), now)
