@@ -298,6 +298,7 @@ class Answers:
 
     def drop_robot(self, robot: NodeName) -> list[Step]:
         """The robot's session is over, and so is what was on its way there. Returns what lets go of it."""
+        self._lines.pop(robot, None)  # at once: letting go makes room, which nothing of it is to take
         return in_groups(self._remove, chain.from_iterable(self._of.get(robot, {}).values()))
 
     def _remove(self, answer: _Answer) -> None:

@@ -211,3 +211,24 @@ def test_an_answer_that_waits_is_called_off_with_its_request() -> None:
     assert len(robot.responses()) == 12
     mesh.run(60.0)
     assert_nothing_is_left(robot, slow)
+
+
+def test_answers_of_a_session_that_is_over_are_not_sent() -> None:
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", rules=(rule(lifetime_s=120.0, deadline_s=5.0),))
+    cloud = mesh.cloud("a")
+    cloud.answer = lambda _: bytes(1_000_000)
+    down = mesh.wire("a.eth0", "robot.wlan0")
+    mesh.push_views()
+    mesh.run(2)
+    down.bytes_per_s = 20 * MBIT
+    for number in range(250):
+        robot.submit(b"%d" % number)
+    mesh.run(3)
+    assert cloud.engine._serving.answers.unsent(["robot"]) > 150
+    robot.start()
+    mesh.push_views()
+    mesh.run(1)
+    assert len(cloud.engine._outbox) == 0
+    assert len(cloud.engine._serving.answers) == 0
+    assert robot.engine.stats.dropped["answer_to_unknown_request"] == 0
