@@ -419,7 +419,7 @@ class RequestTable:
                 self._end_answered_here(request, now)
             elif not request.missed:
                 self._miss(request)
-                if request.rule.idempotent:
+                if request.rule.idempotent and request not in self._no_room:  # it does not get past those that wait
                     self._rescue(request, now, insist=True)
 
     def _miss(self, request: Request) -> None:

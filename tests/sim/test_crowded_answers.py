@@ -225,7 +225,7 @@ def test_answers_of_a_session_that_is_over_are_not_sent() -> None:
     for number in range(250):
         robot.submit(b"%d" % number)
     mesh.run(3)
-    assert cloud.engine._serving.answers.unsent(["robot"]) > 150
+    assert cloud.engine._serving.answers.unsent([robot.name]) > 150
     robot.start()
     mesh.push_views()
     mesh.run(1)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from protos.model import Role, ServiceName, ServiceOffer
 from sidecar.core import room as room_module
+from sidecar.core.priority import Priority
 from sidecar.core.redundancy_mode import RedundancyMode
 from sidecar.core.room import SMALL_BYTES, Lane
-from tests.sim.mesh import Mesh, rule
+from tests.sim.mesh import TYPE, Mesh, rule
 
 SIZE = 400_000
 
@@ -68,3 +70,30 @@ def test_what_waited_for_room_at_a_server_that_went_dark_is_sent_when_it_is_back
         wire.cut, wire.bytes_per_s = False, 0
     mesh.run(10)
     assert waits in {response.request_id for response in robot.responses()}
+
+
+@pytest.mark.audit("dp-1")
+def test_what_misses_its_deadline_does_not_take_the_room_of_what_is_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(room_module._ROOM_BYTES, Lane.LARGE, 1_300_000)
+    bulk, urgent = ServiceName("/bulk"), ServiceName("/urgent")
+    rules = (
+        rule(pattern=bulk, lifetime_s=60.0, deadline_s=50.0, priority=Priority.LOW),
+        rule(pattern=urgent, lifetime_s=60.0, deadline_s=2.0, priority=Priority.HIGH),
+    )
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", rules=rules)
+    cloud = mesh.add("a", Role.CLOUD, ["eth0"], rules)
+    cloud.offers = (ServiceOffer(bulk, TYPE), ServiceOffer(urgent, TYPE))
+    cloud.engine.set_offers(cloud.offers)
+    mesh.wire("robot.wlan0", "a.eth0").bytes_per_s = 2e6
+    mesh.push_views()
+    mesh.run(2)
+    for _ in range(4):
+        robot.submit(bytes(300_000), urgent)
+    waits = robot.submit(bytes(700_000), bulk)
+    for _ in range(100):
+        for _ in range(2):
+            robot.submit(bytes(300_000), urgent)
+        mesh.run(0.1)
+    request = robot.engine._requests._requests.get(waits)
+    assert request is None or request.copies
