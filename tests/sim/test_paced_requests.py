@@ -144,9 +144,16 @@ def test_losing_all_that_is_in_flight_does_not_stall_the_path() -> None:
 
 
 def test_a_route_that_gets_longer_for_a_while_and_a_radio_that_loses_some_are_no_congestion() -> None:
+    """The ceiling of one run is chance: by eight seeds it was 55 kB to none at all. The median of five tells."""
+    windows = sorted(lossy_radio(seed) for seed in range(1, 6))
+    assert windows[len(windows) // 2] > 100_000
+
+
+def lossy_radio(seed: int) -> float:
+    """Ask for 15 s over a route whose length changes; returns the window's ceiling (bytes) at the end."""
     size, usual_s = 120_000, 0.025
     world = World(20 * MBIT, usual_s, deadline_s=1.0)
-    rng = random.Random(1)
+    rng = random.Random(seed)
     world.request(size, 2.0)
     later = []
     for _ in range(15):
@@ -154,12 +161,12 @@ def test_a_route_that_gets_longer_for_a_while_and_a_radio_that_loses_some_are_no
             wire.delay_s, wire.loss = usual_s * rng.uniform(0.8, 1.6), 0.003
         later += world.request(size, 1.0, hz=5)
     window = world.control.ceiling.bytes
-    assert window is None or window > 100_000
     world.mesh.run(2.0)
     elapsed = sorted(world.elapsed(later))
     assert len(elapsed) == len(later)
     assert elapsed[len(elapsed) // 2] < 0.15
     assert elapsed[-1] < 0.5
+    return float("inf") if window is None else window
 
 
 @pytest.mark.audit("dp-13")
