@@ -57,10 +57,10 @@ bench: setup ## every measurement one after the other, reports into bench/result
 bench-quick: setup ## 15 s of a drive with every contender: direct ROS 2, MPTCP, zenoh, ours (5 minutes at most, as root)
 	@$(PY) -m bench evaluate --quick $(BENCH_ARGS)
 
-bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP, QUIC and zenoh (15 minutes, as root)
+bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP, QUIC and zenoh (20 minutes, as root)
 	@$(PY) -m bench dataplane $(BENCH_ARGS)
 
-bench-churn: setup ## interfaces, servers, control plane come and go for ten minutes: nothing is lost, nothing grows
+bench-churn: setup ## interfaces, servers, control plane come and go for ten minutes under small, large and slow calls: nothing is lost, nothing grows
 	@$(PY) -m bench churn $(BENCH_ARGS)
 
 bench-matcher: setup ## the matcher's predictions against recorded networks, and its speed, and the real system while two servers swap load (half an hour)

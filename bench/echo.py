@@ -49,10 +49,12 @@ class Burden:
 class EchoRequests:
     """Requests of one size, each with other bytes."""
 
-    def __init__(self, size: int, delay_ms: float, rng: random.Random) -> None:
+    def __init__(self, size: int, delay_ms: float, rng: random.Random, answer_bytes: tuple[int, int] = (0, 0)) -> None:
+        """`answer_bytes`: the least and the most that is asked back; each order of magnitude as often."""
         self._size = size
         self._delay_ms = delay_ms
         self._rng = rng
+        self._least, self._most = answer_bytes
         self._count = 0
 
     def request(self, stamp: Any) -> Any:
@@ -60,7 +62,9 @@ class EchoRequests:
         request.image.header.stamp = stamp
         request.image.header.frame_id = f"{self._count}"
         self._count += 1
-        request.image.format = f"{self._delay_ms:g}"
+        ratio = self._most / self._least if self._least else 0.0
+        back = round(self._least * ratio ** self._rng.random())
+        request.image.format = f"{self._delay_ms:g} {back}"
         request.image.data = self._rng.randbytes(self._size)
         return request
 
@@ -68,6 +72,8 @@ class EchoRequests:
         mine = response.header == request.image.header
         if not mine or response.image_width != zlib.crc32(bytes(request.image.data)):
             return "answer to another request", {}
+        if response.message != "." * int(request.image.format.partition(" ")[2]):
+            return "another answer than was asked for", {}
         return None, {}
 
 
@@ -83,12 +89,22 @@ def main() -> int:
     robot_client.add_arguments(call, rate_hz=50.0, deadline_ms=500.0)
     call.add_argument("--size", type=int, default=1000)
     call.add_argument("--ask-delay-ms", type=float, default=0.0, help="how long the server shall take")
+    call.add_argument("--service", default=SERVICE, metavar="NAME", help="call the one of this name (%(default)s)")
+    call.add_argument(
+        "--answer-bytes",
+        type=int,
+        nargs=2,
+        default=(0, 0),
+        metavar=("LEAST", "MOST"),
+        help="how much the server shall answer besides (default none)",
+    )
     options = parser.parse_args()
     if options.command == "serve":
         serving = answer if options.burden is None else Burden(options.burden).answer
         return service_server.run("echo", DetectPeople, options.service, serving, options)
-    workload = EchoRequests(options.size, options.ask_delay_ms, random.Random(options.seed))
-    return robot_client.run("caller", DetectPeople, SERVICE, workload, options)
+    back = (options.answer_bytes[0], options.answer_bytes[1])
+    workload = EchoRequests(options.size, options.ask_delay_ms, random.Random(options.seed), back)
+    return robot_client.run("caller", DetectPeople, options.service, workload, options)
 
 
 def journal_ids(path: Path) -> list[str]:

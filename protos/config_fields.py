@@ -23,6 +23,8 @@ def split_host_port(text: str) -> tuple[str, int]:
         raise ValueError(f"expected host:port with a port up to {_MAX_PORT}, got {text!r}")
     if host.startswith("[") and host.endswith("]"):
         return canonical_ip(host[1:-1]), int(port)
+    if "//" in host:
+        raise ValueError(f"expected host:port without {text.partition('//')[0]}//, got {text!r}")
     if ":" in host:
         raise ValueError(f"expected an IPv6 address in brackets, as in [2001:db8::1]:50051, got {text!r}")
     if not _HOST.fullmatch(host):
@@ -63,6 +65,15 @@ def _check_listen(text: str) -> str:
     host, _ = split_host_port(text)
     canonical_ip(host)
     return text
+
+
+def numeric_host(host_port: str) -> tuple[str, int] | None:
+    """The address that host:port, already checked, is; None if it is a name."""
+    host, port = split_host_port(host_port)
+    try:
+        return canonical_ip(host), port
+    except ValueError:
+        return None
 
 
 def is_loopback(host_port: str) -> bool:

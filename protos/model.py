@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from protos.histogram import Histogram
     from protos.preferences import InterfaceLabel
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 """Version of the control stream and of the datagram layout; peers of another version are refused."""
 
 NodeName = NewType("NodeName", str)

@@ -15,7 +15,8 @@ _NONE_YET = Version(0)
 
 
 class SyncState(enum.Enum):
-    """Whether a sidecar applied what it was sent last; a nack is never shown as synced."""
+    """Whether a sidecar applied what it was sent last. A nack is never shown as synced, and stays one while the same is
+    sent again."""
 
     NOT_SENT = "not sent"
     STALE = "stale"

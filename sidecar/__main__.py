@@ -73,8 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return EXIT_OK
         return _run(config)
     except ConfigError as error:
-        # What is found out later than the file is read does not know its name.
-        located = ConfigError(str(options.config), error.key, error.problem)
+        # What is found out later than the file is read does not know its name; without a key it is another file's.
+        located = ConfigError(str(options.config), error.key, error.problem) if error.key else error
         sys.stderr.write(f"{PROGRAM}: {located}\n")
         return EXIT_BAD_CONFIG
 

@@ -22,8 +22,9 @@ from protos.config_file import key_path, parse_yaml, read_text, validate
 from protos.errors import ConfigError
 from protos.identity import IdentityRole
 from protos.model import NodeName, Role, ServiceName
-from protos.preferences import InterfaceLabel
+from protos.preferences import DEFAULT_CHARGE, InterfaceLabel
 from sidecar.config_fields import (
+    ControlPlaneAddresses,
     DomainLabel,
     InterfacePattern,
     Section,
@@ -31,7 +32,8 @@ from sidecar.config_fields import (
     converted,
     is_glob,
 )
-from sidecar.core.rules import ServiceRule, find_rule
+from sidecar.core.control_ways import Price
+from sidecar.core.rules import Rules, ServiceRule
 from sidecar.service_config import NetworkConfig, ServiceConfig
 
 if TYPE_CHECKING:
@@ -86,8 +88,8 @@ class SidecarConfig(Section):
     role: Annotated[Role, converted]
     """robot: its applications call services; cloud: its servers answer them. With tls_dir the certificate's, and may
     be left out."""
-    control_plane: RemoteAddress
-    """host:port of the control plane."""
+    control_plane: ControlPlaneAddresses
+    """host:port of the control plane, or a list of its addresses, the preferred one first."""
     tls_dir: Annotated[TlsDir, converted] | None = None
     """Absolute path of the folder with cert.pem, key.pem, ca.pem and perhaps crl.pem, as plr ca issue writes it; read
     anew when they change. Required unless insecure."""
@@ -144,10 +146,20 @@ class SidecarConfig(Section):
         """What is known of these interfaces; those that no entry of `networks` matches are left out."""
         found = []
         for name in dict.fromkeys(interfaces):
-            network = next((entry for entry in self.networks if fnmatch.fnmatchcase(name, entry.interface)), None)
+            network = self._network(name)
             if network is not None:
                 found.append(InterfaceLabel(name, network.carrier or "", network.cost_per_request))
         return tuple(found)
+
+    def price(self, interface: InterfaceName) -> Price:
+        """What the control stream costs over an interface."""
+        network = self._network(interface)
+        if network is None:
+            return Price(charge=DEFAULT_CHARGE)
+        return Price(network.extra_mb_per_day is not None, network.cost_per_request)
+
+    def _network(self, interface: InterfaceName) -> NetworkConfig | None:
+        return next((entry for entry in self.networks if fnmatch.fnmatchcase(interface, entry.interface)), None)
 
 
 def load_config(path: Path, identify: Callable[[Path], Identity] | None = None) -> SidecarConfig:
@@ -187,9 +199,10 @@ def _with_identity(data: dict[str, Any], identity: Identity, source: str) -> dic
 
 def refuse_exposed(config: SidecarConfig, source: str) -> None:
     """Refuse to talk to others without TLS; raises ConfigError."""
-    if config.insecure and not is_loopback(config.control_plane):
+    exposed = next((address for address in config.control_plane if not is_loopback(address)), None)
+    if config.insecure and exposed is not None:
         problem = (
-            f"expected a loopback address with insecure: true, got '{config.control_plane}'; use tls_dir, or start "
+            f"expected a loopback address with insecure: true, got '{exposed}'; use tls_dir, or start "
             "with --insecure-i-know"
         )
         raise ConfigError(source, "control_plane", problem)
@@ -246,7 +259,7 @@ def _check_order(config: SidecarConfig, index: int) -> Iterator[_Problem]:
         if service.fallback == name:
             yield ("services", index, "name"), f"expected a service that is not the fallback of services[{other}]"
     if not is_glob(name):
-        winner = find_rule(config.service_rules()[:index], ServiceName(name))
+        winner = Rules(config.service_rules()[:index]).find(ServiceName(name))
         if winner is not None and winner.pattern != name:
             yield (
                 ("services", index, "name"),

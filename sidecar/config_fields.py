@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
+from protos.config_fields import check_remote, refuse_duplicates
 from protos.convert.fields import MAX_COPIES
 from protos.errors import DecodeError
 from protos.names import domain_label, node_name
@@ -18,6 +19,8 @@ _SERVICE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _SERVICE_GLOB = re.compile(r"[/*?\[][A-Za-z0-9_/*?\[\]!-]*")
 _GLOB_CHARACTERS = frozenset("*?[")
 _MAX_SERVICE_CHARACTERS = 255
+MAX_CONTROL_PLANES = 8
+"""Addresses of the control plane; each is tried over every interface."""
 _COPIES_WORDS = {"each": EVERY_INTERFACE, "at_most": AT_MOST_EVERY_INTERFACE}
 
 
@@ -71,6 +74,15 @@ def _check_domain_label(text: str) -> str:
         raise ValueError(problem) from None
 
 
+def _check_control_planes(value: object) -> tuple[str, ...]:
+    if isinstance(value, str):
+        return (check_remote(value),)
+    if isinstance(value, list | tuple) and 1 <= len(value) <= MAX_CONTROL_PLANES:
+        if all(isinstance(one, str) for one in value):
+            return refuse_duplicates(tuple(check_remote(one) for one in value))
+    raise ValueError(f"expected host:port, or a list of 1 to {MAX_CONTROL_PLANES} of them, got {value!r}")
+
+
 def _check_copies(value: object) -> Copies:
     if isinstance(value, Copies):
         return value
@@ -101,6 +113,18 @@ RepairShare = Annotated[
     float | str,
     PlainValidator(_check_repair_share),
     WithJsonSchema({"anyOf": [{"enum": ["off", "auto"]}, {"type": "number", "minimum": 0, "maximum": 1}]}),
+]
+ControlPlaneAddresses = Annotated[
+    tuple[str, ...],
+    PlainValidator(_check_control_planes),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string"},
+                {"type": "array", "items": {"type": "string"}, "minItems": 1, "maxItems": MAX_CONTROL_PLANES},
+            ]
+        }
+    ),
 ]
 DomainLabel = Annotated[str, Field(min_length=1), AfterValidator(_check_domain_label)]
 """Name of a region or a carrier."""

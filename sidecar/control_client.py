@@ -1,7 +1,7 @@
 """Drives the control stream over gRPC: one thread with its own event loop, away from the data plane.
 
-All decisions are ControlSession's. Names are resolved and connections made inside gRPC; nothing here is called by, or
-waited for by, a thread that moves datagrams.
+All decisions are ControlSession's. Connections are made by the dialer, to which gRPC connects; nothing here is called
+by, or waited for by, a thread that moves datagrams.
 
 grpc.aio rather than a synchronous stub: at a report each 0.5 s the latter needs two more threads and some more
 wake-ups, each of which may take the interpreter from a data-plane thread.
@@ -21,11 +21,12 @@ import grpc
 from protos import tls_advice
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
 from protos.errors import DecodeError
-from protos.identity import CONTROL_PLANE_DNS
 from protos.model import CandidateSet, PeerSet, Report, ResourceKind, ServiceSet, Welcome
 from protos.names import clean_text
 from protos.plr.v1 import control_pb2_grpc
+from sidecar.control_channel import REFUSALS, open_channel
 from sidecar.core.control_session import Apply
+from sidecar.core.control_watch import CHEAPER
 from sidecar.outage_log import OutageLog
 from sidecar.refusal_log import RefusalLog
 
@@ -38,16 +39,11 @@ if TYPE_CHECKING:
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
     from sidecar.core.control_session import ControlSession, ControlStats
+    from sidecar.net.control_dialer import ControlDialer, ControlLine
 
     _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
 
 log = logging.getLogger(__name__)
-
-KEEPALIVE_TIME_MS = 10_000
-"""Ping this often: finds out about a silently dead path, and keeps NAT bindings for TCP open."""
-
-KEEPALIVE_TIMEOUT_MS = 5_000
-"""A ping unanswered for this long ends the connection."""
 
 GOODBYE_S = 0.5
 """How long `stop` waits for the control plane to take the goodbye."""
@@ -59,52 +55,30 @@ JUDGE_AGAIN_S = 10.0
 """Between two judgements on refused peers: a robot without a clock hears the time soon after its start, and 4096 peers
 are a second of public-key work."""
 
-_CHANNEL_OPTIONS: tuple[tuple[str, int | str], ...] = (
-    ("grpc.keepalive_time_ms", KEEPALIVE_TIME_MS),
-    ("grpc.keepalive_timeout_ms", KEEPALIVE_TIMEOUT_MS),
-    ("grpc.http2.max_pings_without_data", 0),
-    # The session decides when to try again: no retries and no remembered backoff below it.
-    ("grpc.enable_retries", 0),
-    ("grpc.use_local_subchannel_pool", 1),
-    # Behaviour comes from the configuration, not from the environment.
-    ("grpc.enable_http_proxy", 0),
-    # Whatever its address: the name in the certificate of every control plane of the fleet.
-    ("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),
-)
-
-_REFUSALS = frozenset(
-    {
-        grpc.StatusCode.INVALID_ARGUMENT,
-        grpc.StatusCode.FAILED_PRECONDITION,
-        grpc.StatusCode.ABORTED,
-        grpc.StatusCode.ALREADY_EXISTS,
-        grpc.StatusCode.PERMISSION_DENIED,
-        grpc.StatusCode.UNAUTHENTICATED,
-        grpc.StatusCode.UNIMPLEMENTED,
-        grpc.StatusCode.RESOURCE_EXHAUSTED,
-    }
-)
-"""The control plane decided so, and will decide so again a moment later."""
-
 
 class _StreamEndedError(Exception):
-    """The stream is over; `refused`: by a decision of the control plane, `wanted`: by ours, to open another."""
+    """The stream is over. `refused`: by a decision of the control plane. `wanted`: by ours, to open another. `moved`:
+    there is a better way to the control plane."""
 
-    def __init__(self, reason: str, *, refused: bool = False, wanted: bool = False) -> None:
+    def __init__(self, reason: str, *, refused: bool = False, wanted: bool = False, moved: bool = False) -> None:
         super().__init__(reason)
         self.reason = reason
         self.refused = refused
         self.wanted = wanted
+        self.moved = moved
 
 
 class ControlClient:
-    """Keeps one sidecar connected to the control plane at `target` (host:port) until `stop`.
+    """Keeps one sidecar connected to the control plane that `dialer` reaches until `stop`.
 
     `tls` holds the certificate to show; None in insecure mode.
     """
 
-    def __init__(self, target: str, session: ControlSession, hooks: ControlHooks, tls: TlsWatch | None = None) -> None:
-        self._target = target
+    def __init__(
+        self, dialer: ControlDialer, session: ControlSession, hooks: ControlHooks, tls: TlsWatch | None = None
+    ) -> None:
+        self._dialer = dialer
+        self._line: ControlLine | None = None
         self._tls = tls
         self._session = session
         self._hooks = hooks
@@ -112,7 +86,7 @@ class ControlClient:
         self.last_failure: str | None = None
         """Why the last attempt or stream ended; None before that, or when we ended it."""
         self._stopping = False
-        self._outage = OutageLog(log, target)
+        self._outage = OutageLog(log, ", ".join(dialer.names))
         self._refusals = RefusalLog(log)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._main_task: asyncio.Task[None] | None = None
@@ -189,12 +163,18 @@ class ControlClient:
         self._main_task = asyncio.current_task()
         self._running.set()
         judging = asyncio.create_task(self._judge_again())
+        self._dialer.start(self._network_changed)
         with contextlib.suppress(asyncio.CancelledError):
             while not self._stopping:
-                await self._wait_until(self._session.retry_at)
+                await self._wait_for_turn()
                 if not self._stopping:
                     await self._one_stream()
+        self._dialer.close()
         judging.cancel()
+
+    def _network_changed(self) -> None:
+        self._session.network_changed(time.monotonic())
+        self._wake.set()
 
     async def _judge_again(self) -> None:
         """Also without any stream: while our clock is wrong, the control plane's certificate is no good either."""
@@ -211,9 +191,9 @@ class ControlClient:
         if self._loop is not None and self._main_task is not None:
             self._loop.call_later(GOODBYE_S, self._main_task.cancel)
 
-    async def _wait_until(self, when: float) -> None:
-        """Wait until `when`, or until stopped."""
-        while not self._stopping and (delay_s := when - time.monotonic()) > 0:
+    async def _wait_for_turn(self) -> None:
+        """Wait until the next attempt is due, or until stopped."""
+        while not self._stopping and (delay_s := self._session.retry_at - time.monotonic()) > 0:
             self._wake.clear()
             await self._woken_within(delay_s)
 
@@ -227,12 +207,14 @@ class ControlClient:
         self._session.opened(time.monotonic())
         ended = _StreamEndedError("stopped")
         try:
-            async with self._open_channel() as channel:
+            async with self._dialer.line() as line, self._open_channel(line.target) as channel:
+                self._line = line
                 call = control_pb2_grpc.ControlPlaneStub(channel).Connect()
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(self._read(call))
                     tasks.create_task(self._write(call))
-                    tasks.create_task(self._await_welcome())
+                    tasks.create_task(self._await_welcome(line))
+                    tasks.create_task(self._await_end(line))
                     if self._tls is not None:
                         tasks.create_task(self._watch_files())
         except* _StreamEndedError as group:
@@ -241,7 +223,10 @@ class ControlClient:
             log.exception("control stream failed")
             ended = _StreamEndedError("internal error", refused=True)
         finally:
-            delay_s = self._session.closed(time.monotonic(), refused=ended.refused)
+            if self._line is not None and not ended.wanted:
+                self._line.over(welcomed=self._connected, refused=ended.refused)
+            self._line = None
+            delay_s = self._session.closed(time.monotonic(), refused=ended.refused, moved=ended.moved)
         was_connected = self._connected
         self._note_connection(False, "stopped" if self._stopping else ended.reason)
         self.last_failure = None if ended.wanted else ended.reason
@@ -250,12 +235,15 @@ class ControlClient:
         elif not self._stopping:
             self._outage.failed(ended.reason, delay_s, time.monotonic(), was_connected=was_connected)
 
-    def _open_channel(self) -> grpc.aio.Channel:
-        if self._tls is None:
-            return grpc.aio.insecure_channel(self._target, options=_CHANNEL_OPTIONS)
-        files = self._tls.current
-        credentials = grpc.ssl_channel_credentials(files.ca_pem, files.key_pem, files.certificate_pem)
-        return grpc.aio.secure_channel(self._target, credentials, options=_CHANNEL_OPTIONS)
+    def _open_channel(self, target: str) -> grpc.aio.Channel:
+        return open_channel(target, None if self._tls is None else self._tls.current)
+
+    async def _await_end(self, line: ControlLine) -> None:
+        """End the stream when there is no way to the control plane, or a better one than the stream's."""
+        end = await asyncio.shield(line.ended)  # `over` asks it, after this task was cancelled
+        if isinstance(end, str):
+            raise _StreamEndedError(end)
+        raise _StreamEndedError(end.reason, wanted=end.cause == CHEAPER, moved=True)
 
     async def _watch_files(self) -> None:
         """End the stream when there is another certificate to show."""
@@ -278,9 +266,11 @@ class ControlClient:
         code = error.code()
         reason = clean_text(f"{code.name}: {error.details() or 'no details'}")
         advice = None
+        if code is grpc.StatusCode.UNAVAILABLE and self._connected and self._line is not None and self._line.broken:
+            reason = f"{code.name}: {self._line.broken}"
         if code is grpc.StatusCode.UNAVAILABLE and not self._connected:
             advice = tls_advice.explain(reason, self._tls.current if self._tls is not None else None, time.time())
-        return _StreamEndedError(advice or reason, refused=code in _REFUSALS)
+        return _StreamEndedError(advice or reason, refused=code in REFUSALS)
 
     async def _read(self, call: _Call) -> None:
         try:
@@ -317,11 +307,11 @@ class ControlClient:
                 return
             await self._woken_within(self._session.next_timer() - time.monotonic())
 
-    async def _await_welcome(self) -> None:
+    async def _await_welcome(self, line: ControlLine) -> None:
         """A network that swallows everything lets gRPC try for 20 s: give up sooner."""
         await asyncio.sleep(max(self._session.next_timer() - time.monotonic(), 0.0))
         if self._session.welcome_overdue(time.monotonic()):
-            raise _StreamEndedError("no answer to the registration")
+            raise _StreamEndedError(line.describe() or f"no answer to the registration at {line.way}")
 
     def _on_message(self, message: control_pb2.ControlMessage) -> None:
         try:
@@ -338,8 +328,9 @@ class ControlClient:
                 self._apply(apply)
 
     def _on_welcome(self, welcome: Welcome) -> None:
-        if not self._connected:
-            self._outage.over()
+        if not self._connected and self._line is not None:
+            self._line.let_in()
+            self._outage.over(str(self._line.way))
         try:
             self._hooks.welcome(welcome)
         except Exception:

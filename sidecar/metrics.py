@@ -16,6 +16,8 @@ from prometheus_client.registry import Collector
 from protos.config_fields import split_host_port
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind
+from sidecar.core.control_watch import LEAVE_CAUSES
+from sidecar.core.control_ways import DIAL_DROPS
 from sidecar.metric_families import by_one, counter, cumulative, gauge
 from sidecar.state_store import FAILURES
 
@@ -271,6 +273,24 @@ def _control(stats: ControlStats, connected: bool, engine: EngineStats) -> Itera
         "Messages of the control plane not acted on.",
         ("reason",),
         by_one(stats.ignored),
+    )
+    yield counter(
+        "plr_control_connections",
+        "TCP connections that a control stream took, by interface.",
+        ("interface",),
+        by_one(stats.connections),
+    )
+    yield counter(
+        "plr_control_connections_left",
+        "Those that were left for another way, by cause.",
+        ("cause",),
+        {(cause,): stats.connections_left[cause] for cause in LEAVE_CAUSES},
+    )
+    yield counter(
+        "plr_control_dial_dropped",
+        "What the control stream's dialer left out or turned away, by reason.",
+        ("reason",),
+        {(reason,): stats.dial_drops[reason] for reason in DIAL_DROPS},
     )
 
 

@@ -42,8 +42,8 @@ class OutageLog:
             delay_s,
         )
 
-    def over(self) -> None:
-        """The control plane answered."""
-        self._log.info("registered with the control plane %s", self._target)
+    def over(self, where: str) -> None:
+        """The control plane answered there."""
+        self._log.info("registered with the control plane %s", where)
         self._attempts = 0
         self._reason = ""

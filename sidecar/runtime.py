@@ -12,12 +12,14 @@ import sdnotify
 from protos import interpreter
 from protos.config_fields import split_host_port
 from protos.errors import ConfigError
-from protos.model import PROTOCOL_VERSION, Registration, ResourceKind, Version
+from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Version
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import Apply, ControlSession
+from sidecar.core.control_ways import ControlInterface
 from sidecar.core.engine import EngineConfig
 from sidecar.metrics import MetricSources, serve_metrics
+from sidecar.net.control_dialer import ControlDialer
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
 from sidecar.ros.bridge import RosBridge
@@ -25,10 +27,13 @@ from sidecar.start_session import signed, start_session
 from sidecar.state_store import StateDirError, StateStore
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from protos.metrics_server import MetricsServer
     from protos.model import Assignment, Candidate, InterfaceName, MappingSet, PeerSet, Report, ServiceName, Welcome
     from protos.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
+    from sidecar.core.path_id import PathState
     from sidecar.core.stun_events import StunEvent
     from sidecar.stop_request import StopRequest
 
@@ -59,7 +64,13 @@ class Sidecar:
         self._data_plane = ThreadedDataPlane(
             EngineConfig(config.role, rules, config.budgets()),
             own,
-            DataPlaneHooks(self._bridge, self._on_stun, self._on_services_changed, self._on_reach_changed),
+            DataPlaneHooks(
+                self._bridge,
+                self._on_stun,
+                self._on_services_changed,
+                self._on_reach_changed,
+                self._on_paths_changed,
+            ),
         )
         last = self._store.last_good
         self._control_session = ControlSession(
@@ -78,7 +89,15 @@ class Sidecar:
             ),
             random.SystemRandom(),
         )
-        self._control = ControlClient(config.control_plane, self._control_session, self, self._tls)
+        names = config.control_plane
+        self._dialer = ControlDialer(
+            names,
+            self._control_session.stats,
+            self._store.control_addresses(names),
+            lambda addresses: self._store.remember_addresses(names, addresses),
+            self._data_plane.check_paths,
+        )
+        self._control = ControlClient(self._dialer, self._control_session, self, self._tls)
         self._interfaces = InterfaceManager(
             config,
             own,
@@ -168,9 +187,9 @@ class Sidecar:
     def _stun_servers(self, welcome: Welcome | None) -> tuple[str, ...]:
         if welcome is not None and welcome.stun_servers:
             return welcome.stun_servers
-        host, _ = split_host_port(self._config.control_plane)
-        shown = f"[{host}]" if ":" in host else host
-        return (f"{shown}:{DEFAULT_STUN_PORT}",)
+        hosts = [split_host_port(address)[0] for address in self._config.control_plane]
+        shown = [f"[{host}]" if ":" in host else host for host in dict.fromkeys(hosts)]
+        return tuple(f"{host}:{DEFAULT_STUN_PORT}" for host in shown)
 
     def _on_stun(self, interface: InterfaceName, event: StunEvent) -> None:
         self._interfaces.on_stun_event(interface, event)
@@ -178,12 +197,22 @@ class Sidecar:
     def _tell_candidates(self, candidates: tuple[Candidate, ...]) -> None:
         labels = self._config.labels(candidate.interface for candidate in candidates)
         self._control.set_candidates(candidates, labels)
+        own: dict[InterfaceName, list[str]] = {}
+        for candidate in candidates:
+            if candidate.kind is CandidateKind.HOST:
+                own.setdefault(candidate.interface, []).append(candidate.address[0])
+        self._dialer.set_interfaces(
+            [ControlInterface(name, frozenset(addresses), self._config.price(name)) for name, addresses in own.items()]
+        )
 
     def _on_services_changed(self) -> None:
         self._control.set_services(*self._data_plane.services())
 
     def _on_reach_changed(self) -> None:
         self._control.try_again()
+
+    def _on_paths_changed(self, best: Mapping[InterfaceName, PathState]) -> None:
+        self._dialer.set_paths(best)
 
     # -- ControlHooks, on the control client's thread -------------------------------------------------------------
 

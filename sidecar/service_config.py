@@ -36,8 +36,11 @@ if TYPE_CHECKING:
 MAX_DEADLINE_MS = 60_000
 """Where the latency histogram ends: a miss of a longer deadline could not be predicted."""
 
-MIN_DEFAULT_LIFETIME_MS = 10_000.0
-"""A request outlives its deadline at least until a dead path is noticed and another one has tried."""
+MIN_DEFAULT_LIFETIME_MS = 30_000.0
+"""A late answer is still worth having, and a car is out of most tunnels and dead zones by then."""
+
+MIN_DROPPED_LIFETIME_MS = 10_000.0
+"""With `drop_late`: a request outlives its deadline only until it is known what became of its copies."""
 
 LIFETIME_PER_DEADLINE = 10.0
 """Default lifetime, in deadlines."""
@@ -131,8 +134,8 @@ class ServiceConfig(Section):
     lifetime_ms: Annotated[float, Field(gt=0, le=_MAX_LIFETIME_MS)] | None = None
     """Milliseconds after which an unanswered request is given up; more than deadline_ms.
 
-    Robot: by default 10 deadlines, between 10000 and 300000. Cloud: how long a local server is waited for, by default
-    60000."""
+    Robot: by default 10 deadlines, at least 30000 (10000 with drop_late) and at most 300000. Cloud: how long a local
+    server is waited for, by default 60000."""
     idempotent: bool | None = None
     """Robot: copies of one request may run on several servers. Default false."""
     drop_late: bool | None = None
@@ -181,7 +184,8 @@ class ServiceConfig(Section):
             deadline_ms = lifetime_ms
         else:
             deadline_ms = self.deadline_ms or MAX_DEADLINE_MS
-            default_ms = min(max(LIFETIME_PER_DEADLINE * deadline_ms, MIN_DEFAULT_LIFETIME_MS), _MAX_LIFETIME_MS)
+            least_ms = MIN_DROPPED_LIFETIME_MS if self.drop_late else MIN_DEFAULT_LIFETIME_MS
+            default_ms = min(max(LIFETIME_PER_DEADLINE * deadline_ms, least_ms), _MAX_LIFETIME_MS)
             lifetime_ms = self.lifetime_ms or default_ms
         cheapest = self.mode is ModeWord.CHEAPEST
         return ServiceRule(

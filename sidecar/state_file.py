@@ -1,13 +1,16 @@
 """Layout of the sidecar's files on disk, and their codec; no IO.
 
     offset  size
-         0     8  magic: "plr-id\\0\\0" identity, "plr-last" last good messages of the control plane
+         0     8  magic: "plr-id\\0\\0" identity, "plr-last" last good messages of the control plane,
+                  "plr-ctrl" addresses of the control plane that worked
          8     2  format version, 1
         10     4  length of the body
         14    32  SHA-256 of the body
         46        body
 
     identity     token (16), incarnation (8)
+    addresses    number of names (1), the configured host:port names, number of addresses (1), for each its host and
+                 its port (2); texts have their length (1) before them
     last good    owner: length (1), name of the sidecar; then ControlMessages that hold a Welcome, a PeerSet, a
                  MappingSet (the last of a kind counts): length (4), protobuf
 
@@ -21,12 +24,13 @@ import struct
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from protos.config_fields import canonical_ip
 from protos.convert import control_message_to_proto, parse_control_message
 from protos.errors import DecodeError
 from protos.model import TOKEN_BYTES, MappingSet, NodeName, PeerSet, Welcome
 
 if TYPE_CHECKING:
-    from protos.model import ControlMessage
+    from protos.model import Address, ControlMessage
 
 FORMAT_VERSION = 1
 """Of both files; an unknown one is refused."""
@@ -36,8 +40,10 @@ MAX_FILE_BYTES = 64 << 20
 
 _IDENTITY_MAGIC = b"plr-id\0\0"
 _LAST_GOOD_MAGIC = b"plr-last"
+_ADDRESSES_MAGIC = b"plr-ctrl"
 _HEADER = struct.Struct("!8sHI32s")
 _IDENTITY = struct.Struct(f"!{TOKEN_BYTES}sQ")
+_PORT = struct.Struct("!H")
 _LENGTH = struct.Struct("!I")
 
 
@@ -49,6 +55,15 @@ class Identity:
     """`TOKEN_BYTES` random bytes, drawn once."""
     incarnation: int
     """Grows with every start."""
+
+
+@dataclass(frozen=True, slots=True)
+class ControlAddresses:
+    """Where a control plane let the sidecar in, the newest first."""
+
+    names: tuple[str, ...]
+    """The configured host:port names; of no use with others."""
+    addresses: tuple[Address, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +123,46 @@ def decode_last_good(data: bytes, owner: NodeName) -> LastGood:
         message, end = _pull_message(body, end)
         last = last.with_message(message)
     return last
+
+
+def encode_addresses(known: ControlAddresses) -> bytes:
+    """Return the file's content."""
+    parts = [bytes([len(known.names)]), *map(_text, known.names), bytes([len(known.addresses)])]
+    for host, port in known.addresses:
+        parts += [_text(host), _PORT.pack(port)]
+    return _seal(_ADDRESSES_MAGIC, b"".join(parts))
+
+
+def decode_addresses(data: bytes) -> ControlAddresses:
+    """Read the file's content; raises DecodeError."""
+    body = _open(_ADDRESSES_MAGIC, data)
+    try:
+        names, end = [], 1
+        for _ in range(body[0]):
+            name, end = _pull_text(body, end)
+            names.append(name)
+        addresses = []
+        count, end = body[end], end + 1
+        for _ in range(count):
+            host, end = _pull_text(body, end)
+            (port,) = _PORT.unpack_from(body, end)
+            addresses.append((canonical_ip(host), port))
+            end += _PORT.size
+    except (IndexError, ValueError, struct.error) as error:
+        raise DecodeError(f"addresses: {error}") from error
+    return ControlAddresses(tuple(names), tuple(addresses))
+
+
+def _text(text: str) -> bytes:
+    data = text.encode()
+    return bytes([len(data)]) + data
+
+
+def _pull_text(body: bytes, start: int) -> tuple[str, int]:
+    end = start + 1 + body[start]
+    if end > len(body):
+        raise DecodeError("text cut off")
+    return body[start + 1 : end].decode(), end
 
 
 def _pull_message(body: bytes, start: int) -> tuple[ControlMessage, int]:

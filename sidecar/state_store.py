@@ -19,10 +19,13 @@ from protos.errors import DecodeError
 from protos.model import TOKEN_BYTES
 from sidecar.state_file import (
     MAX_FILE_BYTES,
+    ControlAddresses,
     Identity,
     LastGood,
+    decode_addresses,
     decode_identity,
     decode_last_good,
+    encode_addresses,
     encode_identity,
     encode_last_good,
 )
@@ -31,16 +34,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from protos.model import ControlMessage, NodeName
+    from protos.model import Address, ControlMessage, NodeName
 
 log = logging.getLogger(__name__)
 
 IDENTITY_FILE = "identity"
 LAST_GOOD_FILE = "last-good"
+ADDRESSES_FILE = "control-addresses"
 LOCK_FILE = "lock"
 SET_ASIDE_SUFFIX = ".refused"
 
-FAILURES = ("identity_refused", "last_good_refused", "write_failed")
+FAILURES = ("identity_refused", "last_good_refused", "control_addresses_refused", "write_failed")
 """The keys of `StateStore.failures`."""
 
 CLOSE_TIMEOUT_S = 2.0
@@ -72,8 +76,10 @@ class StateStore:
         self._current = self._read(LAST_GOOD_FILE, lambda data: decode_last_good(data, owner)) or LastGood(owner)
         self.last_good = self._current
         """As found on disk when opened."""
+        self._addresses = self._read(ADDRESSES_FILE, decode_addresses) or ControlAddresses(())
         self._condition = threading.Condition()
-        self._dirty = False
+        self._dirty: dict[str, bytes | LastGood] = {}
+        """What to write, by file."""
         self._closing = False
         self._writer = threading.Thread(target=self._write_when_changed, name="plr-state", daemon=True)
         self._writer.start()
@@ -84,8 +90,19 @@ class StateStore:
             changed = self._current.with_message(message)
             if changed != self._current:
                 self._current = changed
-                self._dirty = True
+                self._dirty[LAST_GOOD_FILE] = changed
                 self._condition.notify()
+
+    def control_addresses(self, names: tuple[str, ...]) -> tuple[Address, ...]:
+        """Where a control plane of these names let us in, the newest first."""
+        return self._addresses.addresses if self._addresses.names == names else ()
+
+    def remember_addresses(self, names: tuple[str, ...], addresses: tuple[Address, ...]) -> None:
+        """Keep where a control plane of these names let us in; returns at once."""
+        with self._condition:
+            self._addresses = ControlAddresses(names, addresses)
+            self._dirty[ADDRESSES_FILE] = encode_addresses(self._addresses)
+            self._condition.notify()
 
     def close(self) -> None:
         """Write what is not written yet, and let the folder go."""
@@ -112,9 +129,9 @@ class StateStore:
                 self._condition.wait_for(lambda: self._dirty or self._closing)
                 if not self._dirty:
                     return
-                self._dirty = False
-                current = self._current
-            self._write(LAST_GOOD_FILE, encode_last_good(current))
+                dirty, self._dirty = self._dirty, {}
+            for name, content in dirty.items():
+                self._write(name, encode_last_good(content) if isinstance(content, LastGood) else content)
             with self._condition:
                 self._condition.wait_for(lambda: self._closing, MIN_WRITE_INTERVAL_S)
 

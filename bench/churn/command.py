@@ -10,21 +10,19 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from bench.churn import report
-from bench.churn.hands import DEADLINE_MS, LIFETIME_MS, Hands
+from bench.churn.hands import Hands
 from bench.churn.runner import SAMPLE_EVERY_S, Runner
 from bench.churn.schedule import SERVERS, make_schedule
+from bench.churn.workloads import WORKLOADS
 from bench.system import SystemFailureError, read_json
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator
 
+    from bench.churn.workloads import Workload
     from bench.system import Part
 
-CLIENTS = {"1 kB at 20 Hz": (1_000, 20.0), "100 kB at 2 Hz": (100_000, 2.0)}
-"""Shown name -> bytes of a request, requests a second."""
-GRACE_S = LIFETIME_MS / 1e3 + 5.0
-"""By then a request is answered or has failed."""
 OURS = ("robot.sidecar", *(f"{cloud}.sidecar" for cloud in SERVERS), "controlplane")
 BAD_LINES = ("Traceback", "internal error")
 NON_TTY_EVERY = 20
@@ -63,13 +61,13 @@ def churn(console: Console, folder: Path, length_s: float, seed: int) -> report.
         hands = Hands(lab, folder)
         with console.status("starting the control plane, two clouds and the robot"):
             hands.start()
-        clients = {name: _start_client(hands, name, length_s) for name in CLIENTS}
+        clients = {workload: _start_client(hands, workload, length_s) for workload in WORKLOADS}
         for client in clients.values():
             _wait_until_it_calls(hands, client)
         runner = Runner(hands, schedule, length_s, console.print)
         _play(console, runner, list(clients.values()))
         with console.status("waiting for the last answers"):
-            summaries = {name: _result(hands, name, client) for name, client in clients.items()}
+            summaries = {workload.title: _result(hands, workload, client) for workload, client in clients.items()}
         failures = runner.failures + hands.complaints + _dead_or_cursing(hands)
         hands.system.close()
     return report.Outcome(
@@ -103,18 +101,18 @@ def _wait_until_it_calls(hands: Hands, client: Part) -> None:
     hands.system.wait(f"{client.name} to call", lambda: " sent " in client.log.read_text())
 
 
-def _start_client(hands: Hands, name: str, length_s: float) -> Part:
-    size, rate_hz = CLIENTS[name]
-    slug = _slug(name)
-    argv = ["-m", "bench.echo", "call", "--size", str(size), "--rate", str(rate_hz), "--duration", str(length_s)]
-    argv += ["--deadline-ms", str(DEADLINE_MS), "--grace-s", str(GRACE_S), "--queue-depth", "200"]
-    argv += ["--json", str(hands.system.folder / f"{slug}.json")]
-    return hands.system.start_node(slug, "robot", argv)
+def _start_client(hands: Hands, workload: Workload, length_s: float) -> Part:
+    argv = [*workload.argv(length_s), "--json", str(_result_path(hands, workload))]
+    return hands.system.start_node(workload.part, "robot", argv)
 
 
-def _result(hands: Hands, name: str, client: Part) -> dict[str, Any]:
-    client.process.wait(GRACE_S + 60.0)
-    path = hands.system.folder / f"{_slug(name)}.json"
+def _result_path(hands: Hands, workload: Workload) -> Path:
+    return hands.system.folder / f"{workload.part}.json"
+
+
+def _result(hands: Hands, workload: Workload, client: Part) -> dict[str, Any]:
+    client.process.wait(workload.grace_s + 60.0)
+    path = _result_path(hands, workload)
     if not path.exists():
         raise SystemFailureError(f"the client left no result\n{client.tail()}")
     summary: dict[str, Any] = read_json(path)["summary"]
@@ -132,10 +130,6 @@ def _dead_or_cursing(hands: Hands) -> list[str]:
         lines = hands.system.parts[name].log.read_text(errors="replace").splitlines()
         found += [f"{name}: {line}" for line in lines if any(bad in line for bad in BAD_LINES)]
     return found
-
-
-def _slug(name: str) -> str:
-    return "client-" + name.partition(" at")[0].replace(" ", "").lower()
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import signal
 from typing import TYPE_CHECKING
 
 from bench.churn.schedule import PATHS, SERVERS, Kind, Lane, Trouble
+from bench.churn.workloads import SERVICES
 from bench.netlab import Lab, LabConfig, LinkProfile
 from bench.system import System
 
@@ -17,9 +18,6 @@ PROFILES = {
     "wwan0": LinkProfile(delay_ms=15, jitter_ms=5, loss=0.002, rate_kbps=30_000),
 }
 BURST_LOSS = 0.4
-SERVICE = "/echo"
-DEADLINE_MS = 500
-LIFETIME_MS = 30_000
 FIRST_NEW_ADDRESS, NEW_ADDRESSES = 50, 100
 
 
@@ -40,15 +38,15 @@ class Hands:
         return Lab(LabConfig.of(interfaces=PATHS, clouds=len(SERVERS)), seed=seed)
 
     def start(self) -> None:
-        """Bring everything up, until the robot offers the service."""
+        """Bring everything up, until the robot offers the services."""
         for interface, profile in PROFILES.items():
             self._lab.link(interface).set(profile)
         self.system.start_control_plane()
         for cloud in SERVERS:
             self._start_ros(cloud)
             self._start_sidecar(cloud)
-        rule = {"name": SERVICE, "deadline_ms": DEADLINE_MS, "lifetime_ms": LIFETIME_MS, "idempotent": True}
-        self.system.wait_for_offer(self.system.start_robot([rule], interfaces=PATHS))
+        rules = [service.rule() for service in SERVICES]
+        self.system.wait_for_offer(self.system.start_robot(rules, interfaces=PATHS), len(rules))
 
     def begin(self, trouble: Trouble) -> None:
         """Do it."""
@@ -67,12 +65,12 @@ class Hands:
             case Kind.READDRESS:
                 self._readdress(target)
             case Kind.KILL_ROS:
-                self._kill(f"{target}.echo")
+                self._kill_ros(target)
             case Kind.KILL_SIDECAR:
                 self._kill(f"{target}.sidecar")
             case Kind.KILL_HOST:
                 self._kill(f"{target}.sidecar")
-                self._kill(f"{target}.echo")
+                self._kill_ros(target)
             case Kind.STOP_SIDECAR:
                 self.system.parts[f"{target}.sidecar"].process.send_signal(signal.SIGTERM)
             case Kind.KILL_CONTROL:
@@ -123,7 +121,7 @@ class Hands:
                 return self.system.metrics("robot").get("plr_control_plane_connected") == 1
 
     def _answers(self, cloud: str) -> float:
-        """What the local server has answered since its sidecar started."""
+        """What the local servers have answered since their sidecar started."""
         return sum(
             value
             for series, value in self.system.metrics(cloud).items()
@@ -147,10 +145,17 @@ class Hands:
         )
 
     def _start_ros(self, cloud: str) -> None:
-        self.system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
+        for service in SERVICES:
+            argv = ["-m", "bench.echo", "serve", "--name", service.part, "--service", service.name]
+            argv += ["--delay-ms", str(service.takes_ms)]
+            self.system.start_node(f"{cloud}.{service.part}", cloud, argv)
+
+    def _kill_ros(self, cloud: str) -> None:
+        for service in SERVICES:
+            self._kill(f"{cloud}.{service.part}")
 
     def _start_sidecar(self, cloud: str) -> None:
-        self.system.start_cloud(cloud, [{"name": SERVICE}])
+        self.system.start_cloud(cloud, [{"name": service.name} for service in SERVICES])
 
     def _kill(self, name: str) -> None:
         self.system.parts[name].kill()

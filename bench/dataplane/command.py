@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
         _write(report, options.out)
     report.machine["cpu_pressure"] = pressure.share()
     _write(report, options.out)
-    show_verdicts(console, report.figures, TARGETS)
+    show_verdicts(console, report.figures, TARGETS, report.ranges())
     console.print(f"written: {options.out / 'dataplane.json'} and {options.out / 'dataplane.html'}")
     missed = any(target.met(report.figures) is False for target in TARGETS)
     return 1 if failed or (missed and not options.quick) else 0

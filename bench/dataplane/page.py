@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 def render(report: Report) -> str:
     """The whole page."""
     machine = ", ".join(f"{key}: {value}" for key, value in report.machine.items())
-    how = "quick run, figures are worth little" if report.quick else f"medians of {report.repeats} repeats"
+    how = "quick run, figures are worth little" if report.quick else f"{report.repeats} repeats"
     sections = "".join(_section(report.titles[name], findings) for name, findings in report.sections.items())
     what = note_as_html(f"{how}; {machine}")
-    return document("data plane", f"{what}{verdicts_as_html(TARGETS, report.figures)}{sections}")
+    return document("data plane", f"{what}{verdicts_as_html(TARGETS, report.figures, report.ranges())}{sections}")
 
 
 def _section(title: str, findings: Findings) -> str:

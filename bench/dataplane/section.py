@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from bench.dataplane.statistics import Row
+    from bench.dataplane.statistics import Interval, Row
     from bench.reporting.tables import Figure
 
 
@@ -49,6 +49,8 @@ class Findings:
     """What a section measured."""
 
     figures: dict[str, Figure] = field(default_factory=dict)
+    intervals: dict[str, Interval | None] = field(default_factory=dict)
+    """By the figure's name, of those that are estimates."""
     tables: list[Table] = field(default_factory=list)
     plots: list[Plot] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

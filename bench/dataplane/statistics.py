@@ -1,22 +1,55 @@
-"""From requests to figures: quantiles, medians of repeats, rows of a table. None stands for what was not measured."""
+"""From requests to figures: quantiles, medians of repeats, rows of a table. None stands for what was not measured.
+
+A figure that is held against a target comes with an interval: how far it moves when the samples are drawn again from
+themselves (the bootstrap). It knows nothing of what differs from run to run.
+"""
 
 from __future__ import annotations
 
 import math
+import random
 import statistics
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
 MS = 1000.0
+DRAWS = 400
+"""How often samples are drawn again for an interval."""
+CONFIDENCE = 0.95
+BLOCK = 10
+"""Requests in a row that are drawn together: what disturbs one often disturbs the next."""
+
+
+class Interval(NamedTuple):
+    """Where 95 % of the draws lie, and of how many samples they are."""
+
+    low: float
+    high: float
+    samples: int
 
 
 def quantile(values: Iterable[float], fraction: float) -> float | None:
     """The smallest value that at least `fraction` of the values do not exceed; None of no values."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(fraction * len(ordered)) - 1)] if ordered else None
+
+
+def p99(values: Iterable[float]) -> float | None:
+    """The 99th percentile; None of no values."""
+    return quantile(values, 0.99)
+
+
+def p99_ratio(samples: Sequence[float], others: Sequence[float]) -> float | None:
+    """The P99 of the one over that of the others."""
+    return ratio(p99(samples), p99(others))
+
+
+def median_ratio(samples: Sequence[float], others: Sequence[float]) -> float | None:
+    """The median of the one over that of the others."""
+    return ratio(median(samples), median(others))
 
 
 def median(values: Iterable[float | None]) -> float | None:
@@ -44,6 +77,39 @@ def difference(one: float | None, other: float | None) -> float | None:
 def worst(values: Iterable[float | None]) -> float | None:
     """Largest of what was measured; None when nothing was."""
     return max((value for value in values if value is not None), default=None)
+
+
+def interval(
+    of: Callable[..., float | None], *sets: Sequence[float], block: int = BLOCK, seed: int = 1
+) -> Interval | None:
+    """How far `of(*sets)` moves when each set is drawn again from itself, `block` samples in a row at a time.
+
+    None when there are fewer than two samples in a set, or a draw gives no figure. `samples` is the smallest set's.
+    Blocks are a quarter of a small set at most: drawn as a whole it would never differ from itself.
+    """
+    smallest = min(map(len, sets), default=0)
+    if smallest < 2:
+        return None
+    rng = random.Random(seed)
+    found = []
+    for _ in range(DRAWS):
+        value = of(*(_drawn_again(samples, max(1, min(block, len(samples) // 4)), rng) for samples in sets))
+        if value is None:
+            return None
+        found.append(value)
+    found.sort()
+    cut = round(DRAWS * (1 - CONFIDENCE) / 2)
+    return Interval(found[cut], found[-1 - cut], smallest)
+
+
+def _drawn_again(samples: Sequence[float], block: int, rng: random.Random) -> list[float]:
+    """As many samples, in blocks that begin anywhere; the first follows the last."""
+    count = len(samples)
+    drawn: list[float] = []
+    while len(drawn) < count:
+        begin = rng.randrange(count)
+        drawn += (samples[(begin + offset) % count] for offset in range(min(block, count - len(drawn))))
+    return drawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +148,13 @@ class Calls:
         ends = self.arrivals()
         return max(ends) - self.sent_s[0] if ends else None
 
+    def answered_ms(self) -> list[float]:
+        """The latencies of those that were answered, in order of sending, milliseconds."""
+        return [latency * MS for _, latency in self._answered()]
+
     def row(self, name: str) -> Row:
         """Summarise; quantiles are over the answered ones."""
-        answered = [latency * MS for _, latency in self._answered()]
+        answered = self.answered_ms()
         return Row(
             name,
             sent=len(self.latency_s),

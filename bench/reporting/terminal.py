@@ -27,12 +27,22 @@ def rich_table(table: Table) -> RichTable:
     return shown
 
 
-def show_verdicts(console: Console, figures: Mapping[str, Figure], targets: Sequence[Target]) -> None:
-    """Show what is met and what is missed."""
+def show_verdicts(
+    console: Console,
+    figures: Mapping[str, Figure],
+    targets: Sequence[Target],
+    notes: Mapping[str, str] | None = None,
+) -> None:
+    """Show what is met and what is missed; `notes`, by the figure's name, say what it comes from."""
     table = RichTable(title="targets", title_justify="left")
-    for column in ("figure", "value", "wanted", "verdict"):
-        shape: dict[str, Any] = {"justify": "right"} if column == "value" else {"no_wrap": column != "wanted"}
+    for column in ("figure", "value", "wanted", "verdict", *(("from",) if notes is not None else ())):
+        shape: dict[str, Any] = {"no_wrap": column in ("value", "verdict")}
+        if column == "value":
+            shape["justify"] = "right"
+        elif column == "figure":
+            shape["overflow"] = "fold"
         table.add_column(column, **shape)
     for target in targets:
-        table.add_row(target.key, text_of(figures.get(target.key)), target.wanted, target.verdict(figures))
+        note = () if notes is None else (notes.get(target.key, ""),)
+        table.add_row(target.key, text_of(figures.get(target.key)), target.wanted, target.verdict(figures), *note)
     console.print(table)

@@ -46,6 +46,7 @@ class Track(Generic[C]):
         """What was sent last, or None if the sidecar has to be sent everything."""
         self.nonce = 0
         self.state = SyncState.NOT_SENT
+        """REJECTED stays while what was refused is sent again, until the sidecar has taken something."""
         self.version_sent = Version(0)
         self.version_acked = Version(0)
         self.error = ""
@@ -54,12 +55,15 @@ class Track(Generic[C]):
         self.refused_as_before = False
         """Whether the last refusal gave the same reason as the one before, with nothing taken in between."""
         self._refusal: str | None = None
+        self._unanswered = False
         self._floor = Version(0)
 
     def begin_stream(self, held: Version) -> None:
         """A new stream: the sidecar says which version it holds; what else was sent may not have arrived."""
         self._floor = max(self._floor, held, self.version_sent)
-        if self.sent is not None and held == self.version_sent and self.state is not SyncState.REJECTED:
+        refused, self._unanswered = self.refused, False
+        if self.sent is not None and held == self.version_sent and not refused:
+            self.error = ""
             self.state = SyncState.SYNCED
             self.version_acked = held
             return
@@ -74,30 +78,40 @@ class Track(Generic[C]):
         self.sent = content
         self.version_sent = self._floor = versions.above(self._floor)
         self.nonce += 1
-        self.state = SyncState.STALE
-        self.error = ""
+        self._unanswered = True
+        if not self.send_again:
+            self.state = SyncState.STALE
+            self.error = ""
         self.send_again = False
         return self.version_sent
 
     def ack(self, ack: Ack) -> bool:
         """The sidecar applied it; False if that is stale: about something sent earlier, or already refused."""
-        if ack.nonce != self.nonce or ack.version != self.version_sent or self.state is not SyncState.STALE:
+        if ack.nonce != self.nonce or ack.version != self.version_sent or not self._unanswered:
             return False
+        self._unanswered = False
         self.state = SyncState.SYNCED
+        self.error = ""
         self.version_acked = ack.version
         self._refusal = None
         return True
 
     def nack(self, nack: Nack) -> bool:
         """The sidecar refused it; False if that is stale."""
-        if nack.nonce != self.nonce or self.state not in (SyncState.STALE, SyncState.SYNCED):
+        if nack.nonce != self.nonce or not (self._unanswered or self.state is SyncState.SYNCED):
             return False
+        self._unanswered = False
         self.state = SyncState.REJECTED
         self.version_acked = nack.version
         self.error = nack.error
         self.refused_as_before = nack.error == self._refusal
         self._refusal = nack.error
         return True
+
+    @property
+    def refused(self) -> bool:
+        """Whether the sidecar refused what it was sent last, and was not sent it again since."""
+        return self.state is SyncState.REJECTED and not self._unanswered
 
     @property
     def status(self) -> ResourceStatus:
@@ -134,7 +148,7 @@ class Snapshots:
     def send_refused_again(self) -> None:
         """What is refused is due once more; as it is wanted then, and as a new version."""
         for track in (self.peers, self.mapping):
-            track.send_again = track.state is SyncState.REJECTED
+            track.send_again = track.refused
 
     def peers_acked(self, ack: Ack) -> bool:
         """The sidecar applied its peers: it forgot all others."""

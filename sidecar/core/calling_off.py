@@ -52,7 +52,7 @@ class CallingOff:
             copy.ended_at = now
             self._outbox.drop(copy.message)
             self._stats.called_off[copy.path.interface, copy.path.peer, request.service] += 1
-        servers = {copy.path.peer for copy in copies if copy.message.begun}
+        servers = {copy.path.peer for copy in copies if copy.message.may_have_left}
         servers -= {untold, *(copy.path.peer for copy in request.pending())}
         for server in servers:
             path = self._routes.best_to(server)

@@ -43,6 +43,9 @@ RETRY_FIRST_S = 0.2
 RETRY_MAX_S = 10.0
 """Largest bound: the load of a fleet that waits, against how long a control plane that is back goes unnoticed."""
 
+RETRY_LEAST_S = 1.0
+"""From one attempt to the next, at least, when a change of the network is the reason for it."""
+
 WELCOME_TIMEOUT_S = 5.0
 """A stream without Welcome for this long is given up: connection set-up over a bad cellular link takes 1 to 2 s."""
 
@@ -81,6 +84,12 @@ class ControlStats:
     nacks: Counter[ResourceKind] = field(default_factory=Counter)
     ignored: Counter[str] = field(default_factory=Counter)
     """Messages of the control plane not acted on, by reason."""
+    connections: Counter[str] = field(default_factory=Counter)
+    """TCP connections that a stream took, by interface."""
+    connections_left: Counter[str] = field(default_factory=Counter)
+    """Those that were left for another way, by cause."""
+    dial_drops: Counter[str] = field(default_factory=Counter)
+    """What the dialer left out or turned away, by reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +126,7 @@ class ControlSession:
         self.stats = ControlStats()
         self._retry_at = 0.0
         self._opened_at = 0.0
+        self._refused = False
         self._heartbeat_interval_s = 0.0
         self._report_interval_s = 0.0
         self._heartbeat_at = 0.0
@@ -163,10 +173,11 @@ class ControlSession:
         self._services_due = True
         self._drain_due = self._draining
 
-    def closed(self, now: float, *, refused: bool = False) -> float:
+    def closed(self, now: float, *, refused: bool = False, moved: bool = False) -> float:
         """The stream ended, or never came to be; returns the seconds until the next attempt.
 
-        `refused`: by the control plane's decision, which will hardly change within a second.
+        `refused`: by the control plane's decision, which will hardly change within a second. `moved`: by ours, since
+        there is a better way to it, which is taken at once.
         """
         if self.state is ControlState.ONLINE and now - self._opened_at >= STABLE_AFTER_S:
             self._backoff.reset()
@@ -176,9 +187,20 @@ class ControlSession:
             self.stats.reports_dropped += 1
         self._clear_outgoing()
         self.state = ControlState.OFFLINE
-        delay_s = self._backoff.next_delay_s()
+        self._refused = refused
+        delay_s = 0.0 if moved else self._backoff.next_delay_s()
         self._retry_at = now + delay_s
         return delay_s
+
+    def network_changed(self, now: float) -> None:
+        """An attempt may succeed that could not a moment ago: the next one comes soon, though not in step with others.
+
+        Not if the control plane refuses us; nor more often than once in RETRY_LEAST_S, however often networks change.
+        """
+        if self.state is ControlState.OFFLINE and not self._refused:
+            self._backoff.reset()
+            soon = max(now, self._opened_at + RETRY_LEAST_S) + self._backoff.next_delay_s()
+            self._retry_at = min(self._retry_at, soon)
 
     # ── from the control plane ──
 

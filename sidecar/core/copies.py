@@ -39,7 +39,7 @@ class CopyState(enum.Enum):
     ANSWERED = "answered"
     REJECTED = "rejected"
     DEAD = "dead"
-    """Its server's session ended, or it was called off."""
+    """Its server's session ended, or it was called off or taken back."""
 
 
 @dataclass(slots=True)
@@ -51,6 +51,7 @@ class Copy:
     message: OutboundMessage
     state: CopyState = CopyState.PENDING
     certainly_not_run: bool = False
+    """It was refused unrun, or nothing of it left before it was dead."""
     in_time: bool = False
     """It was answered before the deadline."""
     ended_at: float | None = None
@@ -82,6 +83,10 @@ class Request:
     submitted_at: float
     size_class: int = 0
     """Settled when it was submitted (`protos.size_class`)."""
+    size: int = 0
+    """Bytes of the message that a copy of it is, settled when it was submitted."""
+    held: int = field(init=False)
+    """Bytes of its payload, which stay in memory until its last copy has ended."""
     copies: list[Copy] = field(default_factory=list)
     messages: list[OutboundMessage] = field(default_factory=list)
     """What carries those copies that may leave it to each other: siblings."""
@@ -98,8 +103,15 @@ class Request:
     """The application has its answer, not from the network: copies are sent no more, and are awaited until the deadline
     for what they tell of their paths."""
     found_unreachable: bool = False
+    retry_at: float | None = None
+    """When servers that refused it for the moment are asked again (s); None: not at all."""
+    refusal: str = ""
+    """Why the last of them refused it."""
     outcomes_measured: bool = False
     """Which of its copies missed the deadline has been counted."""
+
+    def __post_init__(self) -> None:
+        self.held = len(self.payload or b"")
 
     @property
     def deadline_at(self) -> float:
@@ -130,7 +142,11 @@ class Request:
 
     def certainly_not_run(self) -> bool:
         """Whether no server has run it, nor will."""
-        return all(copy.state is CopyState.REJECTED and copy.certainly_not_run for copy in self.copies)
+        return all(copy.certainly_not_run for copy in self.copies)
+
+    def may_be_sent(self) -> bool:
+        """Whether no copy of it may be answered any more, and another one does no harm."""
+        return not self.done and not self.pending() and (self.rule.idempotent or self.certainly_not_run())
 
     def worth_another_copy(self, servers: tuple[NodeName, ...], *, rejected: bool) -> tuple[NodeName, ...]:
         """Return those of `servers` that have no pending copy and refused none.
@@ -140,7 +156,8 @@ class Request:
         """
         busy = {copy.path.peer for copy in self.relied_on()}
         refused = {copy.path.peer for copy in self.copies if copy.state is CopyState.REJECTED}
-        others = tuple(server for server in servers if server not in busy | refused)
+        asked = busy | refused
+        others = tuple(server for server in servers if server not in asked)
         if others or rejected:
             return others
         hopeless = {copy.path.peer for copy in self.copies if not copy.certainly_not_run}
@@ -159,9 +176,14 @@ class Request:
         return [copy for copy in self.copies if copy.sent_at == self.copies[0].sent_at and not copy.hedges]
 
     def is_race(self) -> bool:
-        """Whether all its copies are to be measured.
+        """Whether all its copies are to be measured."""
+        return is_race(self.id)
 
-        By a hash (the id), so without regard to the outcome, nor in step with anything that the application does
-        every so many requests.
-        """
-        return self.id[-1] % OBSERVED_ONE_IN == 0
+
+def is_race(request_id: RequestId) -> bool:
+    """Whether a request is one of those of which all copies are to be measured.
+
+    By a hash (the id), so without regard to the outcome, nor in step with anything that the application does every so
+    many requests.
+    """
+    return request_id[-1] % OBSERVED_ONE_IN == 0

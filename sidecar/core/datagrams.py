@@ -14,6 +14,7 @@ from sidecar.core.frame import (
     FRAGMENT_OVERHEAD_BYTES,
     FRAGMENT_TYPE,
     HEADER_BYTES,
+    MAX_LEFT_US,
     NONCE_OFFSET,
     REPAIR_TYPE,
     Header,
@@ -134,7 +135,7 @@ class DatagramBuilder:
         """Add what the path may send now; False when the burst got full first. `probing` allows probes."""
         if path.introductions:
             self._answer_introductions(path, burst, now)
-        if probing and path.probe_at is not None and path.probe_at <= now:
+        if probing and path.probe_at <= now:
             self._add_probe(path, burst, now)
         if probing and path.mtu.timer is not None and path.mtu.timer <= now:
             self._add_mtu_probe(path, burst, now)
@@ -170,6 +171,7 @@ class DatagramBuilder:
         """Add a run's datagrams and return their bytes. Control frames that wait go with it or before it."""
         end, sources = run.first + run.symbols, run.message.count
         path.waits_for_answer(now)
+        path.probing.used(now)
         if path.control_at < NEVER:
             control = path.take_control(now)
             size = run.message.datagram_bytes + sum(map(len, control))
@@ -187,6 +189,7 @@ class DatagramBuilder:
         """Build a datagram for each symbol, all but the last equally long, and seal each where it lies."""
         count = len(indices)
         symbol, message_number, total = message.symbol, message.number, message.total
+        left_us = _left_us(path, message, now)
         segment = FRAGMENT_OVERHEAD_BYTES + symbol
         first_number = path.recovery.take_numbers(count)
         sealing = path.sealing
@@ -200,13 +203,15 @@ class DatagramBuilder:
         end = 0
         with memoryview(buffer) as view:
             for number, index in enumerate(indices, first_number):
-                pack(buffer, end, head, session, number, kind, message_number, total, symbol, index)
+                pack(buffer, end, head, session, number, kind, message_number, total, symbol, index, left_us)
                 data = symbol_data(index)
                 start, body = end, end + HEADER_BYTES
                 plain_end = start + FRAGMENT_DATAGRAM_BYTES + len(data)
                 end = plain_end + TAG_BYTES
                 view[start + FRAGMENT_DATAGRAM_BYTES : plain_end] = data
                 seal_into(view[start + NONCE_OFFSET : body], view[body:plain_end], view[start:body], view[body:end])
+        if message.over:
+            return 0  # whoever ended it meanwhile may count on nothing having left; numbers may be left out
         del buffer[end:]
         last = end - segment * (count - 1)
         path.recovery.on_run_sent(first_number, count, now, segment, last, message, indices.start)
@@ -220,8 +225,13 @@ class DatagramBuilder:
         """Build one datagram of control frames and a symbol: a small answer and what its request is owed, say."""
         message, index = run.message, run.first
         number = path.recovery.take_numbers()
-        head = frame.encode_fragment_head(message.number, message.total, message.symbol, index)
-        datagram = self._sealed(path, number, now, *control, head, message.symbol_data(index))
+        left_us = _left_us(path, message, now)
+        head = frame.encode_fragment_head(message.number, message.total, message.symbol, index, left_us)
+        symbol = message.symbol_data(index)
+        if message.over:  # as in `_add_symbols`
+            self._add_control(path, control, burst, now)
+            return 0
+        datagram = self._sealed(path, number, now, *control, head, symbol)
         size = len(datagram)
         path.recovery.on_run_sent(number, 1, now, size, size, message, index, _finished(control))
         self._stats.datagrams["sent", "data" if index < message.count else "repair"] += 1
@@ -252,7 +262,11 @@ class DatagramBuilder:
         probe_id = path.next_probe(now, self._rng)
         probe = frame.encode_probe(frame.Probe(probe_id))
         me = self.identity
-        for address in path.destinations():
+        destinations = path.destinations()
+        if destinations == (path.remote,) and path.state is not PathState.DOWN:
+            self._add_control(path, [*path.take_control(now), probe], burst, now)
+            return
+        for address in destinations:
             number = path.recovery.take_numbers()
             if path.state is PathState.DOWN:
                 header = Header(me.interface_id, path.remote_id, me.session, number)
@@ -266,13 +280,13 @@ class DatagramBuilder:
         introductions, path.introductions = path.introductions, []
         for address, probe_id in introductions:
             reply = frame.encode_probe_reply(frame.ProbeReply(probe_id))
-            probe = frame.encode_probe(frame.Probe(path.counter_probe(now)))
+            probe = frame.encode_probe(frame.Probe(path.probing.ask_back(now)))
             datagram = self._sealed(path, path.recovery.take_numbers(), now, reply, probe)
             self._add_alone(path, address, datagram, burst)
 
     def _add_mtu_probe(self, path: Path, burst: Burst, now: float) -> None:
         """Add a padded probe. Nobody waits for its acknowledgement, and its loss says nothing of the rest."""
-        probe_id = path.take_probe_id()
+        probe_id = path.probing.take_id()
         size = path.mtu.next_probe(probe_id, now, MTU_PROBE_TIMEOUTS * path.recovery.rtt.probe_timeout(0.0))
         if size is None or path.remote is None:
             return
@@ -295,6 +309,13 @@ class DatagramBuilder:
         sealed = bytearray(len(plain) + TAG_BYTES)
         sealing.encrypt_into(clear[NONCE_OFFSET:], plain, clear, sealed)
         return clear + sealed
+
+
+def _left_us(path: Path, message: OutboundMessage, now: float) -> int:
+    """How long the message will be of use when what is sent now arrives. One way is taken for half a round trip: where
+    that is too much, the way back is longer than that, and its answer would come no sooner."""
+    left_s = message.expires - now - path.recovery.rtt.smoothed / 2
+    return min(max(0, int(left_s * 1e6)), MAX_LEFT_US) if left_s < NEVER else MAX_LEFT_US
 
 
 def _fill(control: list[bytes]) -> list[bytes]:

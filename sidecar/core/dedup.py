@@ -2,7 +2,8 @@
 
 A request is running (copies wait for its result), answered (copies get the cached answer) or forgotten: its id is
 kept as a tombstone after the answer had to go, so that a very late copy is refused and not run again. An id is let go
-only when no copy can come any more: its sender gives a request up when its lifetime is over.
+only when no copy can come any more: its sender gives a request up when its lifetime is over. Of a request that was
+refused unrun the copies are remembered, not the id (`refused_copies.py`): another copy may run.
 
 A robot that has its answer calls a request off. It does not run then if the local server has not got it yet; nobody
 is answered any more, and copies that still come are ignored.
@@ -25,6 +26,7 @@ from sidecar.core.events import (
     RequestId,
 )
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
+from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.rules import MAX_LIFETIME_S
 from sidecar.core.shares import Shares
 
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from protos.model import NodeName, ServiceName
+    from sidecar.core.backlog import Backlog
     from sidecar.core.messages import RequestMessage
     from sidecar.core.path_id import PathId
     from sidecar.core.priority import Priority
@@ -125,6 +128,7 @@ class ExecutionTable:
         self._timers: list[tuple[float, ExecutionId]] = []
         self._next_id = 0
         self._early_cancels = EarlyCancels(stats)
+        self._refused = RefusedCopies(stats)
 
     @property
     def running(self) -> int:
@@ -143,6 +147,8 @@ class ExecutionTable:
         self, path: PathId, message: RequestMessage, now: float, *, patience_s: float = MAX_LIFETIME_S
     ) -> ExecuteRequest | Reply | None:
         """Take one copy: run the request, answer from the cache, refuse, or (None) let it wait for the result.
+
+        What comes first when its lifetime is over is neither run nor answered: its robot has given it up.
 
         The local server is waited for as long as the robot waits, but at most `patience_s`.
         """
@@ -167,10 +173,16 @@ class ExecutionTable:
                 return None
             count[message.service, "cached"] += 1
             return self._reply(execution, waiter, now + lifetime)
+        if lifetime <= 0:
+            self._stats.dropped["request_expired"] += 1
+            return None
         self._forget_old(now)
         if self._early_cancels.holds(path.peer, message.request_id, now):
             count[message.service, "cancelled"] += 1
             return None
+        refused = self._refused.why(RefusedCopy(path.peer, message.request_id, message.copy), now)
+        if refused is not None:
+            return self.refuse_unseen(waiter, message, *refused, now)
         size = len(message.payload)
         if not (
             self._running_shares.fits(path.peer)
@@ -219,7 +231,7 @@ class ExecutionTable:
     def refuse_unseen(
         self, waiter: Waiter, message: RequestMessage, reason: RejectReason, text: str, now: float
     ) -> Reply:
-        """Refuse a copy without remembering it: the request has not run, and may run later."""
+        """Refuse a copy: the request has not run here, and another copy of it may run later."""
         # These not by name, which is whatever a peer wrote: it would make as many counters as it likes.
         if reason is RejectReason.NOT_OFFERED:
             self._stats.dropped["request_for_unknown_service"] += 1
@@ -229,6 +241,7 @@ class ExecutionTable:
             self._stats.executions[message.service, "refused"] += 1
         rejection = RejectionMessage(message.request_id, message.copy, reason, text)
         expires = now + min(message.lifetime_left_s, MAX_LIFETIME_S)
+        self._remember_refused(waiter, message.request_id, reason, text, expires, now)
         return Reply(waiter, message.service, rejection, message.priority, now + message.deadline_left_s, expires)
 
     def complete(self, execution_id: ExecutionId, payload: bytes, processing_s: float, now: float) -> list[Reply]:
@@ -254,16 +267,32 @@ class ExecutionTable:
             return []
         if execution.cancelled or not reason.certainly_not_run:
             self._remember(execution, now)
+        else:
+            for waiter in execution.waiters:
+                self._remember_refused(waiter, execution.request_id, reason, text, execution.expires, now)
         result = "cancelled" if reason is RejectReason.CANCELLED else "refused"
         self._stats.executions[execution.service, result] += 1
         execution.refusal = (reason, text)
         return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
+
+    def _remember_refused(
+        self, waiter: Waiter, request_id: RequestId, reason: RejectReason, text: str, expires: float, now: float
+    ) -> None:
+        copy = RefusedCopy(waiter.path.peer, request_id, waiter.copy)
+        self._refused.add(copy, reason, text, max(expires, now + MIN_REMEMBER_S), now)
 
     def cancel(self, robot: NodeName, request_id: RequestId, now: float) -> CancelExecution | None:
         """The robot wants no further answer; returns what to tell the application, if anything."""
         execution = self._by_request.get(request_id) or self._finished.get(request_id)
         if execution is None:
             self._early_cancels.add(robot, request_id, now)
+            return None
+        return self.call_off(robot, request_id)
+
+    def call_off(self, robot: NodeName, request_id: RequestId) -> CancelExecution | None:
+        """Answer this request no more; returns what to tell the application, if anything."""
+        execution = self._by_request.get(request_id) or self._finished.get(request_id)
+        if execution is None:
             return None
         if execution.robot != robot:
             self._stats.dropped["request_id_mismatch"] += 1
@@ -273,12 +302,9 @@ class ExecutionTable:
         self._cancel(execution)
         return CancelExecution(execution.id) if execution.id in self._running else None
 
-    def cancel_all(self, robot: NodeName) -> list[CancelExecution]:
-        """The robot's session is over, and nobody waits for its answers; returns what to tell the application."""
-        running = [one for one in self._running.values() if one.robot == robot and not one.cancelled]
-        for execution in running:
-            self._cancel(execution)
-        return [CancelExecution(execution.id) for execution in running]
+    def of_robot(self, robot: NodeName) -> list[RequestId]:
+        """Return the robot's requests that are being worked on for somebody."""
+        return [one.request_id for one in self._running.values() if one.robot == robot and not one.cancelled]
 
     def _cancel(self, execution: _Execution) -> None:
         execution.cancelled = True
@@ -292,7 +318,7 @@ class ExecutionTable:
             heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
-    def handle_timer(self, now: float) -> tuple[list[AbandonExecution], list[Reply]]:
+    def handle_timer(self, now: float, backlog: Backlog) -> tuple[list[AbandonExecution], list[Reply]]:
         """Give up executions that took too long; they may have run, so their ids stay.
 
         Returns them, and what those robots are told that still wait. Also forgets what no copy can ask for any more,
@@ -301,7 +327,7 @@ class ExecutionTable:
         self._forget_old(now)
         abandoned = []
         replies = []
-        while self._timers and self._timers[0][0] <= now:
+        while self._timers and self._timers[0][0] <= now and backlog.allows(now):
             _, execution_id = heapq.heappop(self._timers)
             execution = self._running.get(execution_id)
             if execution is None:

@@ -23,11 +23,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import NodeName
+    from sidecar.core.messages import Encoded
     from sidecar.core.path_id import PathId
     from sidecar.core.request_parts import RequestParts
 
 MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""
+MAX_ASKED = 16
+"""As MAX_COPIES, while it is certain that no server ran any of them, and each was given its time to become ready."""
 
 
 class _Why(enum.Enum):
@@ -53,15 +56,23 @@ class Dispatching:
         self._adaptive = Adaptive(parts.routes, self._paces)
         self._budgets = Budgets(parts.budgets, parts.stats)
 
-    def with_room(self, servers: tuple[NodeName, ...], size: int) -> list[NodeName]:
-        """Those of the servers to which a request of `size` bytes may be sent now."""
+    def with_room(self, servers: Iterable[NodeName], request: Request) -> list[NodeName]:
+        """Those of the servers to which the request may be sent now."""
         has_room = self._parts.outbox.has_room
-        return [server for server in servers if has_room(server, size)]
+        return [server for server in servers if has_room(server, request.size)]
 
-    def start(self, request: Request, now: float) -> float | None:
-        """Send the first copies; returns when `look_again` is wanted, if at all."""
+    def candidates(self, request: Request, *, rejected: bool = False) -> tuple[NodeName, ...]:
+        """The servers that may be sent a copy of a request, another one if it has copies; `rejected` as in `rescue`."""
+        servers = self._parts.offers.servers(request.service)
+        if not request.copies:
+            return servers
+        if not request.rule.idempotent and not request.certainly_not_run():
+            return ()
+        return request.worth_another_copy(servers, rejected=rejected)
+
+    def start(self, request: Request, servers: list[NodeName], now: float) -> float | None:
+        """Send the first copies to some of these servers; returns when `look_again` is wanted, if at all."""
         rule = request.rule
-        servers = self.with_room(self._parts.offers.servers(request.service), len(request.payload or b""))
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
         if rule.redundancy is RedundancyMode.REPLICATE:
             paths = self._best_first(request, chosen, now) if self._budgets else chosen
@@ -166,6 +177,8 @@ class Dispatching:
         waiting = request.relied_on()
         if request.answered_here or (waiting and not request.rule.redundancy.helps):
             return
+        if rejected and len(request.copies) >= MAX_COPIES:
+            return  # its retry asks on, without haste
         alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
         if alive and not insist and request.rule.redundancy is RedundancyMode.ADAPTIVE:
             self._adapt(request, now)
@@ -173,6 +186,8 @@ class Dispatching:
         if not insist and any(routes.state(copy.path) is PathState.UP for copy in waiting):
             return
         path = self._next_withheld(request) or self._elsewhere(request, rejected=rejected)
+        if path is None:
+            path = self._take_back(request, waiting, now)
         if path is None:
             return
         if any(copy.path.interface == path.interface and self._is_on_its_way(copy) for copy in waiting):
@@ -195,15 +210,43 @@ class Dispatching:
         for path in request.withheld:
             if self._parts.routes.state(path) is not PathState.UP or path.peer in refused:
                 continue
+            if not self._parts.outbox.has_room(path.peer, request.size):
+                continue
             if request.rule.idempotent or path.peer in waiting:
                 return path
         return None
 
     def _elsewhere(self, request: Request, *, rejected: bool) -> PathId | None:
-        if not request.rule.idempotent and not request.certainly_not_run():
+        return self._parts.mapping.rescue(self.with_room(self.candidates(request, rejected=rejected), request))
+
+    def _take_back(self, request: Request, waiting: list[Copy], now: float) -> PathId | None:
+        """Free a request that is not idempotent from a server that nothing leads to, if nothing has left for it.
+
+        Returns where it can go instead; without such a path it stays where it is.
+        """
+        routes, outbox = self._parts.routes, self._parts.outbox
+        if request.rule.idempotent or not waiting or len(request.pending()) > len(waiting):
             return None
-        servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=rejected)
-        return self._parts.mapping.rescue(self.with_room(servers, len(request.payload or b"")))
+        if any(routes.reaches(copy.path.peer) or copy.message.may_have_left for copy in waiting):
+            return None
+        servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=False)
+        path = self._parts.mapping.rescue(self.with_room(servers, request))
+        if path is None:
+            return None
+        for copy in waiting:
+            outbox.drop(copy.message)
+        if any(copy.message.may_have_left for copy in waiting):
+            return None  # its link was faster
+        for copy in waiting:
+            self.never_left(request, copy, now)
+        return path
+
+    def never_left(self, request: Request, copy: Copy, now: float) -> None:
+        """A copy is over before anything of it left: it has not run, and says nothing of its path or server."""
+        copy.state, copy.ended_at, copy.certainly_not_run = CopyState.DEAD, now, True
+        copy.message.newest.stand_down()
+        if request.observed and not copy.hedges:
+            self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
 
     def answered(self, request: Request, copy: Copy, processing_s: float, now: float) -> None:
         """A copy was answered. After the deadline it had to wait for what is fresh, so its pace means nothing."""
@@ -217,21 +260,26 @@ class Dispatching:
             paths = (*request.withheld, *(copy.path for copy in request.copies))
             self._budgets.earn(request.copies[0].message.total, {path.interface for path in paths})
 
+    def encode(self, request: Request, payload: bytes, now: float) -> Encoded:
+        """Return the next copy as a message; all copies are equally long."""
+        return encode_message(
+            RequestMessage(
+                request.id,
+                len(request.copies),
+                request.rule.priority,
+                request.deadline_at - now,
+                request.expires_at - now,
+                request.service,
+                request.type,
+                payload,
+            )
+        )
+
     def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
-        if request.payload is None or len(request.copies) >= MAX_COPIES:
+        if request.payload is None or len(request.copies) >= _most_copies(request):
             return False
         rule, stats = request.rule, self._parts.stats
-        head = RequestMessage(
-            request.id,
-            len(request.copies),
-            rule.priority,
-            request.deadline_at - now,
-            request.expires_at - now,
-            request.service,
-            request.type,
-            request.payload,
-        )
-        content = encode_message(head)
+        content = self.encode(request, request.payload, now)
         extra = bool(request.relied_on())
         if extra and not self._budgets.allows(path.interface, request.service, content.size, now):
             return False
@@ -242,12 +290,15 @@ class Dispatching:
             fec=rule.fec,
             deadline=request.deadline_at,
             expires=request.expires_at,
+            copy_of=request.id,
             siblings=request.messages if why in _PLANNED and not request.is_race() else None,
         )
         if message is None:
             return False
         explores = why is _Why.EXPLORATION
-        request.copies.append(Copy(path, now, message, explores=explores, hedges=why is _Why.HEDGE))
+        copy = Copy(path, now, message, explores=explores, hedges=why is _Why.HEDGE)
+        request.copies.append(copy)
+        self._parts.in_flight.add_copy(request, copy)
         request.withheld = tuple(other for other in request.withheld if other != path)
         if extra:
             self._budgets.spend(path.interface, content.size)
@@ -257,3 +308,8 @@ class Dispatching:
         elif why is _Why.HEDGE:
             stats.hedged[path.interface, path.peer, request.service] += 1
         return True
+
+
+def _most_copies(request: Request) -> int:
+    patient = request.retry_at is None and request.certainly_not_run()
+    return MAX_ASKED if patient else MAX_COPIES

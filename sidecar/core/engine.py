@@ -7,20 +7,24 @@ application). Nothing here builds, seals or parses a datagram.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
+from sidecar.core.attention import Attention
+from sidecar.core.backlog import SLICE, Backlog, Step
 from sidecar.core.events import (
     ApplicationEvent,
     ExecutionId,
+    OfferService,
     RejectReason,
-    RequestFailed,
     RequestId,
     WithdrawService,
 )
 from sidecar.core.inbound import Decoding, Inbound
 from sidecar.core.link_events import (
+    Attend,
     FinishedLost,
     FragmentsLost,
     FragmentsReceived,
@@ -49,12 +53,12 @@ from sidecar.core.peers import Peers
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
-from sidecar.core.rules import ServiceRule, find_rule
+from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from protos.model import InterfaceName, NodeName, Peer, ServiceMapping, ServiceName, ServiceOffer, SessionId
     from sidecar.core.budgets import Budget
@@ -79,21 +83,24 @@ class Engine:
 
     def __init__(self, config: EngineConfig, own: OwnSession, now: float) -> None:
         self._config = config
+        self._rules = Rules(config.rules)
+        self._backlog = Backlog()
         self.stats = EngineStats()
         self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
         self._events: list[ApplicationEvent] = []
         self._interfaces: set[InterfaceName] = set()
         self._carried: Mapping[ServiceName, bool | None] = {}
         self._sweep_at = now + SWEEP_EVERY_S
+        self._attention = Attention(now)
         self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
         self.peers = Peers(own, self.stats.dropped)
         self.routes = Routes()
         self.mapping = MappingTable(self.routes)
-        self._offers = Offers(config.rules)
+        self._offers = Offers(self._rules)
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
         self._measurements = Measurements(self.stats.dropped)
         self._serving = Serving(
-            ServingParts(config.rules, self.routes, self._outbox, self.stats, self._events.append, self.peers.may_call)
+            ServingParts(self._rules, self.routes, self._outbox, self.stats, self._events.append, self.peers.may_call)
         )
         self._requests = RequestTable(
             RequestParts(
@@ -106,6 +113,7 @@ class Engine:
                 self._events.append,
                 self._seek,
                 config.budgets,
+                self._backlog,
             )
         )
 
@@ -136,30 +144,31 @@ class Engine:
 
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes, now: float) -> None:
         """Robot: send a serialised request."""
-        rule = find_rule(self._config.rules, service)
+        rule = self._rules.find(service)
         kind = self._offers.offered.get(service)
         if rule is None or kind is None:
-            self.stats.requests[service, "rejected"] += 1
-            why = "no server offers this service any more"
-            self._events.append(RequestFailed(request_id, service, "rejected", why, 0.0))
+            self._requests.reject(request_id, service, "no server offers this service any more")
             return
+        servers = frozenset(self._offers.servers(service))
+        if self._attention.needs(servers, now):
+            self._commands.append((None, Attend(servers)))
         self._requests.submit(request_id, service, kind, rule, payload, now)
-        self.stats.in_flight = self._requests.unanswered
+        self._count_in_flight()
 
     def answered_here(self, request_id: RequestId, now: float) -> None:
         """Robot: the application has its answer, not from the network."""
         self._requests.answered_here(request_id, now)
-        self.stats.in_flight = self._requests.unanswered
+        self._count_in_flight()
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:
         """Cloud: the local server answered."""
         self._serving.complete(execution, payload, processing_s, now)
-        self.stats.in_flight = self._serving.running
+        self._count_in_flight()
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str, now: float) -> None:
         """Cloud: the request was not or will not be answered."""
         self._serving.refuse(execution, reason, detail, now)
-        self.stats.in_flight = self._serving.running
+        self._count_in_flight()
 
     def set_offers(self, offers: Iterable[ServiceOffer]) -> None:
         """Cloud: the services that local servers offer right now."""
@@ -197,11 +206,12 @@ class Engine:
         self._interfaces = new
         for interface in gone:
             paths = self.routes.forget_interface(interface)
-            self._outbox.on_interface_gone(interface, now)
+            self._backlog.add_steps(self._outbox.on_interface_gone(interface), now)
             for path in paths:
                 self._requests.on_path_changed(path, PathState.DOWN, now)
-                if not self.routes.reaches(path.peer):
-                    self._drop_if_unlisted(path.peer, now)
+            for peer in {path.peer for path in paths}:
+                if not self.routes.reaches(peer):
+                    self._drop_if_unlisted(peer, now)
         self._update_offers(now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
 
@@ -214,22 +224,41 @@ class Engine:
             self.stats.nacks += 1
             return error
         self.stats.peers_version = self.peers.version
-        self._offers.set_peers(self.peers.all())
-        for name, session in before.items():
-            if self.peers.session(name) != session:
-                over = name in self.peers or name in left or name in self.peers.refused
-                self._end_session(name, now, may_return=not over)
         self._commands.append((None, SetPeers(self.peers.for_links())))
-        self._update_offers(now)
+        self._follow_offers(now)
+        ended = [name for name, session in before.items() if self.peers.session(name) != session]
+        for name in ended:
+            over = name in self.peers or name in left or name in self.peers.refused
+            self._forget_session(name, now, may_return=not over)
+        self._follow_gone(ended, now)
         return None
+
+    def _follow_offers(self, now: float) -> None:
+        """Other peers than before are known, or they may offer other services."""
+        if self._config.role is Role.ROBOT:
+            self._backlog.add(self._take_offers, now, "offers")
+
+    def _take_offers(self) -> Iterator[Step]:
+        for name in (*self.peers.names(), *self._offers.others(self.peers)):
+            yield partial(self._take_offers_of, name)
+            yield from _REST  # a peer may offer hundreds of services
+        yield self._update_offers
+
+    def _take_offers_of(self, name: NodeName, _now: float) -> None:
+        peer = self.peers.get(name)
+        if peer is not None:
+            self._offers.set_peer(peer)
+        else:
+            self._offers.forget_peer(name)
 
     def recheck_peers(self, judged: Iterable[Peer], now: float) -> list[NodeName]:
         """Judgements changed: sessions of those bad now end; returns the refused taken, as they are `judged` good."""
         gone, taken = self.peers.recheck(), self.peers.readmit(judged)
-        self._offers.set_peers(self.peers.all())
-        for name in gone:
-            self._end_session(name, now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
+        self._follow_offers(now)
+        for name in gone:
+            self._forget_session(name, now)
+        self._follow_gone(gone, now)
         return taken
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
@@ -262,11 +291,11 @@ class Engine:
         match event:
             case FragmentsReceived(path, session, fragments):
                 if self._is_current(path, session):
-                    for content in self._inbound.add(path, session, fragments, now):
-                        self._on_message(path, content, now)
-            case MessageDecoded(path, session, content):
+                    for content, ends_at in self._inbound.add(path, session, fragments, now):
+                        self._on_message(path, content, ends_at, now)
+            case MessageDecoded(path, session, content, ends_at):
                 if self._is_current(path, session):
-                    self._on_message(path, content, now)
+                    self._on_message(path, content, ends_at, now)
             case MessageAbandoned(peer, session, number):
                 if self.peers.session(peer) == session:
                     self._inbound.abandon(peer, number)
@@ -274,7 +303,6 @@ class Engine:
                 self._outbox.on_forgotten(peer, number)
             case MessageFinished(peer, number):
                 self._outbox.on_finished(peer, number)
-                self._requests.on_room(now)
             case FinishedLost(path, numbers) if path.peer in self.peers:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
             case FragmentsLost():
@@ -298,7 +326,17 @@ class Engine:
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
                     self._on_peer_closed(peer, now)
+        if self._outbox.take_made_room():
+            self._use_room(now)
+        self._count_in_flight()
+
+    def _count_in_flight(self) -> None:
         self.stats.in_flight = self._requests.unanswered + self._serving.running
+
+    def _use_room(self, now: float) -> None:
+        """Less is under way than before."""
+        self._requests.on_room(now)
+        self._serving.on_room(now)
 
     def _is_current(self, path: PathId, session: SessionId) -> bool:
         if self.peers.session(path.peer) == session:
@@ -306,7 +344,7 @@ class Engine:
         self.stats.dropped["fragment_of_old_session"] += 1
         return False
 
-    def _on_message(self, path: PathId, content: memoryview, now: float) -> None:
+    def _on_message(self, path: PathId, content: memoryview, ends_at: float, now: float) -> None:
         try:
             message = decode_message(content)
         except DecodeError:
@@ -317,7 +355,7 @@ class Engine:
             if robot:
                 self.stats.dropped["request_to_a_robot"] += 1
             else:
-                self._serving.on_request(path, message, now)
+                self._serving.on_request(path, message.when_left(ends_at - now), now)
         elif isinstance(message, CancelMessage):
             if robot:
                 self.stats.dropped["cancel_to_a_robot"] += 1
@@ -334,13 +372,17 @@ class Engine:
         path, state = event.path, event.state
         if not self._knows(path) or self.routes.state(path) is state:
             return
+        reached = self.routes.reaches(path.peer)
         self.routes.set_state(path, state)
         if state is PathState.UP:
-            self._outbox.on_path_up(path)
+            self._backlog.add_steps(self._outbox.on_path_up(path), now)
             self._inbound.on_path_up(path)
+            if self._requests.unanswered:  # they wait: the other paths may be back as well, and share them
+                self._seek(frozenset((path.peer,)))
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
             self._drop_if_unlisted(path.peer, now)
-        self._update_offers(now)
+        if self.routes.reaches(path.peer) is not reached:
+            self._update_offers(now)
         self._requests.on_path_changed(path, state, now)
 
     def _knows(self, path: PathId) -> bool:
@@ -349,7 +391,7 @@ class Engine:
     def _drop_if_unlisted(self, name: NodeName, now: float) -> None:
         """The last path to a peer died, and it may have been kept for its paths only."""
         if self.peers.drop_if_unlisted(name):
-            self._offers.set_peers(self.peers.all())
+            self._follow_offers(now)
             self._end_session(name, now, may_return=True)
             self._commands.append((None, SetPeers(self.peers.for_links())))
 
@@ -357,48 +399,85 @@ class Engine:
         """It said goodbye: nothing new goes there; the control plane will say the same."""
         for route in self.routes.all_to(name):
             self.routes.set_state(route.id, PathState.DOWN)
-        self._outbox.drop_peer(name)
-        self._serving.on_session_over(name)
+        self._backlog.add_steps(
+            [
+                *self._outbox.drop_peer(name),
+                *self._serving.on_session_over(name),
+                *self._serving.on_robot_gone(name),
+            ],
+            now,
+        )
         self._update_offers(now)
         self._requests.on_peer_gone(name, now)
         self._drop_if_unlisted(name, now)
 
     def _end_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
+        self._forget_session(name, now, may_return=may_return)
+        self._follow_gone((name,), now)
+
+    def _forget_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
         """`may_return`: it was only silent for long, and may be back with the same session, for its answers."""
-        if not may_return:
-            self._serving.on_session_over(name)
+        called_off = [] if may_return else self._serving.on_session_over(name)
+        let_go = [*self._outbox.drop_peer(name), *self._serving.on_robot_gone(name)]
+        self._backlog.add_steps(called_off + let_go, now)
         self._inbound.forget_peer(name)
-        self._outbox.drop_peer(name)
         self.routes.forget_peer(name)
-        self._update_offers(now)
-        self._requests.on_peer_gone(name, now)
+
+    def _follow_gone(self, names: Collection[NodeName], now: float) -> None:
+        if names:
+            self._update_offers(now)
+        for name in names:
+            self._requests.on_peer_gone(name, now)
 
     def _update_offers(self, now: float) -> None:
         if self._config.role is Role.ROBOT:
             for event in self._offers.update(self.routes, now):
+                steps: list[Step] = []
                 if isinstance(event, WithdrawService):
-                    self._requests.on_withdrawn(event.name, event.reason, now)
-                self._events.append(event)
+                    steps += self._requests.withdraw(event.name, event.reason)
+                steps.append(partial(self._tell, event))  # what waits at a service ends before the service does
+                self._backlog.add(steps.copy, now)
             gained = self._offers.take_gained()
             if gained:
                 self._requests.on_servers_gained(gained, now)
+
+    def _tell(self, event: OfferService | WithdrawService, _now: float) -> None:
+        self._events.append(event)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
     def next_timer(self) -> float:
         """When `handle_timer` is wanted next."""
-        timers = (self._requests.next_timer(), self._serving.next_timer(), self._offers.next_timer())
+        timers = (
+            self._backlog.next_timer(),
+            self._requests.next_timer(),
+            self._serving.next_timer(),
+            self._offers.next_timer(),
+        )
         return min((self._sweep_at, *(timer for timer in timers if timer is not None)))
 
     def handle_timer(self, now: float) -> None:
-        """Do what is due by now."""
+        """Do what is due by now, or as much of it as one turn has room for."""
+        self._backlog.begin_turn(now)
+        self._backlog.run(now, leave=SLICE // 2)  # deadlines must not wait until all is done
         self._requests.handle_timer(now)
-        self._serving.handle_timer(now)
+        self._serving.handle_timer(now, self._backlog)
+        self._backlog.run(now)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
-            self._outbox.expire(now)
-            self._requests.on_room(now)
+            self._backlog.add_steps(self._outbox.expired(now), now)
+            self._outbox.ask_again()
             self._inbound.expire(now)
         dark_until = self._offers.next_timer()
         if dark_until is not None and dark_until <= now:
             self._update_offers(now)
+        if self._outbox.take_made_room():
+            self._use_room(now)
+        self._count_in_flight()
+
+
+def _rest(_now: float) -> None:
+    """Takes a step's time from the turn."""
+
+
+_REST: tuple[Step, ...] = (_rest,) * 5

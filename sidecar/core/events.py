@@ -46,6 +46,11 @@ class RejectReason(enum.IntEnum):
         """True when another server may run the request without breaking at-most-once for it."""
         return self not in (RejectReason.SERVER_LOST, RejectReason.FORGOTTEN, RejectReason.TOO_LARGE)
 
+    @property
+    def may_pass(self) -> bool:
+        """True when the same server may run the request in a moment, or another one that takes its place."""
+        return self in (RejectReason.NOT_OFFERED, RejectReason.DRAINING)
+
 
 @dataclass(frozen=True, slots=True)
 class OfferService:

@@ -11,6 +11,7 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core.partial import Partial
+from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -46,6 +47,8 @@ class Reassembled(NamedTuple):
     fate: Fate
     content: memoryview | Partial | None
     """The message, when it was finished just now; a Partial still has to be decoded."""
+    ends_at: float = NEVER
+    """When what was finished just now is of no use any more."""
 
 
 class Reassembler:
@@ -79,12 +82,12 @@ class Reassembler:
         partials = self._partials
         current: int | None = None
         partial: Partial | None = None
-        for number, total, symbol, index, data in fragments:
+        for number, total, symbol, index, data, left_us in fragments:
             if number != current or partial is None:
                 current = number
                 partial = partials.get(number)
                 if partial is None:
-                    partial = self._meet(number, total, symbol, data, now, out)
+                    partial = self._meet(number, total, symbol, data, now, left_us, out)
                     if partial is None:
                         continue
                 else:
@@ -93,6 +96,9 @@ class Reassembler:
             if total != partial.total or symbol != partial.symbol:
                 self._dropped["fragment_mismatch"] += 1
                 continue
+            ends_at = now + left_us * 1e-6
+            if ends_at < partial.ends_at:
+                partial.ends_at = ends_at
             if index < partial.count:
                 have = partial.have
                 if have[index]:
@@ -115,7 +121,14 @@ class Reassembler:
         return list(out.values())
 
     def _meet(
-        self, number: int, total: int, symbol: int, data: memoryview, now: float, out: dict[int, Reassembled]
+        self,
+        number: int,
+        total: int,
+        symbol: int,
+        data: memoryview,
+        now: float,
+        left_us: int,
+        out: dict[int, Reassembled],
     ) -> Partial | None:
         """A symbol of a message that is not being put together; returns the Partial to store it in, if any."""
         fate = self._over.get(number)
@@ -127,7 +140,8 @@ class Reassembler:
             # Of a lone symbol, the repair symbol is its padded copy.
             self._remember(number, Fate.FINISHED)
             # A copy: the datagram's buffer is used again.
-            out[number] = Reassembled(number, Fate.FINISHED, memoryview(bytes(data[:total])))
+            whole, ends_at = memoryview(bytes(data[:total])), now + left_us * 1e-6
+            out[number] = Reassembled(number, Fate.FINISHED, whole, ends_at)
             return None
         self._make_room(total, messages=1)
         partial = self._partials[number] = Partial(number, total, symbol, now)
@@ -147,7 +161,7 @@ class Reassembler:
     def _finish(self, partial: Partial, content: memoryview | Partial) -> Reassembled:
         self._remove(partial)
         self._remember(partial.number, Fate.FINISHED)
-        return Reassembled(partial.number, Fate.FINISHED, content)
+        return Reassembled(partial.number, Fate.FINISHED, content, partial.ends_at)
 
     def _make_room(self, size: int, messages: int) -> None:
         partials = self._partials

@@ -18,7 +18,7 @@ Datagram::
 
 The first 20 bytes stay in clear; they are the associated data, and the last 12 of them the nonce. Flags: bit 0 says
 sealed and is always 1, bit 1 is the phase of the keys (path_keys.py), bit 2 says introduction (introduction.py: another
-key, and no frames); the others are 0. The first byte tells our datagrams (0xD2) from STUN's (0x00 to 0x3F, RFC 8489
+key, and no frames); the others are 0. The first byte tells our datagrams (0xD3) from STUN's (0x00 to 0x3F, RFC 8489
 section 5) on the same socket.
 
 Frames, each a type byte and then::
@@ -27,8 +27,8 @@ Frames, each a type byte and then::
     PROBE        1  id (32)                                  is answered at once
     PROBE_REPLY  2  id (32)
     ACK          3  largest (64) delay in us (32) n (8), n times: length - 1 of a range (16), gap - 1 below it (16)
-    FRAGMENT     4  message (64) total size (32) symbol size (16) index (16), then the symbol: its length follows
-                    from the other fields
+    FRAGMENT     4  message (64) total size (32) symbol size (16) index (16) left in us (32), then the symbol: its
+                    length follows from the other fields
     REPAIR       5  as FRAGMENT, of a repair symbol (fec.py): the index counts on after the source symbols
     FINISHED     6  message (64)                             the receiver has all of it
     ABANDON      7  message (64)                             the sender will not send the rest
@@ -36,8 +36,10 @@ Frames, each a type byte and then::
     FORGOTTEN   10  message (64)                             the receiver dropped what it had of it: send it anew
 
 A message of `total size` bytes is cut into symbols of `symbol size` bytes, the last one shorter; `index` counts them.
+`left` is how long the message is still of use when the datagram arrives, as far as its sender can tell: written when
+the datagram is built, so that it is true for each copy and each retransmission, while the symbol's bytes never change.
 Only FRAGMENT, REPAIR and FINISHED are ack-eliciting (RFC 9002 section 2): a PROBE is answered by its reply, the rest
-is not waited for.
+is not waited for. A datagram holds one ACK at most: each is work, and the newest says what all before it did.
 """
 
 from __future__ import annotations
@@ -84,8 +86,8 @@ _U32 = struct.Struct(">I")
 _U64 = struct.Struct(">Q")
 _ACK_HEAD = struct.Struct(">QIB")
 _ACK_RANGE = struct.Struct(">HH")
-_FRAGMENT_HEAD = struct.Struct(">QIHH")
-FRAGMENT_HEAD = struct.Struct(">BQIHH")
+_FRAGMENT_HEAD = struct.Struct(">QIHHI")
+FRAGMENT_HEAD = struct.Struct(">BQIHHI")
 """What stands before the symbol in a FRAGMENT or REPAIR, its type byte included."""
 FRAGMENT_HEAD_BYTES = FRAGMENT_HEAD.size
 
@@ -94,10 +96,12 @@ FRAGMENT_OVERHEAD_BYTES = HEADER_BYTES + FRAGMENT_HEAD_BYTES + TAG_BYTES
 BASE_SYMBOL_BYTES = pmtu.BASE_BYTES - FRAGMENT_OVERHEAD_BYTES
 """Symbol that every path carries."""
 MAX_SYMBOL_BYTES = MAX_DATAGRAM_BYTES - FRAGMENT_OVERHEAD_BYTES
-FRAGMENT_DATAGRAM = struct.Struct(">IQQBQIHH")
+FRAGMENT_DATAGRAM = struct.Struct(">IQQBQIHHI")
 """What goes before the symbol in a datagram that holds nothing but a FRAGMENT or REPAIR: the header, its first four
 bytes as one number, and the frame's head."""
 FRAGMENT_DATAGRAM_BYTES = FRAGMENT_DATAGRAM.size
+MAX_LEFT_US = 0xFFFFFFFF
+"""71 minutes: more than anything is of use for."""
 MIN_SYMBOL_BYTES = 256
 """Smaller symbols would let a peer make us count millions of fragments for one message."""
 
@@ -139,6 +143,8 @@ class Fragment(NamedTuple):
     symbol: int
     symbol_index: int
     data: memoryview
+    left_us: int = MAX_LEFT_US
+    """How long the message was still of use when this left its sender, less half a round trip."""
 
 
 class Finished(NamedTuple):
@@ -241,10 +247,10 @@ def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
     return b"\x03" + _ACK_HEAD.pack(largest, delay_us, count) + bytes(body)
 
 
-def encode_fragment_head(message: int, total: int, symbol: int, index: int) -> bytes:
+def encode_fragment_head(message: int, total: int, symbol: int, index: int, left_us: int = MAX_LEFT_US) -> bytes:
     """Return the bytes that go before the symbol itself."""
     kind = FRAGMENT_TYPE if index * symbol < total or not index else REPAIR_TYPE
-    return FRAGMENT_HEAD.pack(kind, message, total, symbol, index)
+    return FRAGMENT_HEAD.pack(kind, message, total, symbol, index, left_us)
 
 
 def encode_finished(frame: Finished) -> bytes:
@@ -287,6 +293,7 @@ def decode_frames(view: memoryview) -> list[Frame]:
     frames: list[Frame] = []
     position = 0
     end = len(view)
+    acknowledged = False
     try:
         while position < end:
             kind = view[position]
@@ -297,6 +304,9 @@ def decode_frames(view: memoryview) -> list[Frame]:
                 fragment, position = _decode_fragment(kind, view, position)
                 frames.append(fragment)
             elif kind == _ACK:
+                if acknowledged:
+                    raise DecodeError("more than one acknowledgement")
+                acknowledged = True
                 ack, position = _decode_ack(view, position)
                 frames.append(ack)
             elif kind in _ABOUT_A_MESSAGE:
@@ -339,7 +349,7 @@ def is_repair_index(index: int, total: int, symbol: int) -> bool:
 
 
 def _decode_fragment(kind: int, view: memoryview, position: int) -> tuple[Fragment, int]:
-    message, total, symbol, index = _FRAGMENT_HEAD.unpack_from(view, position)
+    message, total, symbol, index, left_us = _FRAGMENT_HEAD.unpack_from(view, position)
     position += _FRAGMENT_HEAD.size
     if total > MAX_MESSAGE_BYTES:
         raise DecodeError("message over the limit")
@@ -357,7 +367,7 @@ def _decode_fragment(kind: int, view: memoryview, position: int) -> tuple[Fragme
     data = view[position : position + length]
     if len(data) != length:
         raise DecodeError("truncated fragment")
-    return Fragment(message, total, symbol, index, data), position + length
+    return Fragment(message, total, symbol, index, data, left_us), position + length
 
 
 def _decode_ack(view: memoryview, position: int) -> tuple[AckFrame, int]:

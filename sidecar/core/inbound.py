@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core.fragments import OVER_REMEMBERED, Fate, Reassembler
 from sidecar.core.frame import BASE_SYMBOL_BYTES
@@ -30,7 +30,14 @@ class Decoding:
 
     def run(self) -> MessageDecoded:
         """Compute it, in up to some milliseconds; the result is an event for the engine."""
-        return MessageDecoded(self.path, self.session, self.partial.decode())
+        return MessageDecoded(self.path, self.session, self.partial.decode(), self.partial.ends_at)
+
+
+class Arrived(NamedTuple):
+    """A message that is whole, and when it is of no use any more."""
+
+    content: memoryview
+    ends_at: float
 
 
 class Inbound:
@@ -46,13 +53,13 @@ class Inbound:
         self._untold: dict[NodeName, dict[int, None]] = {}
         """Finished messages whose peer could not be told for want of a path, oldest first."""
 
-    def add(self, path: PathId, session: SessionId, fragments: list[Fragment], now: float) -> list[memoryview]:
+    def add(self, path: PathId, session: SessionId, fragments: list[Fragment], now: float) -> list[Arrived]:
         """Store symbols that came over `path`; returns the messages that they complete."""
         reassembler = self._reassemblers.get(path.peer)
         if reassembler is None:
             reassembler = self._reassemblers[path.peer] = Reassembler(path.peer, self._stats.dropped)
-        whole: list[memoryview] = []
-        for number, fate, content in reassembler.add(fragments, now):
+        whole: list[Arrived] = []
+        for number, fate, content, ends_at in reassembler.add(fragments, now):
             if fate is Fate.FORGOTTEN:
                 self._command(SendForgotten(path, number))
                 continue
@@ -61,7 +68,7 @@ class Inbound:
             if isinstance(content, Partial):
                 self._decodings.append(Decoding(path, session, content))
             elif content is not None:
-                whole.append(content)
+                whole.append(Arrived(content, ends_at))
         return whole
 
     def on_finished_lost(self, peer: NodeName, numbers: tuple[int, ...], best: PathId | None) -> None:

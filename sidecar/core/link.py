@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from sidecar.core import frame
 from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
 from sidecar.core.link_events import (
+    Attend,
+    CheckPaths,
     FinishedLost,
     FragmentsLost,
     LinkCommand,
@@ -43,7 +45,7 @@ from sidecar.core.timers import NEVER, Timers
 
 if TYPE_CHECKING:
     import random
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from protos.model import Address, NodeName
     from sidecar.core.datagrams import LinkIdentity
@@ -85,6 +87,8 @@ class Link:
         self._timers: Timers[PathId] = Timers()
         self._unarmed: dict[PathId, Path] = {}
         """What has sent since its timer was set: that waits until timers are asked for, the datagrams do not."""
+        self._stirred: dict[PathId, Path] = {}
+        """Paths of which there may be something to tell: a link with thousands that rest looks at these alone."""
         self._measure_at = now + MEASURE_EVERY_S
 
     # -- what the driver calls ------------------------------------------------------------------------------------
@@ -114,7 +118,7 @@ class Link:
                     self._events.append(FinishedLost(path_id, (number,)))
                 else:
                     by = now if at_once else now + MAX_FINISHED_DELAY_S
-                    self._table.owe(path, frame.encode_finished(frame.Finished(number)), by)
+                    self._table.owe_finished(path, number, by)
             case SendAbandon(path_id, number):
                 path = self._paths.get((path_id.peer, path_id.remote))
                 if path is not None and path.state is not PathState.DOWN:
@@ -139,16 +143,26 @@ class Link:
                 self._keeper.take_all_down(reason)
                 self._probe_what_is_down(now)
             case Seek(peers):
-                for path in self._paths.values():
-                    if path.peer in peers and path.state is PathState.DOWN:
+                for path in self._paths_to(peers):
+                    if path.state is PathState.DOWN:
                         path.hasten_probe(now)
                         self._dirty[path.id] = path
+            case CheckPaths():
+                for path in self._paths.values():
+                    if path.state is PathState.UP:
+                        path.hasten_probe(now)
+                        self._dirty[path.id] = path
+            case Attend(peers):
+                for path in self._paths_to(peers):
+                    path.needed(now)
+                    self._dirty[path.id] = path
             case SetMtu(mtu):
                 self._mtu.set_interface(mtu, self._paths.values(), now)
                 self._dirty.update((path.id, path) for path in self._paths.values())
-            case Rebind():
+            case Rebind(lost, rerouted):
                 for path in self._paths.values():
-                    self._keeper.rebind(path, now)
+                    if path.state is PathState.DOWN or path.leaves_from(lost) or path.family in rerouted:
+                        self._keeper.rebind(path, now)
             case SendClose():
                 self._table.closing = True
                 for path in self._paths.values():
@@ -163,7 +177,7 @@ class Link:
             if path is not None:  # an introduction may have taken the place of another
                 self._dirty[path_id] = path
                 self._keeper.on_timer(path, now)
-        if now >= self._measure_at:
+        if self._stirred and now >= self._measure_at:
             self._measure_at = now + MEASURE_EVERY_S
             self._measure(now)
 
@@ -171,7 +185,7 @@ class Link:
         """When `handle_timer` is wanted next."""
         self._rearm()
         timer = self._timers.next()
-        return self._measure_at if timer is None else min(timer, self._measure_at)
+        return min(NEVER if timer is None else timer, self._measure_at if self._stirred else NEVER)
 
     def on_too_big(self, destination: Address, size: int, now: float) -> None:
         """The kernel refused to send a datagram of this many bytes over the interface (EMSGSIZE)."""
@@ -183,6 +197,16 @@ class Link:
     def next_event(self) -> LinkEvent | None:
         """Return the oldest event not taken yet."""
         return self._events.popleft() if self._events else None
+
+    def living(self) -> list[PathId]:
+        """The paths that are not down."""
+        return [path.id for path in self._paths.values() if path.state is not PathState.DOWN]
+
+    def note_source(self, path_id: PathId, source_towards: Callable[[Address], str | None]) -> None:
+        """Note from which address of ours the kernel sends to where the path leads now, as `source_towards` says."""
+        path = self._paths.get((path_id.peer, path_id.remote))
+        if path is not None and path.remote is not None:
+            path.source = source_towards(path.remote)
 
     def in_use(self, address: Address) -> bool:
         """Whether a path that is not down leads to this address."""
@@ -198,6 +222,9 @@ class Link:
             if self._builder.build(path, burst, now, probing=probing):
                 del self._dirty[path.id]
                 self._unarmed[path.id] = path
+                if not self._stirred:
+                    self._measure_at = now + MEASURE_EVERY_S
+                self._stirred[path.id] = path
             if burst.full:
                 break
         return burst.batches
@@ -211,8 +238,11 @@ class Link:
     def _probe_what_is_down(self, now: float) -> None:
         for path in self._paths.values():
             if path.state is PathState.DOWN:
-                path.probe_soon(now)
+                path.probing.begin_again(now)
             self._dirty[path.id] = path
+
+    def _paths_to(self, peers: Iterable[NodeName]) -> list[Path]:
+        return [path for peer in peers for path in self._table.to(peer)]
 
     def _live_path(self, path_id: PathId, message: OutboundMessage, indices: Iterable[int]) -> Path | None:
         """Return the path if it can carry the message; otherwise hand the symbols back as lost.
@@ -234,30 +264,31 @@ class Link:
     # -- measurements ---------------------------------------------------------------------------------------------
 
     def _measure(self, now: float) -> None:
-        for path in self._paths.values():
+        stirred, self._stirred = self._stirred, {}
+        for path in stirred.values():
             self._keeper.report_measured(path)
-            path.recovery.reordering.forget_old(path.recovery.rtt, now)
-        self._publish_path_stats()
+            path.recovery.reordering.forget_old(now)
+            if path.recovery.reordering.remembers:
+                self._stirred[path.id] = path
+        for peer in {path.peer for path in stirred.values()}:
+            self._publish_stats_of(peer)
 
-    def _publish_path_stats(self) -> None:
-        best: dict[NodeName, Path] = {}
-        for path in self._paths.values():
-            other = best.get(path.peer)
-            if other is None or (path.state is PathState.UP and other.state is not PathState.UP):
-                best[path.peer] = path
-        self.stats.paths = {
-            name: PathStats(
-                up=path.state is PathState.UP,
-                srtt_s=path.recovery.rtt.smoothed,
-                datagrams_sent=path.recovery.total_sent,
-                datagrams_lost=path.recovery.total_lost,
-                spurious_losses=path.recovery.reordering.spurious,
-                bytes_sent=path.bytes_sent,
-                max_datagram=path.mtu.size,
-                key_phase=path.sealing.phase,
-            )
-            for name, path in best.items()
-        }
+    def _publish_stats_of(self, peer: NodeName) -> None:
+        paths = self._table.to(peer)
+        if not paths:
+            self.stats.paths.pop(peer, None)
+            return
+        path = next((path for path in paths if path.state is PathState.UP), paths[0])
+        self.stats.paths[peer] = PathStats(
+            up=path.state is PathState.UP,
+            srtt_s=path.recovery.rtt.smoothed,
+            datagrams_sent=path.recovery.total_sent,
+            datagrams_lost=path.recovery.total_lost,
+            spurious_losses=path.recovery.reordering.spurious,
+            bytes_sent=path.bytes_sent,
+            max_datagram=path.mtu.size,
+            key_phase=path.sealing.phase,
+        )
 
     def remember(self, *, hangs: bool = False) -> LinkMemory:
         """End the link; returns what the interface's next one must know. `hangs`: its driver may not have ended."""
@@ -272,7 +303,9 @@ class Link:
             if (path.peer, path.remote_id) not in self._paths:
                 self._dirty.pop(path.id, None)
                 self._unarmed.pop(path.id, None)
+                self._stirred.pop(path.id, None)
                 self._timers.arm(path.id, None)
+                self._publish_stats_of(path.peer)
 
     # -- timers ---------------------------------------------------------------------------------------------------
 

@@ -57,7 +57,13 @@ class ResetPaths:
 
 @dataclass(frozen=True, slots=True)
 class Rebind:
-    """The interface's address or gateway changed: what was measured is void, and peers must learn where we are."""
+    """Addresses or gateways of the interface changed: of paths which that concerns, what was measured is void, and
+    their peers must learn where we are."""
+
+    lost: frozenset[str]
+    """Addresses that nothing leaves from any more."""
+    rerouted: frozenset[int]
+    """Families (4, 6) whose gateways are others now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,18 @@ class SetCredential:
 @dataclass(frozen=True, slots=True)
 class Seek:
     """A request waits for any path to these peers: probe those that are down, however long they have been."""
+
+    peers: frozenset[NodeName]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckPaths:
+    """Something else than datagrams is not answered over this interface: probe what is up now, however idle."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attend:
+    """Requests go to these peers: whether a path to one of them lives must be known soon, also of those that rest."""
 
     peers: frozenset[NodeName]
 
@@ -132,7 +150,18 @@ class SendClose:
 PathCommand = Send | Resend | SendFinished | SendAbandon | SendForgotten
 """What is for one path."""
 LinkCommand = (
-    SetPeers | SetCredential | SetReady | SetCarrier | ResetPaths | Rebind | Seek | SetMtu | PathCommand | SendClose
+    SetPeers
+    | SetCredential
+    | SetReady
+    | SetCarrier
+    | ResetPaths
+    | Rebind
+    | Seek
+    | CheckPaths
+    | Attend
+    | SetMtu
+    | PathCommand
+    | SendClose
 )
 
 
@@ -179,6 +208,8 @@ class MessageDecoded:
     path: PathId
     session: SessionId
     content: memoryview
+    ends_at: float
+    """When it is of no use any more."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,6 +51,8 @@ class LinkMtu:
         """The peer's datagrams come from elsewhere: another route, unless only a NAT gave it another port."""
         elsewhere = path.remote is not None and source[0] != path.remote[0]
         path.remote = source
+        if elsewhere:
+            path.source = None
         if elsewhere and path.mtu.timer is not None:
             self.start_afresh(path)
             self.search(path, now)

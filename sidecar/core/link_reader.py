@@ -83,7 +83,7 @@ class LinkReader:
             size = len(plain) - FRAGMENT_HEAD_BYTES
             if size < 0 or number <= high or its_path is not path:
                 break
-            kind, message, total, symbol, index = unpack(plain)
+            kind, message, total, symbol, index, left_us = unpack(plain)
             if kind == FRAGMENT_TYPE:
                 length = total - index * symbol
                 if length > symbol:
@@ -103,10 +103,11 @@ class LinkReader:
                 received.add_run(low, high, now)
                 low = number
             high = number
-            fragments.append(new(Fragment, (message, total, symbol, index, plain[FRAGMENT_HEAD_BYTES:])))
+            fragments.append(new(Fragment, (message, total, symbol, index, plain[FRAGMENT_HEAD_BYTES:], left_us)))
         if fragments:
             received.add_run(low, high, now)
             self._heard(path, source, now, newest=True)
+            self._used(path, now)
             self._stats.datagrams["received", "data"] += len(fragments)
             self._hand_up(path, fragments)
             received.owe_ack(now, len(fragments))
@@ -116,9 +117,14 @@ class LinkReader:
         """An authentic datagram that is no duplicate came; `newest`: sent after all that came before."""
         if newest and source != path.remote and not (self._leads and path.keeps_address(source)):
             self._mtu.moved(path, source, now)
+        self._table.dirty[path.id] = path
+
+    @staticmethod
+    def _used(path: Path, now: float) -> None:
+        """The peer sends what it would not send over a path that is down to it."""
         if path.state is PathState.DOWN:
             path.hasten_probe(now)
-        self._table.dirty[path.id] = path
+        path.probing.used(now)
 
     def _hand_up(self, path: Path, fragments: list[Fragment]) -> None:
         """Append to the event before, if it is of the same path and session."""
@@ -143,6 +149,7 @@ class LinkReader:
 
     def _receive_frames(self, path: Path, frames: list[frame.Frame], now: float) -> None:
         eliciting = False
+        replies = False
         events = self._events
         kind = "control"
         for item in frames:
@@ -150,20 +157,18 @@ class LinkReader:
                 case frame.Fragment():
                     eliciting = True
                     kind = "data"
+                    self._used(path, now)
                     self._hand_up(path, [item])
                 case frame.AckFrame():
                     self._keeper.on_ack(path, item, now)
                 case frame.Probe(probe_id) if self._table.closing:
                     pass  # an answer would bring us back to life over there
                 case frame.Probe(probe_id):
+                    path.asked(now)
                     self._table.owe(path, frame.encode_probe_reply(frame.ProbeReply(probe_id)))
-                case frame.ProbeReply(probe_id) if self._mtu.answered(path, probe_id, now):
-                    pass
                 case frame.ProbeReply(probe_id):
-                    if path.answered_probe(probe_id, now):
-                        self._keeper.probe_answered(path, now)
-                    else:
-                        self._stats.dropped["unasked_probe_reply"] += 1
+                    replies = True
+                    self._receive_reply(path, probe_id, now)
                 case frame.Finished(number):
                     eliciting = True
                     events.append(MessageFinished(path.peer, number))
@@ -177,5 +182,18 @@ class LinkReader:
                 case frame.Close():
                     pass
         self._stats.datagrams["received", kind] += 1
+        if path.state is PathState.DOWN and not replies:
+            # It lives in this direction. A reply that fits nothing says only that it is slow: were it a reason to ask,
+            # each one would call for the next.
+            path.hasten_probe(now)
         if eliciting:
             path.received.owe_ack(now)
+
+    def _receive_reply(self, path: Path, probe_id: int, now: float) -> None:
+        if self._mtu.answered(path, probe_id, now):
+            return
+        sent_at = path.answered_probe(probe_id, now)
+        if sent_at is None:
+            self._stats.dropped["unasked_probe_reply"] += 1
+        else:
+            self._keeper.probe_answered(path, sent_at, now)

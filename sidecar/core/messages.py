@@ -1,6 +1,6 @@
 """What a reassembled message holds. Integers are big-endian.
 
-    request    1  request id (16 bytes) copy (8) priority (8) deadline left in us (32) lifetime left in ms (32)
+    request    1  request id (16 bytes) copy (8) priority (8) deadline left in us (32) lifetime left in us (32)
                   n (16) service name m (16) type name, payload
     response   2  request id (16 bytes) copy (8) processing time in us (32), payload
     rejection  3  request id (16 bytes) copy (8) reason (8) n (16) text
@@ -8,12 +8,16 @@
 
 `copy` numbers the copies of one request; the answer repeats it, so that each copy's latency is known whichever path
 the answer takes. A deadline that is over has 0 left. A cancel is about all copies of its request.
+
+What a request says to be left was so when its message was made. It waits before it leaves, and parts of it may leave
+again much later, so each datagram tells how much of the lifetime is left by then (frame.py); what is gone of that is
+gone of the deadline too.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
@@ -48,6 +52,14 @@ class RequestMessage:
     service: ServiceName
     type: str
     payload: bytes | memoryview = field(repr=False)
+
+    def when_left(self, lifetime_left_s: float) -> RequestMessage:
+        """Return it as it is by the time that no more than this is left of its lifetime."""
+        gone_s = self.lifetime_left_s - lifetime_left_s
+        if gone_s <= 0:
+            return self
+        left_s = max(0.0, self.deadline_left_s - gone_s)
+        return replace(self, deadline_left_s=left_s, lifetime_left_s=max(0.0, lifetime_left_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +109,11 @@ def encode_message(message: Message) -> Encoded:
     if isinstance(message, RequestMessage):
         service, kind = message.service.encode(), message.type.encode()
         deadline_us = _clamped(message.deadline_left_s * 1e6)
-        lifetime_ms = _clamped(message.lifetime_left_s * 1e3)
+        lifetime_us = _clamped(message.lifetime_left_s * 1e6)
         head = b"".join(
             (
                 _HEAD.pack(_REQUEST, message.request_id, message.copy),
-                _REQUEST_TIMES.pack(message.priority, deadline_us, lifetime_ms),
+                _REQUEST_TIMES.pack(message.priority, deadline_us, lifetime_us),
                 _U16.pack(len(service)),
                 service,
                 _U16.pack(len(kind)),
@@ -137,7 +149,7 @@ def decode_message(view: memoryview) -> Message:
 
 
 def _decode_request(request_id: RequestId, copy: int, view: memoryview, position: int) -> Message:
-    priority, deadline_us, lifetime_ms = _REQUEST_TIMES.unpack_from(view, position)
+    priority, deadline_us, lifetime_us = _REQUEST_TIMES.unpack_from(view, position)
     try:
         priority = Priority(priority)
     except ValueError:
@@ -146,7 +158,7 @@ def _decode_request(request_id: RequestId, copy: int, view: memoryview, position
     kind, position = _decode_text(view, position, MAX_NAME_BYTES)
     payload = _payload(view, position)
     return RequestMessage(
-        request_id, copy, priority, deadline_us / 1e6, lifetime_ms / 1e3, ServiceName(service), kind, payload
+        request_id, copy, priority, deadline_us / 1e6, lifetime_us / 1e6, ServiceName(service), kind, payload
     )
 
 

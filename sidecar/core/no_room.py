@@ -1,41 +1,110 @@
 """Robot side: requests that no server's share of the outbox had room for when they might have been sent.
 
-Those wait for a path as well, and there may be more of them than the outbox takes at once when it comes.
+Requests for the same servers wait in one line for each lane (`room.py`), whatever their services. Who comes later does
+not get past them, but by being more urgent: a server that somebody waits for is full for them, too.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
+from sidecar.core.room import Lane
+from sidecar.core.waiting_line import WaitingLine
+
 if TYPE_CHECKING:
-    from protos.model import ServiceName
+    from collections.abc import Iterable, Iterator
+
+    from protos.model import NodeName
     from sidecar.core.copies import Request
+    from sidecar.core.dispatching import Dispatching
     from sidecar.core.events import RequestId
+    from sidecar.core.routes import Routes
+
+    _Group = tuple[Lane, tuple[NodeName, ...]]
 
 
 class NoRoom:
-    """Service -> its requests without a copy, in order of arrival; as many as the request table holds."""
+    """Requests without a copy that may be answered; as many as the request table holds."""
 
-    def __init__(self) -> None:
-        self._waiting: dict[ServiceName, dict[RequestId, Request]] = {}
+    def __init__(self, dispatching: Dispatching, routes: Routes) -> None:
+        self._dispatching = dispatching
+        self._routes = routes
+        self._lines: dict[_Group, WaitingLine[RequestId]] = {}
+        self._waiting: dict[RequestId, tuple[Request, _Group]] = {}
+        self._awaited: Counter[tuple[Lane, NodeName]] = Counter()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
 
     def __contains__(self, request: Request) -> bool:
-        return request.id in self._waiting.get(request.service, ())
+        return request.id in self._waiting
 
-    def add(self, request: Request) -> None:
-        """It found no room."""
-        self._waiting.setdefault(request.service, {})[request.id] = request
+    def open_to(self, request: Request) -> list[NodeName]:
+        """The servers that have room for the request, and nobody waiting for it."""
+        lane = Lane.of(request.size)
+        servers = self._dispatching.candidates(request)
+        return self._dispatching.with_room((each for each in servers if (lane, each) not in self._awaited), request)
 
-    def remove(self, request: Request) -> None:
-        """It is tried again, or over."""
-        waiting = self._waiting.get(request.service)
-        if waiting is not None and waiting.pop(request.id, None) is not None and not waiting:
-            del self._waiting[request.service]
+    def consider(self, request: Request, *, rejected: bool = False) -> None:
+        """Let a request wait if it could be sent now (again), and room is all that it lacks."""
+        if request.id in self._waiting or request.answered_here or not request.may_be_sent():
+            return
+        reached = self._reached(self._dispatching.candidates(request, rejected=rejected))
+        lane = Lane.of(request.size)
+        if reached and all((lane, each) in self._awaited for each in self._dispatching.with_room(reached, request)):
+            self._add(request, (lane, reached))
 
-    def services(self) -> list[ServiceName]:
-        """Those with requests that wait for room."""
-        return list(self._waiting)
+    def _reached(self, servers: Iterable[NodeName]) -> tuple[NodeName, ...]:
+        return tuple(server for server in servers if self._routes.reaches(server))
 
-    def first(self, service: ServiceName) -> Request | None:
-        """Return the one that waits longest."""
-        return next(iter(self._waiting.get(service, {}).values()), None)
+    def _add(self, request: Request, group: _Group) -> None:
+        self._waiting[request.id] = request, group
+        self._awaited.update((group[0], server) for server in group[1])
+        line = self._lines.setdefault(group, WaitingLine())
+        line.add(request.id, request.rule.priority, request.deadline_at, request.size)
+
+    def remove(self, request: Request, *, went: bool = False) -> None:
+        """It is over, or its turn has come (`went`); or it did not wait."""
+        _, group = self._waiting.pop(request.id, (request, None))
+        if group is None:
+            return
+        line = self._lines[group]
+        if went:
+            line.went(request.id)
+        else:
+            line.remove(request.id)
+        if not len(line):
+            del self._lines[group]
+        for server in group[1]:
+            place = group[0], server
+            self._awaited[place] -= 1
+            if not self._awaited[place]:
+                del self._awaited[place]
+
+    def going(self, now: float) -> Iterator[tuple[Request, list[NodeName]]]:
+        """Remove and return those that there is room for, each in its turn, and the servers that have it.
+
+        Each is to be sent before the next one is asked for.
+        """
+        full: set[tuple[Lane, NodeName]] = set()
+        before = len(self) + 1
+        while 0 < len(self) < before:
+            before = len(self)
+            for request in self._heads(now):
+                if request not in self:
+                    continue  # it ended since the last one went
+                lane, servers = Lane.of(request.size), self._dispatching.candidates(request)
+                reached = self._reached(servers)
+                room = self._dispatching.with_room((each for each in servers if (lane, each) not in full), request)
+                if reached and not any(server in room for server in reached):
+                    full.update((lane, server) for server in reached)
+                    continue
+                self.remove(request, went=True)
+                yield request, room
+
+    def _heads(self, now: float) -> list[Request]:
+        """Return the one of each line whose turn it is, the most urgent first."""
+        found = (line.first(now) for line in list(self._lines.values()))
+        heads = [self._waiting[request_id][0] for request_id in found if request_id is not None]
+        return sorted(heads, key=lambda request: (request.rule.priority, request.deadline_at))

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING
 
 from protos.model import ServiceUse
 from sidecar.core.events import OfferService, WithdrawService
-from sidecar.core.rules import find_rule
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Container, Mapping
 
     from protos.model import NodeName, Peer, ServiceName
     from sidecar.core.routes import Routes
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules import Rules
 
 WITHDRAW_AFTER_S = 15.0
 """Longer than a handover, a tunnel or the restart of a server, shorter than a person's patience with a dead service."""
@@ -28,35 +27,46 @@ WITHDRAW_AFTER_S = 15.0
 class Offers:
     """Services offered on the robot, and the servers behind each."""
 
-    def __init__(self, rules: tuple[ServiceRule, ...]) -> None:
+    def __init__(self, rules: Rules) -> None:
         self._rules = rules
         self._offered: dict[ServiceName, str] = {}
+        self._by_peer: dict[NodeName, tuple[dict[ServiceName, str], bool]] = {}
+        """Peer -> (the type of each service that it offers, whether it drains)."""
+        self._by_service: dict[ServiceName, dict[str, dict[NodeName, bool]]] = {}
+        """Service -> type -> who offers it so, and whether they drain."""
+        self._touched: set[ServiceName] = set()
+        """Services of which other servers than before, or of another type, are known."""
         self._wanted: dict[ServiceName, tuple[str, tuple[NodeName, ...]]] = {}
         """Service -> (type, servers), as the peers offer it."""
         self._gained: set[ServiceName] = set()
         """Of the wanted ones, those that got another server since somebody asked."""
         self._dark_until: dict[ServiceName, float] = {}
         """Service without a server in reach -> when its offer ends."""
-        self.conflicts: set[tuple[ServiceName, NodeName, str]] = set()
-        """Servers left out because they offer another type than the rest."""
+        self._conflicts: dict[ServiceName, set[tuple[ServiceName, NodeName, str]]] = {}
 
     @property
     def offered(self) -> dict[ServiceName, str]:
         """Service names and types offered now."""
         return self._offered
 
+    @property
+    def conflicts(self) -> set[tuple[ServiceName, NodeName, str]]:
+        """Servers left out because they offer another type than the rest."""
+        self._choose_touched()
+        return {conflict for of_service in self._conflicts.values() for conflict in of_service}
+
     def servers(self, service: ServiceName) -> tuple[NodeName, ...]:
         """Return the servers that a new request for this service may go to."""
+        if service in self._touched:
+            self._touched.discard(service)
+            self._choose(service)
         wanted = self._wanted.get(service)
         return wanted[1] if wanted else ()
 
     def update(self, routes: Routes, now: float) -> list[OfferService | WithdrawService]:
         """Follow the peers' offers and the paths to them; returns what changes on the robot."""
-        reached = {
-            name: kind
-            for name, (kind, servers) in self._wanted.items()
-            if any(routes.reaches(server) for server in servers)
-        }
+        self._choose_touched()
+        reached = {name: kind for name, (kind, servers) in self._wanted.items() if routes.reaches_any(servers)}
         events: list[OfferService | WithdrawService] = []
         for name, kind in list(self._offered.items()):
             if name not in reached:
@@ -81,7 +91,7 @@ class Offers:
         return WithdrawService(name, reason)
 
     def _patience_s(self, name: ServiceName) -> float:
-        rule = find_rule(self._rules, name)
+        rule = self._rules.find(name)
         return max(WITHDRAW_AFTER_S, rule.lifetime_s) if rule else WITHDRAW_AFTER_S
 
     def uses(self, carried: Mapping[ServiceName, bool | None]) -> tuple[ServiceUse, ...]:
@@ -91,37 +101,74 @@ class Offers:
         """
         uses = []
         for name, kind in self._offered.items():
-            rule = find_rule(self._rules, name)
+            rule = self._rules.find(name)
             if rule is not None and name in carried:
                 wanted = (rule.deadline_s, rule.idempotent, rule.copies, rule.target_miss)
                 uses.append(ServiceUse(name, kind, *wanted, fallback_up=carried[name]))
         return tuple(uses)
 
-    def set_peers(self, peers: list[Peer]) -> None:
-        """Take what the peers offer; servers that drain count only where there is no other."""
-        by_name: dict[ServiceName, dict[str, list[Peer]]] = {}
-        for peer in peers:
-            for offer in peer.offers:
-                if find_rule(self._rules, offer.name) is not None:
-                    by_name.setdefault(offer.name, {}).setdefault(offer.type, []).append(peer)
-        before, self._wanted = self._wanted, {}
-        self.conflicts = set()
-        for name, by_type in by_name.items():
-            current = self._offered.get(name)
-            # Most servers win; the type already offered wins a tie, so that one odd server changes nothing.
-            kind = max(sorted(by_type), key=lambda kind: (len(by_type[kind]), kind == current))
-            self.conflicts.update(
-                (name, peer.name, other) for other, others in by_type.items() if other != kind for peer in others
-            )
-            fresh = [peer.name for peer in by_type[kind] if not peer.draining]
-            servers = tuple(fresh or [peer.name for peer in by_type[kind]])
-            self._wanted[name] = (kind, servers)
-            if name not in before or not set(servers) <= set(before[name][1]):
-                self._gained.add(name)
-        self._gained &= self._wanted.keys()  # a cloud's sidecar never asks
+    def set_peer(self, peer: Peer) -> None:
+        """Take what a peer offers; `update` tells what comes of it."""
+        offers = {offer.name: offer.type for offer in peer.offers if self._rules.find(offer.name) is not None}
+        before, drained = self._by_peer.get(peer.name, ({}, False))
+        if offers == before and drained == peer.draining:
+            return
+        self._by_peer[peer.name] = offers, peer.draining
+        for name, kind in before.items():
+            if offers.get(name) != kind:
+                self._take_out(name, kind, peer.name)
+        for name, kind in offers.items():
+            if before.get(name) != kind or drained != peer.draining:
+                self._by_service.setdefault(name, {}).setdefault(kind, {})[peer.name] = peer.draining
+                self._touched.add(name)
+
+    def others(self, peers: Container[NodeName]) -> list[NodeName]:
+        """Return the peers known here that are none of these."""
+        return [name for name in self._by_peer if name not in peers]
+
+    def forget_peer(self, peer: NodeName) -> None:
+        """The peer is gone."""
+        offers, _ = self._by_peer.pop(peer, ({}, False))
+        for name, kind in offers.items():
+            self._take_out(name, kind, peer)
+
+    def _take_out(self, name: ServiceName, kind: str, peer: NodeName) -> None:
+        by_type = self._by_service[name]
+        del by_type[kind][peer]
+        if not by_type[kind]:
+            del by_type[kind]
+        if not by_type:
+            del self._by_service[name]
+        self._touched.add(name)
+
+    def _choose_touched(self) -> None:
+        while self._touched:
+            self._choose(self._touched.pop())
+
+    def _choose(self, name: ServiceName) -> None:
+        """Settle the service's type and servers; servers that drain count only where there is no other."""
+        by_type = self._by_service.get(name)
+        before = self._wanted.pop(name, None)
+        self._conflicts.pop(name, None)
+        if by_type is None:
+            self._gained.discard(name)
+            return
+        current = self._offered.get(name)
+        # Most servers win; the type already offered wins a tie, so that one odd server changes nothing.
+        kind = max(sorted(by_type), key=lambda kind: (len(by_type[kind]), kind == current))
+        if len(by_type) > 1:
+            self._conflicts[name] = {
+                (name, peer, other) for other, peers in by_type.items() if other != kind for peer in peers
+            }
+        fresh = [peer for peer, drains in by_type[kind].items() if not drains]
+        servers = tuple(fresh or by_type[kind])
+        self._wanted[name] = kind, servers
+        if before is None or not set(servers) <= set(before[1]):
+            self._gained.add(name)
 
     def take_gained(self) -> set[ServiceName]:
         """Return the services that got another server since the last call."""
+        self._choose_touched()
         gained, self._gained = self._gained, set()
         return gained
 

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 class OutboundMessage:
     """The bytes of one message and which symbols have arrived.
 
-    Links on several threads share it without a lock: `acked` bytes, `begun` and `over` only ever go from 0 to 1, and
-    a link that reads an old value of these or of `expected_at` merely sends a symbol that is no longer needed, or a
-    little later.
+    Links on several threads share it without a lock: `acked` bytes, `begun` and `over` only ever go from 0 to 1 (but
+    for a byte of what the peer is asked after, `Outbox.ask_again`), and a link that reads an old value of these or of
+    `expected_at` merely sends a symbol that is no longer needed, or a little later.
 
     The payload is never copied as a whole: a symbol is a view of it (the first ones hold the head and are joined),
     which goes into its datagram in the link's thread. That is the only copy on the way out.
@@ -37,6 +37,7 @@ class OutboundMessage:
         "answers",
         "begun",
         "content",
+        "copy_of",
         "count",
         "deadline",
         "expected_at",
@@ -52,6 +53,7 @@ class OutboundMessage:
         "successor",
         "symbol",
         "total",
+        "unreported",
     )
 
     def __init__(
@@ -65,6 +67,7 @@ class OutboundMessage:
         expires: float,
         symbol: int = BASE_SYMBOL_BYTES,
         answers: RequestId | None = None,
+        copy_of: RequestId | None = None,
         repairs: int = 0,
         siblings: list[OutboundMessage] | None = None,
     ) -> None:
@@ -94,8 +97,12 @@ class OutboundMessage:
         self.acked = bytearray(self.symbols)
         self.answers = answers
         """The request that it answers; the engine's, links do not look at this."""
+        self.copy_of = copy_of
+        """The request that it is a copy of; the engine's as well."""
         self.begun = False
         """Something of it may have left."""
+        self.unreported = False
+        """The peer had enough of it when the engine looked last, and had not said so."""
         self.over = False
         """Delivered, called off, expired or cut anew: nothing of it needs to travel any more."""
         self.successor: OutboundMessage | None = None
@@ -131,6 +138,17 @@ class OutboundMessage:
         return message
 
     @property
+    def may_have_left(self) -> bool:
+        """Whether anything of these bytes may have left, as whatever they were cut into.
+
+        False is certain only of a message that is over already: its link looks at `over` after it has set `begun`.
+        """
+        message = self
+        while not message.begun and message.successor is not None:
+            message = message.successor
+        return message.begun
+
+    @property
     def datagram_bytes(self) -> int:
         """Length of its longest datagram, with the room for the tag."""
         return min(self.total, self.symbol) + FRAGMENT_OVERHEAD_BYTES
@@ -151,6 +169,7 @@ class OutboundMessage:
             expires=self.expires,
             symbol=symbol,
             answers=self.answers,
+            copy_of=self.copy_of,
             repairs=-(-self.repairs * symbol_count(self.total, symbol) // self.count),
             siblings=self.siblings if shared else None,
         )

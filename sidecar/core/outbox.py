@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING
 
-from sidecar.core.fragments import MAX_PEER_BYTES as REASSEMBLED_PEER_BYTES
+from sidecar.core.backlog import in_groups
 from sidecar.core.frame import symbol_count
 from sidecar.core.link_events import FragmentsLost, Resend, Send, SendAbandon
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.redundancy import repair_symbols, worth_a_copy
-from sidecar.core.shares import Shares
+from sidecar.core.room import Room
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import InterfaceName, NodeName
+    from sidecar.core.backlog import Step
     from sidecar.core.events import RequestId
     from sidecar.core.link_events import PathCommand
     from sidecar.core.messages import Encoded
@@ -24,10 +27,8 @@ if TYPE_CHECKING:
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
 
-MAX_MESSAGES = 16_384
-"""All undelivered messages: one peer may have half of them, as many as requests may be in flight."""
-MAX_BYTES = 256 * 1024 * 1024
-"""All undelivered messages together: sixteen of the largest."""
+LOOKED_AT_ONCE = 512
+"""Messages looked at in one call of `ask_again`, which has the engine's lock: about a millisecond."""
 MAX_GENERATIONS = 8
 """How often a message is sent anew under another number; a receiver that forgets it more often is not honest."""
 
@@ -40,11 +41,16 @@ class Outbox:
         self._command = command
         self._stats = stats
         self._messages: dict[int, OutboundMessage] = {}
+        self._by_peer: dict[NodeName, dict[int, OutboundMessage]] = {}
         self._parked: dict[NodeName, dict[int, OutboundMessage]] = {}
-        self._shares_of_messages = Shares(MAX_MESSAGES)
-        self._shares_of_bytes = Shares(MAX_BYTES)
+        self._room = Room()
         self._answers: dict[tuple[NodeName, RequestId], list[OutboundMessage]] = {}
         """Undelivered answers by the robot and request they are for: one for each copy that asked."""
+        self._answers_over: list[tuple[NodeName, RequestId]] = []
+        """Those of which the last message ended since it was asked; what is cut anew begins again."""
+        self._made_room = False
+        self._looked_at = 0
+        """How many of the messages, oldest first, `ask_again` has looked at in this round."""
         self._next_number = 1
 
     def __len__(self) -> int:
@@ -53,11 +59,15 @@ class Outbox:
     @property
     def held_bytes(self) -> int:
         """Bytes of all undelivered messages."""
-        return self._shares_of_bytes.used
+        return self._room.held_bytes
 
     def messages_to(self, peer: NodeName) -> int:
         """How many messages to this peer are undelivered."""
-        return self._shares_of_messages.held(peer)
+        return self._room.messages_to(peer)
+
+    def sent_over(self, path: PathId) -> int:
+        """Bytes of the undelivered messages that were first sent over this path."""
+        return self._room.sent_over(path)
 
     def waiting_over(self, interface: InterfaceName) -> int:
         """How many undelivered messages use this interface."""
@@ -65,12 +75,25 @@ class Outbox:
 
     def has_room(self, peer: NodeName, size: int) -> bool:
         """Whether another message of this size may be sent to this peer."""
-        held = self._shares_of_bytes
-        return (
-            self._shares_of_messages.fits(peer)
-            and held.fits(peer, size)
-            and held.held(peer) + size <= REASSEMBLED_PEER_BYTES
-        )
+        return self._room.fits(peer, size)
+
+    def take_made_room(self) -> bool:
+        """Whether a message ended since the last call, so that what waits for room may find it."""
+        made, self._made_room = self._made_room, False
+        return made
+
+    def take_answers_over(self) -> list[tuple[NodeName, RequestId]]:
+        """Return the robots and requests whose answers are under way no more, delivered or not."""
+        over, self._answers_over = self._answers_over, []
+        return [key for key in over if key not in self._answers]
+
+    def carries_answer(self, peer: NodeName, request: RequestId) -> bool:
+        """Whether an answer to this request is under way."""
+        return (peer, request) in self._answers
+
+    def answer_has_begun(self, peer: NodeName, request: RequestId) -> bool:
+        """Whether anything may have left of an answer that is under way."""
+        return any(message.begun for message in self._answers.get((peer, request), ()))
 
     def send(
         self,
@@ -82,12 +105,14 @@ class Outbox:
         expires: float,
         fec: Redundancy = None,
         answers: RequestId | None = None,
+        copy_of: RequestId | None = None,
         siblings: list[OutboundMessage] | None = None,
     ) -> OutboundMessage | None:
         """Send a message over `path`; None (counted) when there is no room.
 
         `fec`: repair symbols for each source symbol, None: by the path's loss; none at all where they find no room.
         `answers`: the request that it answers, by which `drop_answers` finds it.
+        `copy_of`: the request that it is a copy of.
         `siblings`: what carries the same request already; it becomes one of them.
         """
         if not self.has_room(path.peer, content.size):
@@ -96,7 +121,7 @@ class Outbox:
         symbol = self._routes.symbol_to(path.peer)
         count = symbol_count(content.size, symbol)
         repairs = repair_symbols(count, fec, self._routes.loss(path))
-        if repairs and not self.has_room(path.peer, (count + repairs) * symbol):
+        if repairs and not self._room.fits(path.peer, content.size, (count + repairs) * symbol):
             repairs = 0
         message = OutboundMessage(
             self._take_number(),
@@ -108,6 +133,7 @@ class Outbox:
             symbol=symbol,
             repairs=repairs,
             answers=answers,
+            copy_of=copy_of,
             siblings=siblings,
         )
         self._enter(message)
@@ -120,10 +146,10 @@ class Outbox:
 
     def _enter(self, message: OutboundMessage) -> None:
         self._messages[message.number] = message
+        self._by_peer.setdefault(message.peer, {})[message.number] = message
         if message.answers is not None:
             self._answers.setdefault((message.peer, message.answers), []).append(message)
-        self._shares_of_messages.take(message.peer)
-        self._shares_of_bytes.take(message.peer, message.held_bytes)
+        self._room.take(message)
         self._command(Send(message.path, message))
         if not message.repairs and worth_a_copy(1, self._routes.loss(message.path)):
             # It leaves before the others, so a burst does not take both.
@@ -164,8 +190,12 @@ class Outbox:
     def _remove(self, message: OutboundMessage) -> None:
         message.over = True
         if self._messages.pop(message.number, None) is not None:
-            self._shares_of_messages.give_back(message.peer)
-            self._shares_of_bytes.give_back(message.peer, message.held_bytes)
+            of_peer = self._by_peer.get(message.peer, {})
+            of_peer.pop(message.number, None)
+            if not of_peer:
+                self._by_peer.pop(message.peer, None)
+            self._room.give_back(message)
+            self._made_room = True
             self._parked.get(message.peer, {}).pop(message.number, None)
             if message.answers is not None:
                 self._forget_answer((message.peer, message.answers), message)
@@ -180,12 +210,15 @@ class Outbox:
         answers.remove(message)
         if not answers:
             del self._answers[key]
+            self._answers_over.append(key)
 
-    def drop_peer(self, peer: NodeName) -> None:
-        """The peer's session is over: what was meant for it can not arrive."""
-        for message in [message for message in self._messages.values() if message.peer == peer]:
-            self._remove(message)
+    def drop_peer(self, peer: NodeName) -> list[Step]:
+        """The peer's session is over: what was meant for it cannot arrive. Returns what is left to do."""
+        messages = self._by_peer.pop(peer, {}).values()
+        for message in messages:
+            message.over = True
         self._parked.pop(peer, None)
+        return in_groups(self._remove, messages)
 
     def on_lost(self, event: FragmentsLost, now: float) -> None:
         """Send lost symbols again over the best path to that peer; without one, keep them until there is one."""
@@ -228,24 +261,47 @@ class Outbox:
     def _enter_anew(self, message: OutboundMessage, path: PathId) -> None:
         self._enter(message.cut_anew(self._take_number(), path, self._routes.symbol_to(path.peer)))
 
-    def on_path_up(self, path: PathId) -> None:
-        """Send what waited for a path to this peer."""
-        for message in self._parked.pop(path.peer, {}).values():
-            missing = message.lost(message.give_up())
-            if missing:
-                self._resend(message, path, missing)
+    def on_path_up(self, path: PathId) -> list[Step]:
+        """Return what sends all that waited for a path to this peer."""
+        return [partial(self._send_rest, message) for message in self._parked.pop(path.peer, {}).values()]
 
-    def on_interface_gone(self, interface: InterfaceName, now: float) -> None:
-        """The interface's link is gone with all it had queued: its messages take other paths.
+    def on_interface_gone(self, interface: InterfaceName) -> list[Step]:
+        """The interface's link is gone with all it had queued: returns what gives its messages other paths.
 
         What of them is on its way over another interface travels twice; nobody knows any more which it is.
         """
-        for message in [message for message in self._messages.values() if interface in message.interfaces]:
+        messages = [message for message in self._messages.values() if interface in message.interfaces]
+        for message in messages:
             message.interfaces.discard(interface)
-            self.on_lost(FragmentsLost(message.path, message, message.give_up()), now)
+        return [partial(self._send_rest, message) for message in messages]
 
-    def expire(self, now: float) -> None:
-        """Drop messages whose time is over."""
-        for message in [message for message in self._messages.values() if message.expires <= now]:
+    def _send_rest(self, message: OutboundMessage, now: float) -> None:
+        """Send all that is missing of a message, whatever of it is under way."""
+        self.on_lost(FragmentsLost(message.path, message, message.give_up()), now)
+
+    def ask_again(self) -> None:
+        """Ask after messages that the peer has all of, as far as is known, but has not reported FINISHED.
+
+        That report is lost if the interface went that it waited for, say. One symbol that comes once more brings it.
+        To be called about once a second: what is found so twice is asked after.
+        """
+        start = self._looked_at
+        messages = list(islice(self._messages.values(), start, start + LOOKED_AT_ONCE))
+        self._looked_at = start + LOOKED_AT_ONCE if len(messages) == LOOKED_AT_ONCE else 0
+        for message in messages:
+            if message.acked.count(1) < message.count:
+                message.unreported = False
+            elif not message.unreported:
+                message.unreported = True
+            elif (path := self._routes.best_to(message.peer, size=message.datagram_bytes)) is not None:
+                message.acked[0] = 0
+                self._resend(message, path, (0,))
+
+    def expired(self, now: float) -> list[Step]:
+        """Return what drops the messages whose time is over."""
+        return in_groups(self._expire, [message for message in self._messages.values() if message.expires <= now])
+
+    def _expire(self, message: OutboundMessage) -> None:
+        if not message.over:
             self.drop(message)
             self._stats.dropped["message_expired"] += 1

@@ -6,6 +6,7 @@ import mmap
 
 from sidecar.core import fec
 from sidecar.core.frame import symbol_count
+from sidecar.core.timers import NEVER
 
 LAZY_BYTES = 1024 * 1024
 """From this size on, a buffer's pages are claimed as they are written: announcing 16 MiB must cost nothing."""
@@ -23,6 +24,7 @@ class Partial:
         "_rows",
         "buffer",
         "count",
+        "ends_at",
         "have",
         "missing",
         "number",
@@ -45,6 +47,9 @@ class Partial:
         self.repairs = 0
         """Repair symbols stored."""
         self.touched_at = now
+        self.ends_at = NEVER
+        """When the message is of no use any more: the earliest that a symbol told, as what was under way for longest
+        tells too late an end."""
         self._blocks = fec.block_count(self.count)
         self._rows: dict[int, dict[int, bytes]] = {}
         """Repair symbols by block and row."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core import frame
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
@@ -13,6 +12,7 @@ from sidecar.core.link_events import (
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
+    from sidecar.core import frame
     from sidecar.core.link_mtu import LinkMtu
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_table import PathTable
@@ -43,14 +43,18 @@ class PathKeeper:
         if newly is None:
             self._table.stats.dropped["acks_the_unsent"] += 1
             return
+        # What was declared lost in haste proves life as well as what was not: where round trips grow faster than the
+        # timeouts, all of it is such. Each datagram counts once: what an acknowledgement repeats proves nothing.
         if late := recovery.late(ack, now):
-            _mark_acked(late)
             path.control.policer.on_spurious(sum(run.size for run in late))
-        if not newly:
+        arrived = newly + late
+        if not arrived:
             return
-        _mark_acked(newly)
-        path.sealing.delivered(max(run.at for run in newly))
-        path.mtu.on_delivered(max(run.longest for run in newly))
+        for run in arrived:
+            if run.message is not None:
+                run.message.acked[run.symbol : run.symbol + run.datagrams] = b"\1" * run.datagrams
+        path.sealing.delivered(max(run.at for run in arrived))
+        path.mtu.on_delivered(max(run.longest for run in arrived))
         if recovery.sample is not None:
             path.control.on_acked(recovery.sample, recovery.rtt, now)
         path.note_rtt()
@@ -58,12 +62,14 @@ class PathKeeper:
             self.path_up(path, now)
         self._detect_lost(path, now)
 
-    def probe_answered(self, path: Path, now: float) -> None:
-        """A probe of liveness was answered."""
+    def probe_answered(self, path: Path, sent_at: float, now: float) -> None:
+        """A probe of liveness that left at `sent_at` (s) was answered."""
         path.mtu.on_delivered(0)
+        in_flight = path.recovery.sent
         if path.made_progress(now):
-            # What left before the probe may be lost, and fill a window in which nothing else may leave.
-            path.recovery.ask_at_once(now)
+            if in_flight and in_flight[0].at <= sent_at:
+                # What left before the probe may be lost, and fill a window in which nothing else may leave.
+                path.recovery.ask_at_once(now)
             self.path_up(path, now)
 
     def path_up(self, path: Path, now: float) -> None:
@@ -84,7 +90,7 @@ class PathKeeper:
         state = path.check_silence(now)
         if state is not None:
             if state is PathState.DOWN:
-                self.take_down(path, "silent")
+                self._hand_back(path, "silent", forget=False)
             else:
                 self._events.append(PathChanged(path.id, state, "silent"))
 
@@ -103,11 +109,23 @@ class PathKeeper:
                 self.take_down(path, reason)
 
     def take_down(self, path: Path, reason: str) -> None:
-        """Hand back what the path still carried, then say that it is down."""
+        """It is known that the path is of no use: what it was asked until now proves nothing, whenever it is answered.
+
+        So with an interface without carrier, a driver that hangs, a peer that says goodbye: what they left in a buffer
+        must not bring the path back. One that is down since it is silent comes back by any answer (see `on_timer`):
+        where that is late for a slow path, it is the only sign of life there can be. An answer opens with the keys of
+        this session, is taken once by its packet number, and fits one question of the last LONGEST_ANSWER_S. So who can
+        hold datagrams back, but not forge them, can make a path that died seem alive for so long at most.
+        """
+        path.probing.forget()
         path.go_down()
+        self._hand_back(path, reason, forget=True)
+
+    def _hand_back(self, path: Path, reason: str, *, forget: bool) -> None:
+        """Say that the path is down, and hand back what it still carried."""
         path.control.on_path_down()
         self._events.append(PathChanged(path.id, PathState.DOWN, reason))
-        self._report_lost(path, path.recovery.give_up_all())
+        self._report_lost(path, path.recovery.give_up_all(forget=forget))
         unsent = path.take_pending_finished()
         if unsent:
             self._events.append(FinishedLost(path.id, unsent))
@@ -122,7 +140,7 @@ class PathKeeper:
         self._table.dirty[path.id] = path
         if was_up:
             self._events.append(PathChanged(path.id, path.state, "rebinding"))
-        self._report_lost(path, path.recovery.give_up_all(), timed_out=True)
+        self._report_lost(path, path.recovery.give_up_all(forget=True), timed_out=True)
 
     def _lost(self, path: Path, lost: list[Sent], now: float, *, timed_out: bool = False) -> None:
         self._mtu.lost(path, lost, now)
@@ -139,15 +157,9 @@ class PathKeeper:
                 finished += run.finished
             else:
                 for number in run.finished:
-                    self._table.owe(path, frame.encode_finished(frame.Finished(number)))
+                    self._table.owe_finished(path, number)
         if finished:
             self._events.append(FinishedLost(path.id, tuple(finished)))
         for message, indices in by_message.values():
             if indices:
                 self._events.append(FragmentsLost(path.id, message, tuple(indices), timed_out))
-
-
-def _mark_acked(runs: list[Sent]) -> None:
-    for run in runs:
-        if run.message is not None:
-            run.message.acked[run.symbol : run.symbol + run.datagrams] = b"\1" * run.datagrams

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
+from protos.model import Role
 from sidecar.core.introduction import hello_id
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keys import LinkMemory, PathKeys, make_path_keys
@@ -12,13 +13,17 @@ from sidecar.core.paths import Path
 from sidecar.core.stats import LinkStats
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.datagrams import LinkIdentity
     from sidecar.core.link_events import LinkEvent, LinkPeer
     from sidecar.core.path_keys import KeyLimits
 
 MAX_PENDING_FRAMES = 256
-"""Control frames waiting on one path; a peer that makes us owe more is not honest."""
+"""Control frames waiting on one path besides FINISHED; a peer that makes us owe more is not honest."""
+MAX_PENDING_FINISHED = 8192
+"""FINISHED waiting on one path: as many as an honest peer has undelivered messages to us (`room.py`)."""
 MAX_PATHS_OF_A_PEER = 32
 """Those that a peer introduces itself by included. A further introduction takes the place of one that nothing
 authentic followed; if there is none, it waits for the control plane's word."""
@@ -32,7 +37,8 @@ class PathTable:
     """Paths, who may use them, and what came of them."""
 
     __slots__ = (
-        "_limits", "_memory", "by_hello", "by_session", "closing", "dirty", "events", "identity", "paths", "stats",
+        "_by_peer", "_limits", "_memory", "by_hello", "by_session", "closing", "dirty", "events", "identity", "paths",
+        "stats",
     )  # fmt: skip
 
     def __init__(self, identity: LinkIdentity, memory: LinkMemory, limits: KeyLimits) -> None:
@@ -45,6 +51,7 @@ class PathTable:
         self.by_session: dict[SessionId, LinkPeer] = {}
         self.by_hello: dict[bytes, LinkPeer] = {}
         self.paths: dict[tuple[NodeName, InterfaceId], Path] = {}
+        self._by_peer: dict[NodeName, list[Path]] = {}
         self.dirty: dict[PathId, Path] = {}
         """Paths that may have something to send, or another timer than before."""
         self.closing = False
@@ -70,7 +77,7 @@ class PathTable:
         path = self.paths.get((peer.name, remote))
         if path is not None:
             return path
-        others = [path for path in self.paths.values() if path.peer == peer.name]
+        others = self.to(peer.name)
         if len(others) >= MAX_PATHS_OF_A_PEER:
             # Whoever knows the token could fill the table with interfaces that do not exist.
             unproven = next((path for path in others if path.remote is None and not path.candidates), None)
@@ -78,14 +85,24 @@ class PathTable:
                 self.stats.dropped["paths_full"] += 1
                 return None
             self._drop(unproven)
-        path = self.paths[peer.name, remote] = self._new_path(peer, remote, (), self.next_number, now)
+        path = self._new_path(peer, remote, (), self.next_number, now)
+        self._enter(path)
         return path
+
+    def to(self, peer: NodeName) -> Sequence[Path]:
+        """The paths to one peer."""
+        return self._by_peer.get(peer, ())
+
+    def _enter(self, path: Path) -> None:
+        self.paths[path.peer, path.remote_id] = path
+        self._by_peer.setdefault(path.peer, []).append(path)
 
     def _new_path(
         self, peer: LinkPeer, remote: InterfaceId, addresses: tuple[Address, ...], first_number: int, now: float
     ) -> Path:
         path_id = PathId(self.identity.interface, peer.name, remote)
-        return Path(path_id, peer.session, self._keys(peer, remote, now), addresses, first_number, now)
+        keys, leads = self._keys(peer, remote, now), self.identity.role is Role.ROBOT
+        return Path(path_id, peer.session, keys, addresses, first_number, now, leads=leads)
 
     def _keys(self, peer: LinkPeer, remote: InterfaceId, now: float) -> PathKeys:
         known = self._memory.take(peer.session, remote)
@@ -95,6 +112,7 @@ class PathTable:
 
     def _drop(self, path: Path) -> None:
         del self.paths[path.peer, path.remote_id]
+        self._by_peer[path.peer].remove(path)
         self.dirty.pop(path.id, None)
         self._forget(path)
 
@@ -110,6 +128,16 @@ class PathTable:
         path.pending_by = min(path.pending_by, by)
         self.dirty[path.id] = path
 
+    def owe_finished(self, path: Path, number: int, by: float = 0.0) -> None:
+        """As `owe`: the peer's message with this number is whole."""
+        # A sender that hears nothing asks again (`Outbox.ask_again`).
+        if len(path.finished) >= MAX_PENDING_FINISHED and number not in path.finished:
+            self.stats.dropped["pending_frames_full"] += 1
+            return
+        path.finished[number] = None
+        path.pending_by = min(path.pending_by, by)
+        self.dirty[path.id] = path
+
     def set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> list[Path]:
         """Keep the paths to these peers and begin new ones; returns those that are no more."""
         before = self.paths.copy()
@@ -118,7 +146,9 @@ class PathTable:
         self.by_session = {peer.session: peer for peer in peers}
         self.by_hello = {hello_id(peer.token): peer for peer in peers}
         self.paths.clear()
+        self._by_peer.clear()
         for peer in peers:
+            crowd = sum(len(addresses) for _, addresses in peer.addresses)
             for remote, addresses in peer.addresses:
                 path = before.pop((peer.name, remote), None)
                 if path is not None and path.session == peer.session:
@@ -127,13 +157,14 @@ class PathTable:
                     if path is not None:
                         before[peer.name, remote] = path
                     path = self._new_path(peer, remote, addresses, first_number, now)
-                self.paths[peer.name, remote] = path
-                self.dirty[path.id] = path
+                    self.dirty[path.id] = path
+                path.probing.crowd = crowd
+                self._enter(path)
         for key, path in list(before.items()):
             known = self.by_session.get(path.session)
             if path.state is not PathState.DOWN and known is not None and key not in self.paths:
                 # It proves itself, whatever the control plane's view says: older or newer than what happened here.
-                self.paths[key] = before.pop(key)
+                self._enter(before.pop(key))
         for path in before.values():
             self._forget(path)
         return list(before.values())

@@ -1,14 +1,15 @@
-"""One path: where it leads, whether it lives, when to probe it."""
+"""One path: where it leads, and whether it lives."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from sidecar.core.congestion import CongestionController
-from sidecar.core.frame import FINISHED_TYPE, encode_ack, finished_number
+from sidecar.core.frame import Finished, encode_ack, encode_finished
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
+from sidecar.core.probing import Probing
 from sidecar.core.recovery import Recovery
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.send_queue import SendQueue
@@ -16,28 +17,18 @@ from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
     import random
+    from collections.abc import Collection
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.path_keys import PathKeys
 
-IDLE_PROBE_S = 0.5
-"""A quiet path is probed this often: keeps NAT bindings open (RFC 4787 asks for 2 minutes, real ones forget after
-seconds) and finds a dead path within a second."""
-FIRST_PROBE_S = 0.05
-"""Probes to a path that is not up start this close together ..."""
-MAX_PROBE_S = 1.0
-"""... and back off to this, so that a path that comes back is seen within a second."""
-PROBE_BACKOFF = 1.5
-RETURN_BACKOFF = 1.02
-"""A path that was up is likely to come back, and requests may wait for it: its probes are as far apart as a fiftieth of
-the time that it is down, 0.25 s after ten seconds. Both ends probe, so that the wait is mostly half of that or less."""
 DOWN_FACTOR = 4.0
 """An unstable path is down after this many times the silence that made it unstable, or the longest that anybody waits
 beyond that, ..."""
 DOWN_FLOOR_S = 0.5
 """... but not before this."""
-MAX_PROBES_OUT = 32
-"""Unanswered probes that are remembered; older ones could only give stale round-trip times."""
+DOWN_WAIT_S = 2.0
+"""One whose answers take long is down so much after its next answer is overdue, or after the time that it takes."""
 MAX_RTT_SAMPLES = 512
 """Round-trip times kept between two reports."""
 
@@ -48,16 +39,13 @@ class Path:
     __slots__ = (
         "_introduced",
         "_introducer",
-        "_next_probe_id",
-        "_probe_gap",
-        "_probed_at",
-        "_probes_out",
+        "_oldest_at",
         "_rebound",
         "_waiting_since",
-        "_was_up",
         "bytes_sent",
         "candidates",
         "control",
+        "finished",
         "id",
         "introductions",
         "keys",
@@ -65,7 +53,7 @@ class Path:
         "opening",
         "pending",
         "pending_by",
-        "probe_at",
+        "probing",
         "queue",
         "received",
         "recovery",
@@ -77,6 +65,7 @@ class Path:
         "rtts",
         "sealing",
         "session",
+        "source",
         "state",
     )
 
@@ -88,7 +77,10 @@ class Path:
         candidates: tuple[Address, ...],
         first_number: int,
         now: float,
+        *,
+        leads: bool,
     ) -> None:
+        """`leads`: this end is the one that keeps the path alive (see `Probing`)."""
         self.id = path_id
         self.remote_id: InterfaceId = path_id.remote
         self.session = session
@@ -99,6 +91,8 @@ class Path:
         self.candidates = candidates
         self.remote: Address | None = None
         """Where the newest authentic datagram came from."""
+        self.source: str | None = None
+        """Which of our addresses the kernel sends from to there, as far as the driver knows."""
         self.state = PathState.DOWN
         self.recovery = Recovery(first_number)
         self.control = CongestionController()
@@ -108,29 +102,43 @@ class Path:
         """Where the peer introduced itself from, and the probe that it wants answered there."""
         self.pending: list[bytes] = []
         """Encoded control frames that wait for the next datagram ..."""
+        self.finished: dict[int, None] = {}
+        """... and messages to be reported FINISHED in it ..."""
         self.pending_by = NEVER
         """... which leaves at this moment (s) at the latest; NEVER when none waits."""
-        self.probe_at: float | None = now
+        self.probing = Probing(now, leads=leads)
         self.rtts: list[float] = []
         self.bytes_sent = 0
         self.reported_sent = 0
         self.reported_lost = 0
         self.reported_fates = (0, 0)
-        self._probe_gap = FIRST_PROBE_S
-        self._probed_at = now - FIRST_PROBE_S
-        self._next_probe_id = 0
-        self._probes_out: dict[int, tuple[float, bool]] = {}
-        """When each unanswered probe left, and whether it was sealed with this path's keys."""
         self._introduced = False
         self._introducer: Address | None = None
         self._waiting_since: float | None = None
+        self._oldest_at = now
+        """When the oldest of what waits for an answer left."""
         self._rebound = False
-        self._was_up = False
 
     @property
     def peer(self) -> NodeName:
         """The node at the other end."""
         return self.id.peer
+
+    @property
+    def family(self) -> int | None:
+        """4 or 6: of the address that it leads to; None while none is known."""
+        return None if self.remote is None else 6 if ":" in self.remote[0] else 4
+
+    def leaves_from(self, addresses: Collection[str]) -> bool:
+        """Whether it leaves from one of these, by their family alone if its own address is not known."""
+        if self.source is not None:
+            return self.source in addresses
+        return self.family in {6 if ":" in address else 4 for address in addresses}
+
+    @property
+    def probe_at(self) -> float:
+        """When the next probe leaves (s)."""
+        return self.probing.at
 
     def destinations(self) -> tuple[Address, ...]:
         """Where a probe goes now: the known address, or all that may be it while the path is down or just rebound."""
@@ -161,69 +169,51 @@ class Path:
 
     def next_probe(self, now: float, rng: random.Random) -> int:
         """Return the id of a probe that leaves now, and plan the next one."""
-        self._probed_at = now
-        probe_id = self._note_probe(now, sealed=self.state is not PathState.DOWN)
+        probe_id = self.probing.ask(now, sealed=self.state is not PathState.DOWN)
         self.waits_for_answer(now)
         if self.state is PathState.UP:
-            gap = IDLE_PROBE_S
+            self.probing.plan_up(now, rng)
         elif self.state is PathState.UNSTABLE:
-            gap = max(FIRST_PROBE_S, self.recovery.rtt.smoothed)
+            self.probing.plan_unstable(now, self.recovery.rtt.smoothed, rng)
         else:
-            gap = self._probe_gap
-            backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
-            self._probe_gap = min(gap * backoff, MAX_PROBE_S)
-        self.probe_at = now + gap * rng.uniform(0.9, 1.1)
+            self.probing.plan_down(now, rng)
         return probe_id
 
-    def counter_probe(self, now: float) -> int:
-        """Return the id of a sealed probe that leaves now besides those that are planned."""
-        return self._note_probe(now, sealed=True)
+    def asked(self, now: float) -> None:
+        """The peer probed the path."""
+        if self.state is PathState.UP:
+            self.probing.asked(now)
 
-    def _note_probe(self, now: float, *, sealed: bool) -> int:
-        probe_id = self.take_probe_id()
-        self._probes_out[probe_id] = now, sealed
-        if len(self._probes_out) > MAX_PROBES_OUT:
-            del self._probes_out[next(iter(self._probes_out))]
-        return probe_id
-
-    def take_probe_id(self) -> int:
-        """Return the id of the next probe, of liveness or of size."""
-        probe_id = self._next_probe_id
-        self._next_probe_id = (probe_id + 1) & 0xFFFFFFFF
-        return probe_id
+    def needed(self, now: float) -> None:
+        """Requests go to the peer: it must be known soon whether this path can carry them."""
+        if self.state is PathState.UP:
+            self.probing.needed(now)
 
     def hasten_probe(self, now: float) -> None:
-        """It is time to ask again. Never sooner than FIRST_PROBE_S after the last time, whoever wishes it."""
-        if self.probe_at is not None:
-            self.probe_at = min(self.probe_at, max(now, self._probed_at + FIRST_PROBE_S))
-
-    def probe_soon(self, now: float) -> None:
-        """The path may have come back: probe at once, and the first ones close together."""
-        self._probe_gap = FIRST_PROBE_S
-        self.probe_at = now
+        """It is time to ask again, as far as `Probing.hasten` lets."""
+        self.probing.hasten(now, self.recovery.rtt.smoothed)
 
     def start_afresh(self, now: float) -> None:
         """The way to the peer changed: nothing measured on the old one holds (RFC 9000 section 9.4)."""
         self.recovery.rtt = RttEstimator()
         self.control = CongestionController()
-        self._probes_out.clear()
+        self.probing.forget()
         self._rebound = True
-        self.probe_soon(now)
+        self.probing.begin_again(now)
         if self.state is PathState.UP:
             self.state = PathState.UNSTABLE
-            self._waiting_since = now
+            self._waiting_since = self._oldest_at = now
 
-    def answered_probe(self, probe_id: int, now: float) -> bool:
-        """A PROBE_REPLY came; False when it answers nothing we asked."""
-        probe = self._probes_out.pop(probe_id, None)
+    def answered_probe(self, probe_id: int, now: float) -> float | None:
+        """A PROBE_REPLY came: return when what it answers left (s), None when it answers nothing we asked."""
+        probe = self.probing.answered(probe_id, now)
         if probe is None:
-            return False
-        sent_at, sealed = probe
-        self.recovery.rtt.sample(now - sent_at, now)
-        if sealed:
-            self.sealing.delivered(sent_at)
+            return None
+        self.recovery.rtt.sample(now - probe.sent_at, now)
+        if probe.sealed:
+            self.sealing.delivered(probe.sent_at)
         self.note_rtt()
-        return True
+        return probe.sent_at
 
     @property
     def control_at(self) -> float:
@@ -233,20 +223,18 @@ class Path:
 
     def take_control(self, now: float) -> list[bytes]:
         """Remove and return the control frames that wait, the acknowledgement that is owed included."""
-        if self.received.ack_at is not None:
-            ranges, delay_s = self.received.take_ack(now)
-            self.pending.append(encode_ack(ranges, delay_s))
         taken, self.pending = self.pending, []
+        taken += [encode_finished(Finished(number)) for number in self.take_pending_finished()]
+        if self.received.ack_at is not None:
+            taken.append(encode_ack(*self.received.take_ack(now)))
         self.pending_by = NEVER
         return taken
 
     def take_pending_finished(self) -> tuple[int, ...]:
-        """Remove the FINISHED from the frames that wait, and return which messages they are of."""
-        waiting = [encoded for encoded in self.pending if encoded[0] == FINISHED_TYPE]
-        if waiting:
-            self.pending = [encoded for encoded in self.pending if encoded[0] != FINISHED_TYPE]
-            self.pending_by = self.pending_by if self.pending else NEVER
-        return tuple(map(finished_number, waiting))
+        """Return which messages are to be reported FINISHED, and forget it."""
+        finished = tuple(self.finished)
+        self.finished.clear()
+        return finished
 
     def note_rtt(self) -> None:
         """Keep the latest round-trip time for the next report."""
@@ -275,45 +263,49 @@ class Path:
 
     def _take_fates(self) -> tuple[int, int]:
         """Return how many datagrams arrived and were missed since the last call."""
-        recovery = self.recovery
-        arrived, missed = recovery.total_arrived, recovery.total_missed - recovery.reordering.spurious
-        before, self.reported_fates = self.reported_fates, (arrived, missed)
-        # Late arrivals may be more than what was missed in the meantime.
-        return arrived - before[0], max(0, missed - before[1])
+        arrived, missed = self.recovery.total_arrived, self.recovery.reordering.missed
+        told_arrived, told_missed = self.reported_fates
+        # More may have turned up late than was missed in the meantime: then so many fewer are told next time.
+        self.reported_fates = arrived, max(missed, told_missed)
+        return arrived - told_arrived, max(0, missed - told_missed)
 
     def waits_for_answer(self, now: float) -> None:
         """Something that wants an answer left."""
         if self._waiting_since is None:
-            self._waiting_since = now
+            self._waiting_since = self._oldest_at = now
 
     def made_progress(self, now: float) -> bool:
         """The peer proved that our datagrams arrive; True when that brings the path up."""
-        self._waiting_since = now if self.recovery.sent else None
+        sent = self.recovery.sent
+        self._waiting_since = None
+        if sent:
+            self._waiting_since, self._oldest_at = now, sent[0].at
         self._rebound = False
         if self.state is PathState.UP:
-            if self.probe_at is None or self.probe_at < now + IDLE_PROBE_S / 2:
-                self.probe_at = now + IDLE_PROBE_S
+            self.probing.proven(now)
             return False
         self.state = PathState.UP
         self._introduced, self._introducer = False, None
-        self._was_up = True
-        self._probe_gap = FIRST_PROBE_S
-        self.probe_at = now + IDLE_PROBE_S
+        self.probing.came_up(now)
         return True
 
     @property
     def silence_timer(self) -> float | None:
-        """When the present silence makes the path unstable or down."""
+        """When the present silence makes the path unstable or down.
+
+        Two things must be overdue: any sign of life, by how the path answered until now, and the answer to the oldest
+        of what left, by how long the last one took. Of a path that is in use the first one says more: whatever queue
+        there is, what stands in it arrives one after the other. Of one that rested nothing is to be expected before a
+        round trip is over, and with a queue of others that may be one of many seconds.
+        """
         if self._waiting_since is None or self.state is PathState.DOWN:
             return None
-        return self._waiting_since + self._limit()
-
-    def _limit(self) -> float:
         rtt = self.recovery.rtt
-        limit = rtt.silence_limit()
-        if self.state is PathState.UP:
-            return limit
-        return max(min(DOWN_FACTOR * limit, limit + rtt.longest_wait()), DOWN_FLOOR_S)
+        limit, answer = rtt.silence_limit(), rtt.next_answer()
+        if self.state is not PathState.UP:
+            limit = max(min(DOWN_FACTOR * limit, limit + rtt.longest_wait()), DOWN_FLOOR_S)
+            answer += min(rtt.latest, DOWN_WAIT_S)
+        return max(self._waiting_since + limit, self._oldest_at + answer)
 
     def check_silence(self, now: float) -> PathState | None:
         """Return the new state when the silence changed it."""
@@ -324,12 +316,11 @@ class Path:
             self.state = PathState.UNSTABLE
         else:
             self.go_down()
-        self.probe_at = now
+        self.probing.at = now
         return self.state
 
     def go_down(self) -> None:
-        """Nothing that is under way brings it up again: only what is asked from now on."""
+        """It is as good as dead. What was asked before may still be answered, if the path is slow rather than dead."""
         self.state = PathState.DOWN
         self._waiting_since = None
-        self._probes_out.clear()
         self.mtu.stop()

@@ -64,6 +64,8 @@ class Peers:
         self.refused: dict[NodeName, Refusal] = {}
         """Of the view, so no more than `MAX_PEERS`."""
         self._unlisted: set[NodeName] = set()
+        self._told: dict[NodeName, tuple[Peer, PairKeys, LinkPeer]] = {}
+        """What links were told of each, and what that was made of."""
         self._restarted_at: dict[NodeName, float] = {}
         self._policy = NO_POLICY
         """Fingerprint of the access policy that was judged by last."""
@@ -216,7 +218,15 @@ class Peers:
 
     def for_links(self) -> tuple[LinkPeer, ...]:
         """Return the peers as links need them."""
-        return tuple(_link_peer(peer, self._keys[name]) for name, peer in self._known.items())
+        told = {}
+        for name, peer in self._known.items():
+            keys = self._keys[name]
+            before = self._told.get(name)
+            if before is None or before[0] is not peer or before[1] is not keys:
+                before = peer, keys, _link_peer(peer, keys)
+            told[name] = before
+        self._told = told
+        return tuple(link_peer for _, _, link_peer in told.values())
 
 
 def _link_peer(peer: Peer, keys: PairKeys) -> LinkPeer:

@@ -142,7 +142,8 @@ class PathMtu:
         if size > self.size:
             self.size = size
             self._forgive()
-            if self._target is not None and self._target <= size:
+            if self._target is None or self._target <= size:
+                # Also when it comes so late that the search was given up.
                 self._target = None
                 self._at = now
         return True

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PTO_DATAGRAMS = 2
 """How many of the oldest datagrams a probe timeout gives up (RFC 9002 section 6.2.4 allows two probes)."""
 MAX_PTO_BACKOFF = 6
-"""Probe timeouts stop doubling here, or when they are as long as anybody waits on this path."""
+"""Probe timeouts stop doubling here, or when they are as long as anybody waits on this path, or as an answer takes."""
 
 _first = attrgetter("first")
 
@@ -40,7 +40,6 @@ class Recovery:
         "sent",
         "total_arrived",
         "total_lost",
-        "total_missed",
         "total_sent",
     )
 
@@ -58,8 +57,6 @@ class Recovery:
         self.total_lost = 0
         self.total_arrived = 0
         """Acknowledged datagrams, of those that are (ack-eliciting ones)."""
-        self.total_missed = 0
-        """Those lost while the path lived, the ones that turned up late included."""
         self._next_number = first_number
         self._lost_at: float | None = None
         self._pto_count = 0
@@ -153,7 +150,15 @@ class Recovery:
 
     def late(self, ack: AckFrame, now: float) -> list[Sent]:
         """Return what an acknowledgement says to have arrived although it was declared lost."""
-        return self.reordering.late(ack.ranges, self.rtt, now)
+        arrived = self.reordering.late(ack.ranges, self.rtt, now)
+        if arrived:
+            # Where every answer takes longer than the timeouts, these are all that tell how long.
+            self._pto_count = 0
+            newest_at = next((run.at for run in arrived if run.end == ack.ranges[0][1] + 1), None)
+            if newest_at is not None:
+                self.rtt.sample(now - newest_at, now, ack.delay_s)
+        self.reordering.overtaken(self.largest_acked)
+        return arrived
 
     def detect_lost(self, now: float) -> list[Sent]:
         """Return what packet and time threshold call lost by now, and arm the time threshold for the rest."""
@@ -194,17 +199,23 @@ class Recovery:
     def ask_at_once(self, now: float) -> None:
         """The path answers again, but not about what is in flight: the probe timeout is now, however long it was."""
         self._pto_count = 0
-        self.last_eliciting_at = now - self.rtt.longest_wait()
+        self.last_eliciting_at = now - self._longest_timeout()
 
-    def give_up_all(self) -> list[Sent]:
-        """The path is dead: everything in flight counts as lost."""
+    def give_up_all(self, *, forget: bool) -> list[Sent]:
+        """The path is dead: everything in flight counts as lost.
+
+        With `forget`, what is acknowledged of it later proves nothing.
+        """
         lost, self.sent = self.sent, []
         self._lost_at = None
+        if forget:
+            self.reordering.forget()
+        else:
+            self.reordering.note_given_up(lost)
         return self._forget(lost)
 
     def _lose(self, lost: list[Sent], *, by_threshold: bool) -> list[Sent]:
         if lost:
-            self.total_missed += sum(run.datagrams for run in lost)
             self.reordering.note_lost(lost, by_threshold=by_threshold)
         return self._forget(lost)
 
@@ -225,4 +236,7 @@ class Recovery:
         if not self.sent:
             return None
         timeout = self.rtt.probe_timeout(MAX_ACK_DELAY_S) * (1 << self._pto_count)
-        return self.last_eliciting_at + min(timeout, self.rtt.longest_wait())
+        return self.last_eliciting_at + min(timeout, self._longest_timeout())
+
+    def _longest_timeout(self) -> float:
+        return max(self.rtt.longest_wait(), self.rtt.next_answer())

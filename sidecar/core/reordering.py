@@ -1,18 +1,25 @@
-"""How much a path reorders, seen from losses that were none: what was declared lost and acknowledged all the same.
+"""What was declared lost and is acknowledged all the same: it tells that the path lives, and how much it reorders.
 
 Radio links retransmit below us, so that some datagrams are overtaken by many. As long as that is not seen, three later
 acknowledgements prove a loss (RFC 9002 section 6.1.1). Once it is, only time does, and the time threshold grows by how
 much too early it was, to one round trip more at most (after RACK, RFC 8985 section 6.2, steps 2 and 4).
+
+Where round trips grow by seconds at once, everything is declared lost before its acknowledgement comes. Packet numbers
+are never used twice, so each such acknowledgement tells how long the path takes now.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
+from enum import Enum, auto
 from itertools import takewhile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+from sidecar.core.rtt import LONGEST_ANSWER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from sidecar.core.rtt import RttEstimator
     from sidecar.core.sent import Sent
@@ -24,21 +31,46 @@ PERSISTS = 16
 MAX_REMEMBERED = 64
 """Lost runs whose late acknowledgement is still noticed; beyond that the oldest are forgotten."""
 MEMORY_FACTOR = 4.0
-"""They are forgotten after this many probe timeouts: a later acknowledgement is not reordering."""
+"""What is acknowledged after this many probe timeouts was not overtaken: the path was slow, or away."""
+
+
+class _Why(Enum):
+    THRESHOLD = auto()
+    """Others arrived that left later: it is missing."""
+    TIMEOUT = auto()
+    """Nothing arrived: whether it is missing is not known yet."""
+    OVERTAKEN = auto()
+    """Nothing arrived at first, then something that left later."""
+    OUTAGE = auto()
+    """The path went down."""
+
+
+_MISSING = frozenset({_Why.THRESHOLD, _Why.OVERTAKEN})
+
+
+class _Lost(NamedTuple):
+    run: Sent
+    why: _Why
 
 
 class Reordering:
     """Lost datagrams of one path that may still turn up, and what follows for the thresholds."""
 
-    __slots__ = ("_extra_s", "_lost", "_persists", "spurious")
+    __slots__ = ("_extra_s", "_lost", "_persists", "missed", "spurious")
 
     def __init__(self) -> None:
-        self._lost: deque[tuple[Sent, bool]] = deque(maxlen=MAX_REMEMBERED)
-        """With whether a threshold said so (and not a probe timeout)."""
+        self._lost: deque[_Lost] = deque(maxlen=MAX_REMEMBERED)
         self._extra_s = 0.0
         self._persists = 0
         self.spurious = 0
         """Datagrams declared lost that had arrived."""
+        self.missed = 0
+        """Datagrams known to be missing while others arrived; it falls by those that turn up."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether `forget_old` may have something to do."""
+        return bool(self._lost)
 
     @property
     def packet_threshold(self) -> int | None:
@@ -51,50 +83,84 @@ class Reordering:
 
     def note_lost(self, lost: Sequence[Sent], *, by_threshold: bool) -> None:
         """These were declared lost."""
-        self._lost.extend((run, by_threshold) for run in lost)
+        why = _Why.THRESHOLD if by_threshold else _Why.TIMEOUT
+        self._remember(lost, why)
+        if by_threshold:
+            self.missed += sum(run.datagrams for run in lost)
         if by_threshold and self._persists:
             self._persists -= 1
             if not self._persists:
                 self._extra_s = 0.0
 
+    def note_given_up(self, lost: Sequence[Sent]) -> None:
+        """The path went down with these in flight."""
+        self._remember(lost, _Why.OUTAGE)
+
+    def _remember(self, lost: Iterable[Sent], why: _Why) -> None:
+        # What it reported FINISHED travels again by then, and there may be many.
+        self._lost.extend(_Lost(run._replace(finished=()) if run.finished else run, why) for run in lost)
+
     def late(self, ranges: Sequence[tuple[int, int]], rtt: RttEstimator, now: float) -> list[Sent]:
         """Take an acknowledgement's ranges (inclusive); returns what of the lost it acknowledges."""
         if not self._lost:
             return []
-        limit = now - MEMORY_FACTOR * rtt.probe_timeout(0.0)
+        rising = ranges[::-1]
+        highs = [high for _, high in rising]
+        overtaken_since = now - MEMORY_FACTOR * rtt.probe_timeout(0.0)
         arrived: list[Sent] = []
-        kept: list[tuple[Sent, bool]] = []
-        for run, by_threshold in self._lost:
-            if run.at < limit:
+        kept: list[_Lost] = []
+        for lost in self._lost:
+            run, why = lost
+            if run.at < now - LONGEST_ANSWER_S:
                 continue
-            parts = _covered(run, ranges)
+            parts = _covered(run, rising, highs)
             if not parts:
-                kept.append((run, by_threshold))
+                kept.append(lost)
                 continue
             arrived += parts
-            kept += [(part, by_threshold) for part in _gaps(run, parts)]
-            if by_threshold:
+            kept += [_Lost(part, why) for part in _gaps(run, parts)]
+            count = sum(part.datagrams for part in parts)
+            self.spurious += count
+            if why in _MISSING:
+                self.missed -= count
+            if why is _Why.THRESHOLD and run.at >= overtaken_since:
                 self._persists = PERSISTS
                 self._extra_s = max(self._extra_s, now - run.at - rtt.loss_delay())
         self._lost = deque(kept, MAX_REMEMBERED)
-        self.spurious += sum(run.datagrams for run in arrived)
         return arrived
 
-    def forget_old(self, rtt: RttEstimator, now: float) -> None:
-        """Let go of what can not turn up any more: it holds its message in memory."""
-        limit = now - MEMORY_FACTOR * rtt.probe_timeout(0.0)
+    def overtaken(self, largest_acked: int) -> None:
+        """This packet number arrived: of what was given up without any news, all that left before is missing."""
         lost = self._lost
-        for _ in list(takewhile(lambda item: item[0].at < limit, lost)):
+        for position, (run, why) in enumerate(lost):
+            if why is _Why.TIMEOUT and run.end <= largest_acked:
+                lost[position] = _Lost(run, _Why.OVERTAKEN)
+                self.missed += run.datagrams
+
+    def forget_old(self, now: float) -> None:
+        """Let go of what can not turn up any more, and of messages that are over: memory holds neither."""
+        lost = self._lost
+        for _ in list(takewhile(lambda item: item.run.at < now - LONGEST_ANSWER_S, lost)):
             lost.popleft()
+        for position, (run, why) in enumerate(lost):
+            if run.message is not None and run.message.over:
+                lost[position] = _Lost(run._replace(message=None), why)
+
+    def forget(self) -> None:
+        """What is acknowledged from now on of what was lost until now proves nothing."""
+        self._lost.clear()
 
 
-def _covered(run: Sent, ranges: Sequence[tuple[int, int]]) -> list[Sent]:
-    """The parts of a run that inclusive ranges, highest first, cover; lowest first."""
+def _covered(run: Sent, ranges: Sequence[tuple[int, int]], highs: Sequence[int]) -> list[Sent]:
+    """The parts of a run that inclusive ranges cover; `highs` are their ends. All lowest first."""
     parts = []
-    for low, high in reversed(ranges):
-        first, end = max(low, run.first), min(high + 1, run.end)
-        if first < end:
-            parts.append(run.cut(first, end))
+    position = bisect_left(highs, run.first)
+    while position < len(ranges):
+        low, high = ranges[position]
+        if low >= run.end:
+            break
+        position += 1
+        parts.append(run.cut(max(low, run.first), min(high + 1, run.end)))
     return parts
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+from sidecar.core.backlog import Backlog
+from sidecar.core.request_index import RequestIndex
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,3 +37,5 @@ class RequestParts:
     """Asks the links to look for a path to any of these peers."""
     budgets: tuple[Budget, ...] = ()
     """What extra copies may cost."""
+    backlog: Backlog = field(default_factory=Backlog)
+    in_flight: RequestIndex = field(default_factory=RequestIndex)

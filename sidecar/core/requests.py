@@ -12,6 +12,7 @@ the network is known to be longer than that, and is reported so.
 from __future__ import annotations
 
 import heapq
+from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
@@ -19,7 +20,7 @@ from protos.model import Assignment
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
-from sidecar.core.dispatching import Dispatching
+from sidecar.core.dispatching import MAX_COPIES, Dispatching
 from sidecar.core.events import (
     DeadlineMissed,
     RequestFailed,
@@ -38,17 +39,23 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection, Iterable, Iterator
 
     from protos.model import NodeName, ServiceName
+    from sidecar.core.backlog import Step
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.request_parts import RequestParts
     from sidecar.core.rules import ServiceRule
 
 MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""
+RETRY_S = 0.05
+"""Twice this, doubled with each copy, until a request that was refused for the moment is asked again, ..."""
+MAX_RETRY_S = 2.0
+"""... and no longer than this for the first MAX_COPIES; after that the time doubles again, so that a server that takes
+minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
-"""Payloads of those requests, which may wait for the first path to a server: as much as the outbox takes."""
+"""Payloads of requests until the last copy of each has ended, also while they wait for a path or for room."""
 
 
 class RequestTable:
@@ -56,11 +63,12 @@ class RequestTable:
 
     def __init__(self, parts: RequestParts) -> None:
         self._parts = parts
-        self._requests: dict[RequestId, Request] = {}
+        self._requests = parts.in_flight
+        self._backlog = parts.backlog
         self._timers: list[tuple[float, RequestId]] = []
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
-        self._no_room = NoRoom()
+        self._no_room = NoRoom(self._dispatching, parts.routes)
         self.unanswered = 0
         self._held_bytes = 0
 
@@ -80,17 +88,24 @@ class RequestTable:
         request = Request(request_id, service, kind, rule, payload, now, size_class)
         problem = self._problem(request)
         if problem:
-            self._parts.stats.requests[service, "rejected"] += 1
-            self._parts.measurements.outcome(service, "rejected")
-            self._parts.emit(RequestFailed(request_id, service, "rejected", problem, 0.0))
+            self.reject(request_id, service, problem)
             return
-        self._requests[request_id] = request
+        request.size = self._dispatching.encode(request, payload, now).size
+        self._requests.add(request)
         self.unanswered += 1
-        self._held_bytes += len(payload)
+        self._held_bytes += request.held
         heapq.heappush(self._timers, (request.deadline_at, request_id))
         request.dark = self._parts.routes.dark(self._parts.offers.servers(service))
         self._dispatch(request, now)
-        self._notice_unreachable(request)
+        if request in self._no_room:
+            self.on_room(now)  # it may be more urgent than those that wait, or small enough
+        self._notice_unreachable(request, now)
+
+    def reject(self, request_id: RequestId, service: ServiceName, why: str) -> None:
+        """A request is not taken on."""
+        self._parts.stats.requests[service, "rejected"] += 1
+        self._parts.measurements.outcome(service, "rejected")
+        self._parts.emit(RequestFailed(request_id, service, "rejected", why, 0.0))
 
     def answered_here(self, request_id: RequestId, now: float) -> None:
         """The application has its answer, not from the network. The request ends at its deadline at the latest."""
@@ -110,39 +125,46 @@ class RequestTable:
             return f"{MAX_IN_FLIGHT} requests are in flight already"
         if self._held_bytes + size > MAX_HELD_BYTES:
             return f"the requests in flight have {self._held_bytes} bytes already"
-        servers = self._parts.offers.servers(request.service)
-        if servers and not self._dispatching.with_room(servers, size):
-            return "too much waits to be sent already"
         if request.id in self._requests:
             return "a request with this identity is in flight already"
         return None
 
     def _dispatch(self, request: Request, now: float) -> None:
-        self._look_at(request, self._dispatching.start(request, now))
-        if request.copies:
-            self._no_room.remove(request)
-        elif self._finds_no_room(request):
-            self._no_room.add(request)
+        """Send a request without copies, unless others wait for the same room."""
+        if request not in self._no_room:
+            self._start(request, self._no_room.open_to(request), now)
 
-    def _finds_no_room(self, request: Request) -> bool:
-        servers = self._parts.offers.servers(request.service)
-        reached = tuple(server for server in servers if self._parts.routes.reaches(server))
-        return bool(reached) and not self._dispatching.with_room(reached, len(request.payload or b""))
+    def _start(self, request: Request, servers: list[NodeName], now: float) -> None:
+        self._look_at(request, self._dispatching.start(request, servers, now))
+        self._no_room.consider(request)
 
     def on_room(self, now: float) -> None:
-        """Less waits to be sent than before: send what found no room, in order of arrival."""
-        for service in self._no_room.services():
-            while (request := self._no_room.first(service)) and not self._finds_no_room(request):
-                self._no_room.remove(request)
-                if not request.answered_here:
-                    self._dispatch(request, now)
+        """Less waits to be sent than before: send what found no room, each in its turn."""
+        if len(self._no_room):
+            self._backlog.add(partial(self._those_with_room, now), now, "room")
+
+    def _those_with_room(self, now: float) -> Iterator[Step]:
+        for request, servers in self._no_room.going(now):
+            yield partial(self._go, request, servers)
+
+    def _go(self, request: Request, servers: list[NodeName], now: float) -> None:
+        if request.done or request.answered_here:
+            return
+        if request.copies:
+            self._rescue(request, now)
+        else:
+            self._start(request, servers, now)
 
     def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
         """See `Dispatching.rescue`. A copy that is alone is looked at as the first one was."""
         alone = not request.relied_on()
         self._dispatching.rescue(request, now, insist=insist, rejected=rejected)
         if alone and request.relied_on():
+            self._no_room.remove(request)
             self._look_at(request, self._dispatching.first_look(request, now))
+        elif request.may_be_sent():
+            self._no_room.consider(request, rejected=rejected)
+            self._requests.strand(request)
 
     def _look_at(self, request: Request, when: float | None) -> None:
         if when is not None:
@@ -213,10 +235,28 @@ class RequestTable:
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
         if not request.done:
             self._rescue(request, now, rejected=True)
-            if not request.pending():
+            if not request.pending() and request not in self._no_room:
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
-                self._fail(request, "rejected", reason, now)
+                if rejection.reason.may_pass and request.may_be_sent():
+                    self._wait_out(request, reason, now)
+                elif request.may_be_sent() and self._dispatching.candidates(request, rejected=True):
+                    # Another server offers it, and is out of reach at present: its first path that is up takes it.
+                    request.refusal = reason
+                    self._requests.strand(request)
+                    self._tell_unreachable(request)
+                else:
+                    self._fail(request, "rejected", reason, now)
         self._settle(request, now)
+
+    def _wait_out(self, request: Request, reason: str, now: float) -> None:
+        """Its servers restart, as it seems: it waits for the first that is back, and asks them now and then."""
+        request.refusal = reason
+        self._requests.strand(request)
+        copies = len(request.copies)
+        retry_s = min(RETRY_S * 2**copies, MAX_RETRY_S) * 2 ** max(0, copies - MAX_COPIES)
+        request.retry_at = now + retry_s
+        self._look_at(request, request.retry_at)
+        self._tell_unreachable(request)
 
     def _find(self, server: NodeName, request_id: RequestId, number: int) -> tuple[Request, Copy] | None:
         dropped = self._parts.stats.dropped
@@ -238,44 +278,87 @@ class RequestTable:
 
     def on_peer_gone(self, peer: NodeName, now: float) -> None:
         """A peer's session ended: its copies get no answer any more."""
-        for request in list(self._requests.values()):
-            hit = [copy for copy in request.pending() if copy.path.peer == peer]
-            for copy in hit:
-                copy.state = CopyState.DEAD
-                copy.message.newest.stand_down()
-                self._lost(request, copy, delivered=True)
-            if hit and not request.done:
-                self._rescue(request, now)
-                if not request.pending() and not request.rule.idempotent:
-                    self._fail(request, "failed", f"{peer} went away; it may have run the request", now)
-            self._settle(request, now)
+        copies = self._requests.take_copies_at(peer)
+        if copies:
+            self._backlog.add(lambda: (partial(self._on_copy_dead, *each) for each in copies), now)
+
+    def _on_copy_dead(self, request: Request, copy: Copy, now: float) -> None:
+        if copy.state is not CopyState.PENDING:
+            return
+        if copy.message.may_have_left:
+            copy.state = CopyState.DEAD
+            copy.message.newest.stand_down()
+            self._lost(request, copy, delivered=True)
+        else:
+            self._dispatching.never_left(request, copy, now)
+        if not request.done:
+            self._rescue(request, now)
+            if not request.pending():
+                if request.may_be_sent():
+                    self._requests.strand(request)
+                else:
+                    self._fail(request, "failed", f"{copy.path.peer} went away; it may have run the request", now)
+        self._settle(request, now)
 
     def on_path_changed(self, path: PathId, state: PathState, now: float) -> None:
         """Bring requests whose copies are in trouble to another path."""
-        for request in list(self._requests.values()):
-            if request.done or request.answered_here:
-                continue
-            if state is not PathState.UP:
-                hit = [copy for copy in request.pending() if copy.path == path]
-                for copy in hit:
-                    copy.message.newest.stand_down()
-                if hit:
-                    self._rescue(request, now)
-                self._notice_unreachable(request)
-            else:
-                self._reconsider(request, now)
+        if state is PathState.UP:
+            self._backlog.add(self._in_trouble, now, "in trouble")
+            self.on_room(now)
+            return
+        self._backlog.add(partial(self._look_after_path, path), now, path)
+        if state is PathState.DOWN and not self._parts.routes.reaches(path.peer):
+            for service in self._requests.services():
+                if not self._parts.routes.reaches_any(self._parts.offers.servers(service)):
+                    self._backlog.add(partial(self._unreachable, service), now, ("unreachable", service))
+
+    def _look_after_path(self, path: PathId) -> Iterator[Step]:
+        return self._each(self._look_after, self._requests.over(path))
+
+    @staticmethod
+    def _each(act: Callable[[Request, float], None], requests: Iterable[Request]) -> Iterator[Step]:
+        return (partial(act, request) for request in requests)
+
+    def _in_trouble(self) -> Iterator[Step]:
+        """Look after what is nowhere, or only where nothing is heard of it."""
+        yield from self._each(self._look_after, self._requests.stranded())
+        for path in self._requests.paths():
+            if self._parts.routes.state(path) is not PathState.UP:
+                yield from self._each(self._look_after, self._requests.over(path))
+
+    def _unreachable(self, service: ServiceName) -> Iterator[Step]:
+        return self._each(self._notice_unreachable, self._requests.of(service))
+
+    def _look_after(self, request: Request, now: float) -> None:
+        """A path of this request changed: its copies on others than those that are up are not relied on."""
+        if request.done or request.answered_here or request.id not in self._requests:
+            return
+        for copy in request.pending():
+            if self._parts.routes.state(copy.path) is not PathState.UP:
+                copy.message.newest.stand_down()
+        self._reconsider(request, now)
 
     def on_servers_gained(self, services: Collection[ServiceName], now: float) -> None:
         """Bring requests that wait for a server to one that offers their service from now on."""
-        for request in list(self._requests.values()):
-            if request.service in services and not request.done and not request.answered_here:
-                self._reconsider(request, now)
+        for service in services:
+            requests = self._requests.of(service)
+            if requests:
+                self._backlog.add(partial(self._each, self._ask_now, requests), now, ("gained", service))
+        self.on_room(now)
 
-    def on_withdrawn(self, service: ServiceName, reason: str, now: float) -> None:
-        """The service is not offered here any more: what waits gets no answer, and is told so now."""
-        for request in list(self._requests.values()):
-            if request.service == service and not request.done:
-                self._end(request, f"withdrawn: {reason}", now)
+    def _ask_now(self, request: Request, now: float) -> None:
+        """Whoever refused it for the moment, another server has come, or the same one anew."""
+        request.retry_at = None
+        self._look_after(request, now)
+
+    def withdraw(self, service: ServiceName, reason: str) -> list[Step]:
+        """Return what ends each request that waits at a service which is not offered here any more."""
+        why = f"withdrawn: {reason}"
+        return [partial(self._withdraw, request, why) for request in self._requests.of(service)]
+
+    def _withdraw(self, request: Request, why: str, now: float) -> None:
+        if not request.done:
+            self._end(request, why, now)
 
     def _reconsider(self, request: Request, now: float) -> None:
         """There is one more way to a server: send what had none, or whose copies are all in trouble."""
@@ -284,21 +367,25 @@ class RequestTable:
         else:
             self._dispatch(request, now)
 
-    def _notice_unreachable(self, request: Request) -> None:
+    def _notice_unreachable(self, request: Request, _now: float) -> None:
         if request.rule.fallback is None or request.found_unreachable or request.done:
             return
-        if not any(self._parts.routes.reaches(server) for server in self._parts.offers.servers(request.service)):
+        if not self._parts.routes.reaches_any(self._parts.offers.servers(request.service)):
+            self._tell_unreachable(request)
+
+    def _tell_unreachable(self, request: Request) -> None:
+        if request.rule.fallback is not None and not request.found_unreachable:
             request.found_unreachable = True
             self._parts.emit(Unreachable(request.id, request.service))
 
     def on_copy_lost(self, message: OutboundMessage, now: float) -> None:
         """Nothing is heard of a message: if it is a copy with a backup, that one is sent now."""
-        for request in list(self._requests.values()):
-            if request.done or request.rule.redundancy is not RedundancyMode.BACKUP:
-                continue
-            waiting = request.relied_on()
-            if len(waiting) == 1 and waiting[0].message.newest is message:
-                self._rescue(request, now, insist=True)
+        request = None if message.copy_of is None else self._requests.get(message.copy_of)
+        if request is None or request.done or request.rule.redundancy is not RedundancyMode.BACKUP:
+            return
+        waiting = request.relied_on()
+        if len(waiting) == 1 and waiting[0].message.newest is message:
+            self._rescue(request, now, insist=True)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
@@ -309,8 +396,8 @@ class RequestTable:
         return self._timers[0][0] if self._timers else None
 
     def handle_timer(self, now: float) -> None:
-        """Deadlines and lifetimes that are over."""
-        while self._timers and self._timers[0][0] <= now:
+        """Deadlines and lifetimes that are over, as many as the turn has room for."""
+        while self._timers and self._timers[0][0] <= now and self._backlog.allows(now):
             _, request_id = heapq.heappop(self._timers)
             request = self._requests.get(request_id)
             if request is None:
@@ -318,6 +405,9 @@ class RequestTable:
             if request.expires_at <= now:
                 self._expire(request, now)
                 continue
+            if request.retry_at is not None and request.retry_at <= now:
+                request.retry_at = None
+                self._look_after(request, now)
             if now < request.deadline_at:
                 self._look_at(request, self._dispatching.look_again(request, now))
                 continue
@@ -329,7 +419,7 @@ class RequestTable:
                 self._end_answered_here(request, now)
             elif not request.missed:
                 self._miss(request)
-                if request.rule.idempotent:
+                if request.rule.idempotent and request not in self._no_room:  # it does not get past those that wait
                     self._rescue(request, now, insist=True)
 
     def _miss(self, request: Request) -> None:
@@ -355,8 +445,8 @@ class RequestTable:
             self._parts.measurements.lost(request.carried(copy), delivered=delivered)
 
     def _expire(self, request: Request, now: float) -> None:
-        unsent = "no room to send it" if request in self._no_room else "no path to any server"
-        why = "no answer" if request.copies else unsent
+        unsent = request.refusal or ("no room to send it" if request in self._no_room else "no path to any server")
+        why = unsent if request.certainly_not_run() else "no answer"
         self._end(request, f"{why} within {request.rule.lifetime_s:g} s", now)
 
     def _end(self, request: Request, reason: str, now: float) -> None:
@@ -376,7 +466,6 @@ class RequestTable:
     def _finish(self, request: Request, outcome: str) -> None:
         request.done = True
         self._no_room.remove(request)
-        self._held_bytes -= len(request.payload or b"")
         request.payload = None
         self.unanswered -= 1
         self._parts.stats.requests[request.service, outcome] += 1
@@ -391,6 +480,8 @@ class RequestTable:
                     self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
-            self._requests.pop(request.id, None)
+            if request.id in self._requests:
+                self._requests.remove(request)
+                self._held_bytes -= request.held
             request.messages.clear()
             self._measure(request, now)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
@@ -11,10 +13,11 @@ from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import BASE_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from protos.model import InterfaceName, NodeName
 
+_order = attrgetter("order")
 _RANK = {PathState.UP: 0, PathState.UNSTABLE: 1, PathState.DOWN: 2}
 
 
@@ -28,11 +31,26 @@ class Route:
     max_datagram: int = BASE_BYTES
     """Bytes of UDP payload."""
     estimate: LossEstimate = field(default_factory=LossEstimate)
+    order: tuple[int, float, PathId] = field(init=False)
+    """Sorts the better path first; kept ready, as every request asks for that of every path."""
 
-    @property
-    def order(self) -> tuple[int, float, PathId]:
-        """Sorts the better path first."""
-        return (_RANK[self.state], self.smoothed_rtt_s, self.id)
+    def __post_init__(self) -> None:
+        self._set_order()
+
+    def set_state(self, state: PathState) -> None:
+        """Note its liveness."""
+        self.state = state
+        if state is PathState.DOWN:
+            self.max_datagram = BASE_BYTES
+        self._set_order()
+
+    def set_rtt(self, smoothed_rtt_s: float) -> None:
+        """Note its smoothed round-trip time."""
+        self.smoothed_rtt_s = smoothed_rtt_s
+        self._set_order()
+
+    def _set_order(self) -> None:
+        self.order = (_RANK[self.state], self.smoothed_rtt_s, self.id)
 
 
 class Routes:
@@ -41,13 +59,23 @@ class Routes:
     def __init__(self) -> None:
         self._routes: dict[PathId, Route] = {}
         self._by_peer: dict[NodeName, dict[PathId, Route]] = {}
+        self._reached: set[NodeName] = set()
+        self._counts: dict[InterfaceName, Counter[PathState]] = {}
+        self.best: Mapping[InterfaceName, PathState] = {}
+        """The best state of the paths over each of our interfaces that has some; another object when one changes."""
 
     def set_state(self, path: PathId, state: PathState) -> None:
         """Note a path's liveness."""
         route = self._get(path)
-        route.state = state
-        if state is PathState.DOWN:
-            route.max_datagram = BASE_BYTES
+        self._count(path, route.state, state)
+        route.set_state(state)
+        self._look_whether_reached(path.peer)
+
+    def _look_whether_reached(self, peer: NodeName) -> None:
+        if any(route.state is not PathState.DOWN for route in self._by_peer.get(peer, {}).values()):
+            self._reached.add(peer)
+        else:
+            self._reached.discard(peer)
 
     def set_max_datagram(self, path: PathId, size: int) -> None:
         """Note how long a path's datagrams may be, in bytes of UDP payload."""
@@ -55,7 +83,7 @@ class Routes:
 
     def set_rtt(self, path: PathId, smoothed_rtt_s: float) -> None:
         """Note a path's smoothed round-trip time."""
-        self._get(path).smoothed_rtt_s = smoothed_rtt_s
+        self._get(path).set_rtt(smoothed_rtt_s)
 
     def rtt(self, path: PathId) -> float:
         """Return a path's smoothed round-trip time in seconds, 0 while none is known."""
@@ -83,19 +111,35 @@ class Routes:
         if route is None:
             route = self._routes[path] = Route(path)
             self._by_peer.setdefault(path.peer, {})[path] = route
+            self._count(path, None, route.state)
         return route
+
+    def _count(self, path: PathId, before: PathState | None, after: PathState | None) -> None:
+        """A path's state is another; None: there is no such path."""
+        interface = path.interface
+        counts = self._counts.setdefault(interface, Counter())
+        if before is not None:
+            counts[before] -= 1
+        if after is not None:
+            counts[after] += 1
+        best = next((state for state in _RANK if counts[state]), None)
+        if best is not self.best.get(interface):
+            others = {name: state for name, state in self.best.items() if name != interface}
+            self.best = others if best is None else others | {interface: best}
 
     def forget_peer(self, peer: NodeName) -> None:
         """The peer is not to be talked to any more."""
         for path in self._by_peer.pop(peer, {}):
-            del self._routes[path]
+            self._count(path, self._routes.pop(path).state, None)
+        self._reached.discard(peer)
 
     def forget_interface(self, interface: InterfaceName) -> list[PathId]:
         """The interface is gone; returns the paths it had."""
         paths = [path for path in self._routes if path.interface == interface]
         for path in paths:
-            del self._routes[path]
+            self._count(path, self._routes.pop(path).state, None)
             del self._by_peer[path.peer][path]
+            self._look_whether_reached(path.peer)
         return paths
 
     def state(self, path: PathId) -> PathState:
@@ -105,7 +149,11 @@ class Routes:
 
     def reaches(self, peer: NodeName) -> bool:
         """Whether any path to the peer is not down."""
-        return any(route.state is not PathState.DOWN for route in self._by_peer.get(peer, {}).values())
+        return peer in self._reached
+
+    def reaches_any(self, peers: Iterable[NodeName]) -> bool:
+        """Whether any path to any of these peers is not down."""
+        return not self._reached.isdisjoint(peers)
 
     def dark(self, peers: Iterable[NodeName]) -> tuple[InterfaceName, ...]:
         """Return our interfaces over which there are paths to these peers, but none that is up."""
@@ -117,8 +165,16 @@ class Routes:
 
     def usable(self, peers: Iterable[NodeName]) -> list[Route]:
         """Return the paths to these peers that are not down, best first."""
-        routes = (route for peer in peers for route in self._by_peer.get(peer, {}).values())
-        return sorted((route for route in routes if route.state is not PathState.DOWN), key=lambda route: route.order)
+        return sorted(
+            (
+                route
+                for peer in peers
+                if peer in self._reached
+                for route in self._by_peer[peer].values()
+                if route.state is not PathState.DOWN
+            ),
+            key=_order,
+        )
 
     def all_to(self, peer: NodeName) -> list[Route]:
         """Return every known path to the peer."""
@@ -135,7 +191,7 @@ class Routes:
             for path, route in self._by_peer.get(peer, {}).items()
             if path.interface == interface and route.state is not PathState.DOWN
         ]
-        return min(routes, key=lambda route: route.order, default=None)
+        return min(routes, key=_order, default=None)
 
     def best_to(self, peer: NodeName, avoid: PathId | None = None, size: int = 0) -> PathId | None:
         """Return the best path to the peer that is not down, preferably one that carries datagrams of `size` bytes.
@@ -166,7 +222,7 @@ class Routes:
             and route.max_datagram >= size
             and route.smoothed_rtt_s <= slowest
         ]
-        best = min(others, key=lambda route: route.order, default=None)
+        best = min(others, key=_order, default=None)
         return None if best is None else best.id
 
     def max_datagram(self, path: PathId) -> int:

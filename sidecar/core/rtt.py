@@ -12,6 +12,9 @@ LONGEST_WAIT_S = 1.0
 """Beyond two bare round trips, nobody waits longer for a sign of life. A queue makes the round trip long, but what is
 in it still arrives one after the other; where nothing does for so long, the path is dead or as good as that. And what
 left before an outage and arrives after it makes a round trip that says nothing of the path."""
+LONGEST_ANSWER_S = 15.0
+"""Answers count for so long after what they answer left: longer than the longest round trip that has to work (10 s), by
+what both ends may add to it. Older ones would only say that the path lived once."""
 MINIMUM_MEMORY_S = 10.0
 """A minimum not seen again for this long is forgotten: the route may have become longer (BBR's RTprop filter)."""
 
@@ -86,6 +89,10 @@ class RttEstimator:
         if not self.has_sample:
             return 2 * INITIAL_RTT_S
         return max(min(2 * self.smoothed + 4 * self.variation, self.longest_wait()), UNSTABLE_FLOOR_S)
+
+    def next_answer(self) -> float:
+        """Seconds within which the answer to what leaves now should come, if it takes little more than the last one."""
+        return self.latest + min(self.latest / 4, LONGEST_WAIT_S)
 
     def longest_wait(self) -> float:
         """Seconds after which anything that is awaited of a living path should have come, whatever queue there is."""

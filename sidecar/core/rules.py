@@ -8,6 +8,7 @@ parameters to other machines.
 from __future__ import annotations
 
 import fnmatch
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from sidecar.core.priority import Priority
 from sidecar.core.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable
 
     from protos.model import ServiceName
     from sidecar.core.fallback_rule import FallbackRule
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 MAX_LIFETIME_S = 300.0
 """A request that may wait longer is a job, not a call; a server remembers every request for longer than this."""
 
+MAX_FOUND = 8192
+"""Names whose rule is kept ready; all are searched for again when a further one comes."""
+
+_GLOB_CHARACTERS = frozenset("*?[")
 _NODE_INTERNAL_SUFFIXES = frozenset(
     {
         # rclcpp and rclpy parameter services
@@ -81,13 +86,46 @@ class ServiceRule:
     """Cloud: what a request costs that runs here."""
 
 
-def find_rule(rules: Sequence[ServiceRule], name: ServiceName) -> ServiceRule | None:
-    """Return the rule under which the service is carried, or None when it is not."""
-    internal = name.rsplit("/", 1)[-1] in _NODE_INTERNAL_SUFFIXES or "/_action/" in name
-    for rule in rules:
-        if rule.fallback is not None and rule.fallback.service == name:
+class Rules:
+    """The configuration's rules in their order, asked by name.
+
+    A node asks about the same names again and again, for every request and every peer's offers: what is found is kept.
+    """
+
+    __slots__ = ("_exact", "_fallbacks", "_found", "_globs")
+
+    def __init__(self, rules: Iterable[ServiceRule]) -> None:
+        self._exact: dict[str, tuple[int, ServiceRule]] = {}
+        self._globs: list[tuple[int, Callable[[str], object], ServiceRule]] = []
+        self._fallbacks: set[str] = set()
+        self._found: dict[ServiceName, ServiceRule | None] = {}
+        for index, rule in enumerate(rules):
+            self._exact.setdefault(rule.pattern, (index, rule))
+            if _GLOB_CHARACTERS.intersection(rule.pattern):
+                self._globs.append((index, re.compile(fnmatch.translate(rule.pattern)).match, rule))
+            if rule.fallback is not None:
+                self._fallbacks.add(rule.fallback.service)
+
+    def find(self, name: ServiceName) -> ServiceRule | None:
+        """Return the rule under which the service is carried, or None when it is not."""
+        try:
+            return self._found[name]
+        except KeyError:
+            pass
+        if len(self._found) >= MAX_FOUND:
+            self._found.clear()  # peers name services: whoever invents names costs time, not memory
+        found = self._found[name] = self._search(name)
+        return found
+
+    def _search(self, name: ServiceName) -> ServiceRule | None:
+        if name in self._fallbacks:
             return None
-    for rule in rules:
-        if rule.pattern == name or (not internal and fnmatch.fnmatchcase(name, rule.pattern)):
-            return rule
-    return None
+        first = self._exact.get(name)
+        if name.rsplit("/", 1)[-1] in _NODE_INTERNAL_SUFFIXES or "/_action/" in name:
+            return None if first is None else first[1]
+        for index, matches, rule in self._globs:
+            if first is not None and first[0] < index:
+                break
+            if matches(name):
+                return rule
+        return None if first is None else first[1]

@@ -1,18 +1,20 @@
 """Symbols that wait for one path, and which of them leave next.
 
 Urgent before bulk: a message's priority comes first. Fresh before late: within a priority, those that can still make
-their deadline go first, earliest deadline first; those that can not go after them, what is begun first and then the
-newest. So a backlog or an overload makes some messages miss, instead of each message make the next one late, and what
-comes late comes as little late as can be. What comes with its deadline over goes last: after an outage the pace is low
-at first, and what is asked then may seem hopeless, but must not wait for the backlog. What another path is sending, and
-in time, comes after all that (`turn`). No priority starves: while a lower one waits, it gets one symbol in SHARE.
+their deadline go first, earliest deadline first; those that can not go after them. So a backlog or an overload makes
+some messages miss, instead of each message make the next one late. Among the late, what is begun goes first and then
+the oldest that can still be of use: the newest would overtake the others again and again until these expire. What comes
+with its deadline over goes after those: after an outage the pace is low at first, and what is asked then may seem
+hopeless, but must not wait for the backlog. What can not even be answered before it expires goes last, as the pace may
+rise; when it did, what can make its deadline after all is fresh again. What another path is sending, and in time, comes
+after all that (`turn`). No priority starves: while a lower one waits, it gets one symbol in SHARE.
 """
 
 from __future__ import annotations
 
 import heapq
 from itertools import count
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.priority import Priority
@@ -43,22 +45,39 @@ class Run(NamedTuple):
     symbols: int
 
 
-class _Class:
-    """Messages of one priority: in time, late, too late when they came, and those that another path takes care of."""
+_Entry: TypeAlias = "tuple[float, int, Turn]"
+"""What it is sorted by, the order of arrival, and the message."""
 
-    __slots__ = ("covered", "fresh", "hopeless", "passed_over", "stale")
+
+class _Class:
+    """Messages of one priority by what is to be expected of them: each heap goes after those named before it."""
+
+    __slots__ = ("covered", "fresh", "hopeless", "newest", "passed_over", "stale", "useless")
 
     def __init__(self) -> None:
-        self.fresh: list[tuple[float, int, Turn]] = []
-        self.hopeless: list[tuple[float, int, Turn]] = []
-        self.stale: list[tuple[float, int, Turn]] = []
-        self.covered: list[tuple[float, int, Turn]] = []
-        """By when they are to be looked at again."""
+        self.fresh: list[_Entry] = []
+        """Can make their deadline; by that, as the next two."""
+        self.hopeless: list[_Entry] = []
+        """Could not make it any more when it was still to come."""
+        self.newest: list[_Entry] = []
+        """Of those, what has its deadline still to come, the last one first; some that left may lie there."""
+        self.stale: list[_Entry] = []
+        """Came when it was over."""
+        self.useless: list[_Entry] = []
+        """Expire sooner than they can be answered, if the pace stays; by when they expire, the last one first."""
+        self.covered: list[_Entry] = []
+        """Another path takes care of them; by when they are to be looked at again."""
         self.passed_over = 0
         """Symbols of higher priorities that left while something waited here."""
 
-    def heaps(self) -> tuple[list[tuple[float, int, Turn]], ...]:
-        return self.fresh, self.hopeless, self.stale, self.covered
+    def heaps(self) -> tuple[list[_Entry], ...]:
+        return self.fresh, self.hopeless, self.stale, self.useless, self.covered
+
+    def look_for_newest(self, now: float) -> None:
+        """Make `newest` again from `hopeless`."""
+        ahead = ((-entry.message.deadline, order, entry) for _, order, entry in self.hopeless)
+        self.newest[:] = [item for item in ahead if -item[0] > now]
+        heapq.heapify(self.newest)
 
 
 class SendQueue:
@@ -107,6 +126,8 @@ class SendQueue:
             for heap in each.heaps():
                 heap[:] = [item for item in heap if not item[2].message.over]
                 heapq.heapify(heap)
+            each.newest[:] = [item for item in each.newest if not item[2].message.over]
+            heapq.heapify(each.newest)
         self._entries = {number: entry for number, entry in self._entries.items() if not entry.message.over}
         self._purge_at = max(PURGE_AT, 2 * len(self._entries))
 
@@ -148,14 +169,15 @@ class SendQueue:
             run = entry.take(max(1, min(most, budget // size, MAX_RUN_BYTES // size)))
             if run is not None:
                 entry.goes_on(now, pace, round_trip_s)
-                if heap is chosen.hopeless or heap is chosen.stale:
+                if heap is not chosen.fresh and heap is not chosen.covered:
                     heapq.heapreplace(heap, (BEGUN, heap[0][1], entry))
                 return Run(message, *run)
             self._drop(heap)
         return None
 
-    def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[tuple[float, int, Turn]] | None:
+    def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[_Entry] | None:
         """Return the heap whose head goes next; heads that are over go, those that change places do so."""
+        self._hope_again(each, now, pace, round_trip_s)
         covered = each.covered
         while covered and covered[0][2].covered_until(now, pace, round_trip_s) is None:
             _, order, entry = heapq.heappop(covered)
@@ -169,21 +191,57 @@ class SendQueue:
                 elif message.expires <= now:
                     self.expired += 1
                     self._drop(heap)
+                elif heap is each.hopeless or heap is each.stale:
+                    if entry.can_end_by(message.expires, now, pace, round_trip_s):
+                        return heap
+                    self._move(heap, each.useless, -message.expires)
                 elif heap is not each.fresh:
                     return heap
                 elif (until := entry.covered_until(now, pace, round_trip_s)) is not None:
                     entry.waits()
                     heapq.heappop(heap)
                     heapq.heappush(covered, (until, order, entry))
-                elif entry.is_hopeless(now, pace, round_trip_s):
-                    late = each.hopeless if message.deadline > now else each.stale
-                    heapq.heappop(heap)
-                    heapq.heappush(late, (BEGUN if entry.begun else -message.deadline, order, entry))
+                elif not entry.can_end_by(message.deadline, now, pace, round_trip_s):
+                    self._move(heap, each.hopeless if message.deadline > now else each.stale, message.deadline)
+                    if message.deadline > now:
+                        heapq.heappush(each.newest, (-message.deadline, order, entry))
+                        if len(each.newest) > 2 * len(each.hopeless) + PURGE_AT:
+                            each.look_for_newest(now)
                 else:
                     return heap
         return None
 
-    def _drop(self, heap: list[tuple[float, int, Turn]]) -> None:
+    def _hope_again(self, each: _Class, now: float, pace: float, round_trip_s: float) -> None:
+        """Bring back what can make its deadline after all, as the pace rose: if any, then the newest."""
+        newest = each.newest
+        while newest:
+            message = newest[0][2].message
+            if message.deadline <= now:
+                newest.clear()
+            elif self._entries.get(message.number) is not newest[0][2]:
+                heapq.heappop(newest)
+            else:
+                break
+        if not newest or not newest[0][2].can_end_by(newest[0][2].message.deadline, now, pace, round_trip_s):
+            return
+        still: list[_Entry] = []
+        for item in each.hopeless:
+            _, order, entry = item
+            if entry.can_end_by(entry.message.deadline, now, pace, round_trip_s):
+                heapq.heappush(each.fresh, (entry.message.deadline, order, entry))
+            else:
+                still.append(item)
+        each.hopeless[:] = still
+        heapq.heapify(each.hopeless)
+        each.look_for_newest(now)
+
+    @staticmethod
+    def _move(heap: list[_Entry], to: list[_Entry], by: float) -> None:
+        """Move the head; what is begun stays in front."""
+        _, order, entry = heapq.heappop(heap)
+        heapq.heappush(to, (BEGUN if entry.begun else by, order, entry))
+
+    def _drop(self, heap: list[_Entry]) -> None:
         del self._entries[heapq.heappop(heap)[2].message.number]
 
     def clear(self) -> list[tuple[OutboundMessage, tuple[int, ...]]]:
@@ -194,6 +252,7 @@ class SendQueue:
         for each in self._classes:
             for heap in each.heaps():
                 heap.clear()
+            each.newest.clear()
         self._entries.clear()
         self._purge_at = PURGE_AT
         return [(message, indices) for message, indices in left if indices]

@@ -4,22 +4,25 @@ to 9). Which of them run is `dedup.py`'s."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
+from sidecar.core.answers import Answers
+from sidecar.core.backlog import in_groups
 from sidecar.core.dedup import ExecutionTable, Reply, Waiter
 from sidecar.core.events import ExecuteRequest, RejectReason
 from sidecar.core.forbidden import ForbiddenCalls
-from sidecar.core.messages import encode_message
-from sidecar.core.path_id import PathId, PathState
-from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule, find_rule
+from sidecar.core.rules import MAX_LIFETIME_S, Rules
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
 
     from protos.model import NodeName, ServiceName, ServiceOffer
-    from sidecar.core.events import ApplicationEvent, ExecutionId
+    from sidecar.core.backlog import Backlog, Step
+    from sidecar.core.events import ApplicationEvent, ExecutionId, RequestId
     from sidecar.core.messages import CancelMessage, RequestMessage
     from sidecar.core.outbox import Outbox
+    from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
 
@@ -28,7 +31,7 @@ if TYPE_CHECKING:
 class ServingParts:
     """What the serving side works with."""
 
-    rules: tuple[ServiceRule, ...]
+    rules: Rules
     routes: Routes
     outbox: Outbox
     stats: EngineStats
@@ -46,6 +49,7 @@ class Serving:
         self._draining = False
         self._forbidden = ForbiddenCalls()
         self.executions = ExecutionTable(parts.stats)
+        self.answers = Answers(parts.rules, parts.routes, parts.outbox, parts.stats)
 
     @property
     def running(self) -> int:
@@ -53,8 +57,8 @@ class Serving:
         return self.executions.running
 
     def awaited(self, robots: Collection[NodeName]) -> int:
-        """How many of those one of these robots still waits for."""
-        return self.executions.awaited(robots)
+        """How many requests one of these robots waits for that run here, or whose answers wait for room."""
+        return self.executions.awaited(robots) + self.answers.unsent(robots)
 
     @property
     def offers(self) -> tuple[ServiceOffer, ...]:
@@ -75,15 +79,16 @@ class Serving:
         """A copy of a request arrived."""
         refusal = self._refusal(path.peer, message, now)
         if refusal and not self.executions.knows(message.request_id):
-            self._reply([self.executions.refuse_unseen(Waiter(path, message.copy), message, *refusal, now)])
+            waiter = Waiter(path, message.copy)
+            self.answers.send([self.executions.refuse_unseen(waiter, message, *refusal, now)], now)
             return
-        rule = find_rule(self._parts.rules, message.service)
+        rule = self._parts.rules.find(message.service)
         patience_s = rule.lifetime_s if rule else MAX_LIFETIME_S
         outcome = self.executions.on_request(path, message, now, patience_s=patience_s)
         if isinstance(outcome, ExecuteRequest):
             self._parts.emit(outcome)
         elif isinstance(outcome, Reply):
-            self._reply([outcome])
+            self.answers.send([outcome], now)
 
     def _refusal(self, robot: NodeName, message: RequestMessage, now: float) -> tuple[RejectReason, str] | None:
         if not self._parts.may_call(robot, message.service):
@@ -106,49 +111,46 @@ class Serving:
         event = self.executions.cancel(robot, message.request_id, now)
         if event is not None:
             self._parts.emit(event)
-        self._parts.outbox.drop_answers(robot, message.request_id)
+        self.answers.drop(robot, message.request_id)
 
-    def on_session_over(self, robot: NodeName) -> None:
-        """The robot said goodbye or restarted: what its servers have not got yet needs not run."""
-        for event in self.executions.cancel_all(robot):
+    def on_room(self, now: float) -> None:
+        """Less is under way than before: send what waited for room."""
+        self.answers.on_room(now)
+
+    def on_robot_gone(self, robot: NodeName) -> list[Step]:
+        """The robot is not talked to any more, for a while at least. Returns what is left to do."""
+        return self.answers.drop_robot(robot)
+
+    def on_session_over(self, robot: NodeName) -> list[Step]:
+        """The robot said goodbye or restarted: returns what calls off what its servers have not got yet."""
+        return in_groups(partial(self._call_off, robot), self.executions.of_robot(robot))
+
+    def _call_off(self, robot: NodeName, request: RequestId) -> None:
+        event = self.executions.call_off(robot, request)
+        if event is not None:
             self._parts.emit(event)
 
     # -- the application ------------------------------------------------------------------------------------------
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:
         """The local server answered."""
-        self._reply(self.executions.complete(execution, payload, processing_s, now))
+        self.answers.send(self.executions.complete(execution, payload, processing_s, now), now)
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str, now: float) -> None:
         """The request was not or will not be answered."""
-        self._reply(self.executions.refuse(execution, reason, detail, now))
-
-    def _reply(self, replies: list[Reply]) -> None:
-        routes = self._parts.routes
-        for reply in replies:
-            rule = find_rule(self._parts.rules, reply.service)
-            path = reply.waiter.path
-            if routes.state(path) is PathState.DOWN:
-                path = routes.best_to(path.peer) or path
-            self._parts.outbox.send(
-                path,
-                encode_message(reply.message),
-                priority=reply.priority,
-                deadline=reply.deadline,
-                expires=reply.expires,
-                fec=rule.fec if rule else None,
-                answers=reply.message.request_id,
-            )
+        self.answers.send(self.executions.refuse(execution, reason, detail, now), now)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
-        return self.executions.next_timer()
+        timers = (self.executions.next_timer(), self.answers.next_timer())
+        return min((timer for timer in timers if timer is not None), default=None)
 
-    def handle_timer(self, now: float) -> None:
-        """Give up what took too long."""
-        abandoned, replies = self.executions.handle_timer(now)
+    def handle_timer(self, now: float, backlog: Backlog) -> None:
+        """Give up what took too long to run, or to be sent, as much of it as the turn has room for."""
+        abandoned, replies = self.executions.handle_timer(now, backlog)
         for event in abandoned:
             self._parts.emit(event)
-        self._reply(replies)
+        self.answers.send(replies, now)
+        self.answers.handle_timer(now, backlog)

@@ -67,12 +67,12 @@ class Turn:
         """The symbols that have not left and still have to."""
         return tuple(filter(self.message.needs, (*self.again, *range(self.next, self.message.symbols))))
 
-    def is_hopeless(self, now: float, pace: float, round_trip_s: float) -> bool:
-        """Whether its last symbol can not be answered before the deadline at this pace (bytes a second; 0: unknown)."""
+    def can_end_by(self, end: float, now: float, pace: float, round_trip_s: float) -> bool:
+        """Whether its last symbol can be answered before `end` at this pace (bytes a second; 0: unknown)."""
         if not pace:
-            return self.message.deadline <= now
+            return now < end
         sending_s = self._sending_s(pace) * (1.0 if self.begun else HASTE)
-        return self.message.deadline <= now + sending_s + round_trip_s
+        return now + sending_s + round_trip_s < end
 
     def goes_on(self, now: float, pace: float, round_trip_s: float) -> None:
         """Some of it has been taken to be sent: tell its siblings when to expect the answer."""

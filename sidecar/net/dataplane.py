@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link_events import ResetPaths, SendClose, SetCredential
+from sidecar.core.link_events import CheckPaths, ResetPaths, SendClose, SetCredential
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
@@ -39,7 +39,9 @@ if TYPE_CHECKING:
         SessionId,
     )
     from sidecar.core.events import ExecutionId, RejectReason, RequestId
+    from sidecar.core.inbound import Decoding
     from sidecar.core.link_events import LinkEvent
+    from sidecar.core.path_id import PathState
     from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
@@ -48,6 +50,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+EVENTS_A_TURN = 32
+"""A link's events that are taken without letting go of the lock: a path that goes down hands back thousands."""
+YIELD_S = 100e-6
+"""Between two turns of one thread, for whoever waits for the lock: the lock goes to who asks first, and a thread that
+must be woken for it is too late."""
 ERROR_PAUSE_S = 0.1
 """After an internal error, which may repeat itself at every turn."""
 
@@ -62,6 +69,8 @@ class DataPlaneHooks:
     """Offers or uses may have changed: the control plane wants to know."""
     reach_changed: Callable[[], None]
     """Interfaces or peers may have come: a mapping that was refused for want of them may fit now."""
+    paths_changed: Callable[[Mapping[InterfaceName, PathState]], None]
+    """The best state of the paths over each interface that has some; called with the engine's lock held."""
 
 
 class ThreadedDataPlane:
@@ -76,6 +85,7 @@ class ThreadedDataPlane:
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
         self._watchdog = Watchdog(self._clock())
+        self._told_paths = self._engine.routes.best
         self._stopping = False
         self._logged_refusals: dict[NodeName, str] = {}
         """Their causes."""
@@ -267,6 +277,13 @@ class ThreadedDataPlane:
         with self._lock:
             return self._engine.take_report()
 
+    def check_paths(self, interface: InterfaceName) -> None:
+        """The control stream is not answered over this interface: find out whether anything else is."""
+        link = self._links.get(interface)
+        if link is not None:
+            link.post(CheckPaths())
+            link.wake()
+
     # -- what metrics and status read -----------------------------------------------------------------------------
 
     @property
@@ -290,13 +307,17 @@ class ThreadedDataPlane:
         """Take what a link saw."""
         engine = self._engine
         while events:
-            now = self._clock()
-            with self._lock:
-                for event in events:
-                    engine.on_link_event(event, now)
-                decodings = engine.take_decodings()
-                woken = self._queue_outputs()
-            self._wake(woken)
+            decodings: list[Decoding] = []
+            for first in range(0, len(events), EVENTS_A_TURN):
+                if first:
+                    time.sleep(YIELD_S)
+                now = self._clock()
+                with self._lock:
+                    for event in events[first : first + EVENTS_A_TURN]:
+                        engine.on_link_event(event, now)
+                    decodings += engine.take_decodings()
+                    woken = self._queue_outputs()
+                self._wake(woken)
             # On this link's thread, with nothing locked.
             events = [decoding.run() for decoding in decodings]
 
@@ -315,6 +336,10 @@ class ThreadedDataPlane:
                 woken.add(link)
         for event in self._engine.take_events():
             self._hooks.application.handle(event)
+        best = self._engine.routes.best
+        if best is not self._told_paths:
+            self._told_paths = best
+            self._hooks.paths_changed(best)
         # The kernel's timer, not its thread: nearly every request has a deadline, and is answered long before it.
         self._timer.arm_at_latest(self._engine.next_timer())
         return woken
@@ -360,6 +385,8 @@ class ThreadedDataPlane:
                 log.exception("internal error; the timers go on")
                 time.sleep(ERROR_PAUSE_S)
             else:
+                if self._timer.due <= self._clock():
+                    time.sleep(YIELD_S)
                 self._timer.wait()
 
     def _timer_turn(self) -> None:

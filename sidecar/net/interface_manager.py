@@ -18,10 +18,10 @@ from sidecar.core.path_keys import KeyLimits
 from sidecar.core.readiness import Readiness
 from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.stun_events import Failed, Mapped, MappingChanged
+from sidecar.net.host_names import HostNames
 from sidecar.net.interfaces import choose, list_interfaces
 from sidecar.net.managed_interface import STOP_TIMEOUT_S, ManagedInterface
 from sidecar.net.netlink_watch import NetlinkWatch
-from sidecar.net.stun_names import StunNames
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -76,7 +76,7 @@ class InterfaceManager:
         self._numbers: dict[InterfaceName, _Number] = {}
         self._stun_names: tuple[str, ...] = config.stun.servers
         self._stun_servers: tuple[Address, ...] = ()
-        self._resolver = StunNames(self._use_stun_servers)
+        self._resolver = HostNames("STUN server", self._use_stun_servers)
         self._candidates: tuple[Candidate, ...] = ()
         self._readiness = Readiness(stun_enabled=config.stun.enabled)
         self._skipped: dict[InterfaceName, str] = {}
@@ -285,7 +285,11 @@ class InterfaceManager:
         elif set(interface.addresses) != set(was.addresses):
             log.info("%s: addresses changed to %s", interface.name, ", ".join(interface.addresses))
         elif interface.gateways != was.gateways:
-            log.info("%s: gateways changed to %s", interface.name, ", ".join(interface.gateways) or "none")
+            log.info(
+                "%s: gateways changed to %s",
+                interface.name,
+                ", ".join(hop or "no hop" for _, hop in interface.gateways) or "none",
+            )
         return changed
 
     def _links(self) -> dict[InterfaceName, InterfaceThread]:

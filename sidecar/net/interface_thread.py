@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Protocol
 
 from sidecar.core.datagrams import Batch
 from sidecar.core.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
-from sidecar.core.link_events import PathChanged
+from sidecar.core.link_events import PathChanged, Rebind
 from sidecar.core.path_id import PathState
 from sidecar.net.batch_socket import RECEIVE_CALLS, BatchSocket
 from sidecar.net.path_log import PathLog
+from sidecar.net.sources import Sources
 from sidecar.net.waiter import Waiter
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class InterfaceThread:
         self._inbox: deque[LinkCommand | Callable[[StunClient], None]] = deque()
         self._waiter = Waiter(sock.fileno(), clock)
         self._batches = BatchSocket(sock, link.stats, self._on_too_big)
+        self._sources = Sources(sock)
         self._unsent: deque[Batch] = deque()
         """One burst at most: no more is asked for before it has left."""
         self._more = False
@@ -197,6 +199,9 @@ class InterfaceThread:
                     command(self._stun)
             else:
                 self.link.execute(command, self._clock())
+                if isinstance(command, Rebind):
+                    for path in self.link.living():
+                        self.link.note_source(path, self._sources.towards)
 
     def _exchange(self) -> None:
         """Hand events to the engine until neither side has more for the other."""
@@ -219,6 +224,8 @@ class InterfaceThread:
             if isinstance(event, PathChanged):
                 self._path_log.note(event)
                 down = down or event.state is PathState.DOWN
+                if event.state is PathState.UP:
+                    self.link.note_source(event.path, self._sources.towards)
         if down:
             self._drop_unsent()
 

@@ -16,6 +16,7 @@ from pyroute2 import IPRoute, NetlinkError
 
 from protos.model import InterfaceName
 from sidecar.config_fields import is_glob
+from sidecar.core.link_events import Rebind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -58,21 +59,24 @@ class Interface:
     mtu: int
     addresses: tuple[str, ...] = ()
     """IPv4 and IPv6 of global or unique-local scope, in canonical form; no link-local ones."""
-    gateways: tuple[str, ...] = ()
-    """Where the default routes that leave by it lead, of both families and all tables, sorted; "" for a link that
-    needs no gateway."""
+    gateways: tuple[tuple[int, str], ...] = ()
+    """Where the default routes that leave by it lead, of all tables, sorted: the family that they carry (4, 6), and the
+    next hop, "" for a link that needs none."""
 
     @property
     def families(self) -> frozenset[int]:
         """4, 6, both or none: of its addresses."""
         return frozenset(6 if ":" in address else 4 for address in self.addresses)
 
-    def rebound_since(self, before: Interface) -> bool:
-        """Whether what was sent from it `before` may have left from elsewhere, or by another way.
+    def rebound_since(self, before: Interface) -> Rebind | None:
+        """Return what of the ways out that it had `before` is no more; None when addresses and gateways are the same.
 
         A further address alone takes nothing away.
         """
-        return self.gateways != before.gateways or not set(before.addresses) <= set(self.addresses)
+        rerouted = {family for family, _ in set(self.gateways) ^ set(before.gateways)}
+        if not rerouted and set(self.addresses) == set(before.addresses):
+            return None
+        return Rebind(frozenset(before.addresses).difference(self.addresses), frozenset(rerouted))
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +162,7 @@ def _virtual_kind(interface: Interface) -> str | None:
     return None
 
 
-def _interface(link: Any, addresses: dict[int, list[str]], gateways: dict[int, set[str]]) -> Interface:
+def _interface(link: Any, addresses: dict[int, list[str]], gateways: dict[int, set[tuple[int, str]]]) -> Interface:
     flags = link["flags"]
     index = link["index"]
     kind = LOOPBACK if flags & _IFF_LOOPBACK else link.get(("linkinfo", "kind")) or ""
@@ -188,16 +192,17 @@ def _addresses_by_index(messages: Iterable[Any]) -> dict[int, list[str]]:
     return addresses
 
 
-def _gateways_by_index(messages: Iterable[Any]) -> dict[int, set[str]]:
-    gateways: dict[int, set[str]] = {}
+def _gateways_by_index(messages: Iterable[Any]) -> dict[int, set[tuple[int, str]]]:
+    gateways: dict[int, set[tuple[int, str]]] = {}
     for message in messages:
         unicast = message["type"] == _RTN_UNICAST and message["family"] in (socket.AF_INET, socket.AF_INET6)
         if not unicast or message["dst_len"] != 0:
             continue
+        family = 6 if message["family"] == socket.AF_INET6 else 4
         if message.get("oif") is not None:
-            gateways.setdefault(message.get("oif"), set()).add(_next_hop(message))
+            gateways.setdefault(message.get("oif"), set()).add((family, _next_hop(message)))
         for hop in message.get("multipath") or ():
-            gateways.setdefault(hop["oif"], set()).add(_next_hop(hop))
+            gateways.setdefault(hop["oif"], set()).add((family, _next_hop(hop)))
     return gateways
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import Candidate, CandidateKind
 from sidecar.core.link import Link
-from sidecar.core.link_events import Rebind, SetCarrier, SetMtu, SetReady
+from sidecar.core.link_events import SetCarrier, SetMtu, SetReady
 from sidecar.core.stun_client import StunClient
 from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.sockets import BoundTo, open_socket
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceName
     from sidecar.core.datagrams import LinkIdentity
+    from sidecar.core.link_events import Rebind
     from sidecar.core.path_keys import KeyLimits, LinkMemory
     from sidecar.net.interface_thread import LinkOwner
     from sidecar.net.interfaces import Interface
@@ -78,14 +79,14 @@ class ManagedInterface:
         """Take the interface as it is now; returns whether anything changed for its peers."""
         before, self.interface = self.interface, interface
         was_suspended, self.suspended = self.suspended, False
-        rebound = interface.rebound_since(before)
+        rebind = interface.rebound_since(before)
         if was_suspended:
             self._post(SetCarrier(on=True))
-        if rebound:
-            self._post(Rebind())
+        if rebind is not None:
+            self._post(rebind)
         if interface.mtu != before.mtu:
             self._post(SetMtu(interface.mtu))
-        changed = was_suspended or rebound or set(interface.addresses) != set(before.addresses)
+        changed = was_suspended or rebind is not None
         if changed:
             # Told by an older network; what is true now comes within a round trip.
             self.reflexive.clear()

@@ -14,15 +14,17 @@ from typing import TYPE_CHECKING, Protocol
 
 from protos.model import Role
 from sidecar.core.events import ExecuteRequest, RejectReason
-from sidecar.ros import graph
 from sidecar.ros.cloud_side import CloudSide
 from sidecar.ros.graph import sidecar_node_name
 from sidecar.ros.log_limit import LimitedLog
+from sidecar.ros.looks import Looks
 from sidecar.ros.robot_side import RobotSide
 from sidecar.ros.ros_loop import RosLoop
 from sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from protos.model import ServiceName
     from sidecar.core.events import ApplicationEvent, ExecutionId
     from sidecar.core.rules import ServiceRule
@@ -44,10 +46,9 @@ class _Side(Protocol):
 
     look_is_due: bool
 
-    @property
-    def scan_period_s(self) -> float: ...
+    def settling(self) -> bool: ...
     def handle(self, event: ApplicationEvent, now: float) -> None: ...
-    def look(self, now: float) -> None: ...
+    def look(self) -> Iterator[None]: ...
     def next_due(self) -> float | None: ...
     def on_timer(self, now: float) -> None: ...
     def close(self) -> None: ...
@@ -132,15 +133,15 @@ class RosBridge:
         )
 
     def _run(self, loop: RosLoop, side: _Side, data_plane: DataPlane) -> None:
-        look_at = time.monotonic()
+        looks = Looks(side.look, side.settling, time.monotonic())
         while not self._stopping:
             try:
                 now = time.monotonic()
-                if now >= look_at or side.look_is_due:
-                    look_at = now + graph.SCAN_PERIOD_S
-                    side.look(now)
-                    look_at = now + side.scan_period_s
-                due = side.next_due()
+                if loop.graph_changed or side.look_is_due:
+                    loop.graph_changed = side.look_is_due = False
+                    looks.changed(now)
+                looks.turn(now)
+                look_at, due = looks.next_due(), side.next_due()
                 until = look_at if due is None else min(look_at, due)
                 ready = loop.wait(until - time.monotonic())
             # A wait or a look that failed is tried again; requests at the servers and answers stay as they are.

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import logging
+import time
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceOffer
 from sidecar.core.events import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest, RejectReason
-from sidecar.core.rules import find_rule
+from sidecar.core.rules import Rules
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.roll_call import POLL_S, RollCall
+from sidecar.ros.server_processes import ServerProcesses
 from sidecar.ros.service_runner import Execution, ServiceRunner
 from sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from protos.model import ServiceName
     from sidecar.core.events import ApplicationEvent, ExecutionId
     from sidecar.core.rules import ServiceRule
@@ -28,6 +33,10 @@ MAX_CARRIED_SERVICES = 512
 """Services of the local graph that are offered; each costs DDS endpoints and a slot in every wait."""
 TYPE_RETRY_S = 30.0
 """How often a type that is not installed is looked for again: someone may be installing it."""
+SILENCE_S = 0.5
+"""A server that answers nothing for so long is asked whether it lives, if its process is not watched."""
+CHECK_EVERY_S = 0.25
+"""How often that is looked at while such a server has something to answer."""
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +54,7 @@ class CloudSide:
         limited_log: LimitedLog,
     ) -> None:
         self._loop = loop
-        self._rules = rules
+        self._rules = Rules(rules)
         self._data_plane = data_plane
         self._stats = stats
         self._limited = limited_log
@@ -55,8 +64,13 @@ class CloudSide:
         self._missing_types: dict[ServiceName, str] = {}
         self._types_retried_at = 0.0
         self._several_servers: set[ServiceName] = set()
-        self._settling = False
+        self._processes = ServerProcesses(loop.domain_id, lambda: graph.participants(loop.node), loop.wake)
+        self._roll_call = RollCall(loop.node)
+        self._at_work: set[ServiceRunner] = set()
+        """Runners whose server has something to answer, and is not known to live."""
+        self._check_at = 0.0
         self.look_is_due = False
+        """The graph should be looked at although it has not changed."""
         self._paced: set[ServiceRunner] = set()
         """Runners with requests that wait for room at their server."""
 
@@ -83,7 +97,7 @@ class CloudSide:
 
     def _execute(self, event: ExecuteRequest, now: float) -> None:
         runner = self._runners.get(event.service)
-        if runner is None:
+        if runner is None or not runner.server.is_usable(now):
             self.refuse(event, RejectReason.NOT_OFFERED, "no local server", now)
             return
         if runner.type.name != event.type:
@@ -105,6 +119,8 @@ class CloudSide:
         if not runner.add(execution, now):
             self._stats.requests_paced += 1
             self._paced.add(runner)
+        if runner not in self._at_work and not self._is_watched(runner):
+            self._at_work.add(runner)
         self._stats.requests_sent[event.service] += 1
 
     def refuse(self, event: ExecuteRequest, reason: RejectReason, detail: str, now: float) -> None:
@@ -159,30 +175,35 @@ class CloudSide:
 
     # -- what the graph shows ------------------------------------------------------------------------------------
 
-    @property
-    def scan_period_s(self) -> float:
-        """Seconds until the graph should be looked at again."""
-        return graph.SETTLING_PERIOD_S if self._settling else graph.SCAN_PERIOD_S
+    def settling(self) -> bool:
+        """Whether another look at the graph should follow soon, although it does not change."""
+        return any(not runner.server.ready for runner in self._runners.values())
 
-    def look(self, now: float) -> None:
-        """Compare the graph with the clients; tell the data plane what is offered from now on."""
-        served = graph.scan(self._loop.node)
+    def look(self) -> Iterator[None]:
+        """Compare the graph with the clients, in small steps; tell the data plane what is offered from now on."""
+        served = yield from graph.scan(self._loop.node)
         self._stats.scans += 1
+        now = time.monotonic()
         retry_types = now - self._types_retried_at >= TYPE_RETRY_S
         if retry_types:
             self._types_retried_at = now
         wanted = self._wanted(served)
         for name in [name for name, runner in self._runners.items() if wanted.get(name) != runner.type.name]:
             self._close_runner(name, "its server is gone")
+            yield
         for name in [name for name, kind in self._missing_types.items() if wanted.get(name) != kind]:
             del self._missing_types[name]
         for name, type_name in wanted.items():
+            yield
             runner = self._runners.get(name)
             if runner is not None:
-                self._notice_restart(runner)
-                self._notice_several_servers(name, served[name].applications()[type_name])
+                self._look_at(runner, time.monotonic())
+                self._notice_several_servers(runner, served[name].applications().get(type_name, frozenset()))
             elif retry_types or name not in self._missing_types:
                 self._open_runner(name, type_name)
+        yield
+        self._processes.forget_the_gone()
+        self._roll_call.keep(graph.participants(self._loop.node))
         self._publish_state()
 
     def _wanted(self, served: dict[ServiceName, graph.Served]) -> dict[ServiceName, str]:
@@ -190,29 +211,33 @@ class CloudSide:
         wanted: dict[ServiceName, str] = {}
         for name, service in served.items():
             types = service.applications()
-            if not types or find_rule(self._rules, name) is None:
+            if not types or self._rules.find(name) is None:
                 continue
             runner = self._runners.get(name)
             # Two types under one name: the one in use stays, else the choice is at least the same every time.
             wanted[name] = runner.type.name if runner is not None and runner.type.name in types else min(types)
         return wanted
 
-    def _notice_restart(self, runner: ServiceRunner) -> None:
-        """A server that went and came back between two looks will not answer what the old one was asked."""
-        if runner.was_replaced():
-            log.warning("service %s: its server was replaced by another", runner.name)
+    def _look_at(self, runner: ServiceRunner, now: float) -> None:
+        """A server that is gone, though another came since, will not answer what it was asked."""
+        if runner.server.look(self._is_dead, now):
+            log.warning("service %s: its server is gone or was replaced by another", runner.name)
             self._give_up_executions(runner, "the server was replaced")
+        for endpoint in runner.server.endpoints:
+            self._processes.watch(endpoint)
 
-    def _notice_several_servers(self, name: ServiceName, nodes: frozenset[str]) -> None:
+    def _notice_several_servers(self, runner: ServiceRunner, nodes: frozenset[str]) -> None:
         """ROS gives each request to all servers of a name: at most once on each, but more than once here."""
-        if len(nodes) < 2:
+        name = runner.name
+        servers = max(len(nodes), runner.server.living)  # nodes may share a name
+        if servers < 2:
             self._several_servers.discard(name)
         elif name not in self._several_servers:
             self._several_servers.add(name)
             log.warning(
                 "service %s has %d servers here (%s): each request runs on all of them, the first answer counts",
                 name,
-                len(nodes),
+                servers,
                 ", ".join(sorted(nodes)),
             )
 
@@ -239,6 +264,7 @@ class CloudSide:
         runner = self._runners.pop(name)
         self._loop.set_clients(tuple(self._runners.values()))
         self._give_up_executions(runner, why)
+        self._at_work.discard(runner)
         runner.close()
         log.info("service %s is no longer offered to robots: %s", name, why)
 
@@ -258,13 +284,12 @@ class CloudSide:
         self._stats.pending = len(self._executions)
 
     def _publish_state(self) -> None:
-        matched = {name: runner for name, runner in self._runners.items() if runner.is_matched()}
-        self._settling = len(matched) < len(self._runners)
+        ready = {name: runner for name, runner in self._runners.items() if runner.server.ready}
         self._stats.missing_types = dict(self._missing_types)
         offers = tuple(
             ServiceOffer(name, runner.type.name, rule.capacity, rule.charge)
-            for name, runner in sorted(matched.items())
-            if (rule := find_rule(self._rules, name)) is not None
+            for name, runner in sorted(ready.items())
+            if (rule := self._rules.find(name)) is not None
         )
         if offers == self._offers:
             return
@@ -274,17 +299,64 @@ class CloudSide:
         self._stats.carried = frozenset(offer.name for offer in offers)
         self._data_plane.set_offers(offers)
 
+    # -- whether the servers live -----------------------------------------------------------------------------------
+
+    def _is_dead(self, endpoint: bytes) -> bool:
+        return self._processes.has_ended(endpoint) or self._roll_call.is_silent(endpoint)
+
+    def _is_watched(self, runner: ServiceRunner) -> bool:
+        return all(self._processes.watches(endpoint) for endpoint in runner.server.endpoints)
+
+    def _notice_ends(self) -> None:
+        """What was handed to a process that ended is lost; what waits for it another server may run."""
+        hit = [r for r in self._runners.values() if r.server.strike_out(self._processes.has_ended)]
+        if hit:
+            log.warning("the process of a server ended: %s", " ".join(sorted(runner.name for runner in hit)))
+        for runner in hit:
+            self._give_up_executions(runner, "the server's process ended")
+        self._publish_state()
+
+    def _notice_silence(self) -> None:
+        """What was handed to a server that shows no sign of life may still be answered; the rest need not wait."""
+        why = "the server shows no sign of life"
+        hit = [runner for runner in self._runners.values() if runner.server.strike_out(self._is_dead)]
+        if hit:
+            log.warning("a server shows no sign of life: %s", " ".join(sorted(runner.name for runner in hit)))
+        for runner in hit:
+            self._at_work.add(runner)
+            self._paced.discard(runner)
+            self._refuse_executions(runner.take_back_unsent(), runner.name, RejectReason.NOT_OFFERED, why)
+        self._publish_state()
+        self.look_is_due = True  # for those that are heard again
+
+    def _endpoints_to_ask(self, now: float) -> list[bytes]:
+        """Ids of servers whose silence may mean their death, and of those that were silent until now."""
+        self._at_work = {runner for runner in self._at_work if runner.silent_since is not None or runner.server.lost}
+        return [
+            endpoint
+            for runner in self._at_work
+            if runner.server.lost or (runner.silent_since is not None and now - runner.silent_since >= SILENCE_S)
+            for endpoint in runner.server.endpoints
+            if not self._processes.watches(endpoint) and not self._processes.has_ended(endpoint)
+        ]
+
     # -- time ----------------------------------------------------------------------------------------------------
 
     def next_due(self) -> float | None:
         """Return when `on_timer` has something to do, or None."""
-        if not self._paced:
-            return None
         dues = [due for runner in self._paced if (due := runner.window.next_due()) is not None]
+        if self._at_work:
+            dues.append(self._check_at)
         return min(dues, default=None)
 
     def on_timer(self, now: float) -> None:
-        """Send the requests that waited long enough for a server that answers nothing."""
+        """Notice who died; send the requests that waited long enough for a server that answers nothing."""
+        if self._processes.take_ended():
+            self._notice_ends()
+        if self._at_work and now >= self._check_at:
+            if self._roll_call.turn(self._endpoints_to_ask(now), now):
+                self._notice_silence()
+            self._check_at = now + (POLL_S if self._roll_call.under_way else CHECK_EVERY_S)
         for runner in tuple(self._paced):
             due = runner.window.next_due()
             if due is None:
@@ -297,6 +369,8 @@ class CloudSide:
         self._offers = ()
         self._stats.carried = frozenset()
         self._data_plane.set_offers(())
+        self._processes.close()
+        self._roll_call.close()
         for name in tuple(self._runners):
             runner = self._runners.pop(name)
             sent, unsent = runner.take_back()

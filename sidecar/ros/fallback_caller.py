@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sidecar.ros.graph import Served
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.ros_loop import RosLoop
+    from sidecar.ros.server_processes import ServerProcesses
     from sidecar.ros.stats import BridgeStats
 
 MAX_ASKED = 64
@@ -102,11 +103,13 @@ class FallbackCaller:
         rules: Iterable[ServiceRule],
         stats: BridgeStats,
         limited_log: LimitedLog,
+        processes: ServerProcesses,
         on_answer: Callable[[FallbackAnswer, float], None],
         on_failure: Callable[[RequestFailed, float], None],
     ) -> None:
         """`on_answer` gives an answer to the application, `on_failure` ends a request that gets none."""
         self._loop = loop
+        self._processes = processes
         self._stats = stats
         self._limited = limited_log
         self._on_answer = on_answer
@@ -131,6 +134,13 @@ class FallbackCaller:
     def settling(self) -> bool:
         """Whether a fallback that is there can not be asked yet."""
         return len(self._up) < len(self._fallbacks)
+
+    def strike_out(self, now: float) -> None:
+        """Some process ended: perhaps a fallback's."""
+        for service, fallback in self._fallbacks.items():
+            if fallback.server.strike_out(self._processes.has_ended):
+                self._replaced(service, now)
+        self._note_up(now)
 
     def types(self) -> dict[ServiceName, str]:
         """The services whose fallback can be asked, or is likely to come back, with their types."""
@@ -203,16 +213,24 @@ class FallbackCaller:
         for service, name in self._policy.services.items():
             types = frozenset(served[name].applications()) if name in served else frozenset()
             self._follow(service, name, types, offers.get(service), now, retry_types=retry_types)
-        up = frozenset(name for name, fallback in self._fallbacks.items() if fallback.server.is_matched())
+        self._note_up(now)
+        self._types = {name: known for name, known in self._types.items() if now - known[1] < KEPT_FOR_S}
+        self._types.update({name: (self._fallbacks[name].server.type.name, now) for name in self._up})
+        self._publish_state()
+
+    def _note_up(self, now: float) -> None:
+        up = frozenset(name for name, fallback in self._fallbacks.items() if fallback.server.ready)
         for service in up - self._up:
             log.info("service %s: its fallback %s is there", service, self._policy.services[service])
         if up != self._up:
             self._up = up
             self._policy.set_up(up, now)
             self._act(now)
-        self._types = {name: known for name, known in self._types.items() if now - known[1] < KEPT_FOR_S}
-        self._types.update({name: (self._fallbacks[name].server.type.name, now) for name in up})
-        self._publish_state()
+
+    def _replaced(self, service: ServiceName, now: float) -> None:
+        log.warning("service %s: its fallback %s is gone or was restarted", service, self._policy.services[service])
+        self._policy.replaced(service, now)
+        self._act(now)
 
     def _follow(
         self,
@@ -232,10 +250,10 @@ class FallbackCaller:
             self._close(service, now)
             fallback = None
         if fallback is not None:
-            if fallback.server.was_replaced():
-                log.warning("service %s: its fallback %s was restarted", service, name)
-                self._policy.replaced(service, now)
-                self._act(now)
+            if fallback.server.look(self._processes.has_ended, now):
+                self._replaced(service, now)
+            for endpoint in fallback.server.endpoints:
+                self._processes.watch(endpoint)
         elif not types:
             self._complain(service, f"no node serves {name} on this robot: start the one that does", now)
         elif wanted not in types:

@@ -1,12 +1,12 @@
 """Who serves what in the local ROS graph.
 
-rclpy (Jazzy) gives no access to the graph's guard condition, so the graph is looked at every `SCAN_PERIOD_S`; a look
-costs about 10 microseconds per node.
+rmw says that the graph has changed, not what of it; `looks.py` says when it is looked at.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +15,12 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from protos.model import ServiceName
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Generator, Mapping
 
-SCAN_PERIOD_S = 0.2
-SETTLING_PERIOD_S = 0.02
-"""Between looks while an entity of ours waits to be matched with its server."""
 SIDECAR_NODE_PREFIX = "_plr_sidecar_"
 """The leading underscore hides the node from `ros2 node list`."""
+PARTICIPANTS_TOPIC = "ros_discovery_info"
+"""DDS's name of the topic by which each ROS process tells of its nodes (rmw_dds_common)."""
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 
 
@@ -51,12 +50,13 @@ class Served:
         return frozenset().union(*self.by_type.values())
 
 
-def scan(node: Any) -> dict[ServiceName, Served]:
-    """Return every service of the graph whose node is known."""
+def scan(node: Any) -> Generator[None, None, dict[ServiceName, Served]]:
+    """Return every service of the graph whose node is known, node after node."""
     found: dict[ServiceName, dict[str, set[str]]] = {}
-    for name, namespace in set(node.get_node_names_and_namespaces()):
+    names = Counter(node.get_node_names_and_namespaces())
+    for name, namespace in names:
         if name == _UNKNOWN_NODE:
-            continue  # its endpoints are discovered before its name: seen at the next look
+            continue  # its endpoints are discovered before its name, which is a change of its own
         full_name = f"{namespace.rstrip('/')}/{name}"
         try:
             services = node.get_service_names_and_types_by_node(name, namespace)
@@ -66,13 +66,42 @@ def scan(node: Any) -> dict[ServiceName, Served]:
             by_type = found.setdefault(ServiceName(service), {})
             for kind in types:
                 by_type.setdefault(kind, set()).add(full_name)
+        yield
+    if any(count > 1 for node_name, count in names.items() if node_name[0] != _UNKNOWN_NODE):
+        # Of several nodes of one name, as of a server that was started twice, rmw shows the services of one only.
+        for service in [s for s, _ in node.get_service_names_and_types() if s not in found]:
+            for info in _reply_writers(node, service):
+                if info["node_name"] != _UNKNOWN_NODE:
+                    full_name = f"{info['node_namespace'].rstrip('/')}/{info['node_name']}"
+                    by_type = found.setdefault(ServiceName(service), {})
+                    by_type.setdefault(_service_type(info["topic_type"]), set()).add(full_name)
+            yield
     return {
         service: Served({kind: frozenset(nodes) for kind, nodes in by_type.items()})
         for service, by_type in found.items()
     }
 
 
-def server_endpoints(node: Any, service: ServiceName) -> frozenset[bytes]:
-    """Return the DDS ids of the endpoints that answer for `service`, or nothing where rmw is not DDS."""
-    infos = node.get_publishers_info_by_topic(f"rr{service}Reply", no_mangle=True)
-    return frozenset(bytes(info.endpoint_gid) for info in infos)
+def server_endpoints(node: Any, service: ServiceName) -> dict[bytes, bool]:
+    """Return the DDS ids of the endpoints that answer for `service`, and whether each one's node is known.
+
+    Nothing where rmw is not DDS.
+    """
+    return {bytes(info["endpoint_gid"]): info["node_name"] != _UNKNOWN_NODE for info in _reply_writers(node, service)}
+
+
+def _reply_writers(node: Any, service: str) -> list[dict[str, Any]]:
+    # Not through the node's own method, which makes an object of each endpoint's QoS: it takes twice as long.
+    infos: list[dict[str, Any]] = _rclpy.rclpy_get_publishers_info_by_topic(node.handle, f"rr{service}Reply", True)
+    return infos
+
+
+def _service_type(dds_type: str) -> str:
+    """Return `std_srvs/srv/Trigger` for `std_srvs::srv::dds_::Trigger_Response_`."""
+    return dds_type.replace("dds_::", "").replace("::", "/").removesuffix("_Response_")
+
+
+def participants(node: Any) -> frozenset[bytes]:
+    """Return the DDS ids of the endpoints by which each ROS process of the domain tells of its nodes: one for each."""
+    infos = _rclpy.rclpy_get_publishers_info_by_topic(node.handle, PARTICIPANTS_TOPIC, True)
+    return frozenset(bytes(info["endpoint_gid"]) for info in infos)

@@ -7,17 +7,20 @@ from typing import TYPE_CHECKING, Any
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.rcl import Message, send_request, take_response
-from sidecar.ros.request_window import MAX_SIZE
 from sidecar.ros.ros_loop import service_qos
+from sidecar.ros.server_capacity import MOST_AT_ONCE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from protos.model import ServiceName
     from sidecar.ros.types import ServiceType
 
 TAKEN_AT_ONCE = 32
 """Answers taken from one server before the others have their turn."""
+SETTLES_S = 0.2
+"""A server that came is asked so long after its node is known: until then it may not know of our client, and DDS takes
+up to 2 s to give it what it missed (measured with servers killed and started again)."""
 
 
 class LocalServer:
@@ -29,29 +32,69 @@ class LocalServer:
         self.type = service_type
         self._node = node
         try:
-            self._client = node.create_client(service_type.service, name, qos_profile=service_qos(MAX_SIZE))
+            self._client = node.create_client(service_type.service, name, qos_profile=service_qos(MOST_AT_ONCE))
         # rclpy validates names with exceptions of several unrelated classes.
         except Exception as error:
             raise RosBridgeError(f"rmw refuses a client of {name}, type {service_type.name}: {error}") from error
         self._pointer: int = self._client.handle.pointer
-        self._endpoints = graph.server_endpoints(node, name)
-        """DDS ids of the server, to tell a restarted one from the old one."""
+        self.endpoints: frozenset[bytes] = frozenset()
+        """DDS ids of all that the graph shows for it, to tell a restarted one from the old one; empty where rmw is not
+        DDS."""
+        self._alive: frozenset[bytes] = frozenset()
+        self._asked: frozenset[bytes] = frozenset()
+        """Those who may still have to answer something."""
+        self._usable_at: float | None = None
+        self._looked = False
+        self.ready = False
+        """Whether requests may be sent: before, rmw would drop them without a word, or nobody is there."""
 
     @property
     def handle(self) -> Any:
         """rclpy's handle."""
         return self._client.handle
 
-    def is_matched(self) -> bool:
-        """True once requests reach the server: before, rmw would drop them without a word."""
-        return bool(self._client.handle.service_server_is_available())
+    @property
+    def lost(self) -> bool:
+        """True while all that the graph shows for it are dead."""
+        return bool(self.endpoints) and not self._alive
 
-    def was_replaced(self) -> bool:
-        """Whether, since the last call, the server went and another came, which will not answer what it was asked."""
-        endpoints = graph.server_endpoints(self._node, self.name)
-        replaced = bool(endpoints and self._endpoints and not endpoints & self._endpoints)
-        self._endpoints = endpoints or self._endpoints
-        return replaced
+    @property
+    def living(self) -> int:
+        """How many of those that the graph shows live; each of them gets every request."""
+        return len(self._alive)
+
+    def is_usable(self, now: float) -> bool:
+        """Whether one of those that the graph shows lives and knows of us by now."""
+        if not self.endpoints:
+            return self._looked
+        return self._usable_at is not None and now >= self._usable_at
+
+    def look(self, is_dead: Callable[[bytes], bool], now: float) -> bool:
+        """Look at the graph; returns whether all that were there at the last look are gone, and will answer nothing."""
+        known = graph.server_endpoints(self._node, self.name)
+        self.endpoints = frozenset(known)
+        self._looked = True
+        alive = frozenset(endpoint for endpoint, is_known in known.items() if is_known and not is_dead(endpoint))
+        if not alive & self._alive:
+            self._usable_at = now + SETTLES_S if alive else None
+        self._alive = alive
+        # A silent one keeps what it has until another takes its place, or until it is gone from the graph.
+        went = bool(self._asked) and not self._asked & (alive or self.endpoints)
+        if went or alive:
+            self._asked = alive
+        matched = bool(self._client.handle.service_server_is_available())
+        self.ready = matched and self.is_usable(now)
+        return went
+
+    def strike_out(self, is_dead: Callable[[bytes], bool]) -> bool:
+        """Some process died, or is silent; returns whether nobody is left to ask."""
+        alive = frozenset(endpoint for endpoint in self._alive if not is_dead(endpoint))
+        went = bool(self._alive) and not alive
+        self._alive = alive
+        if went:
+            self._usable_at = None
+            self.ready = False
+        return went
 
     def send(self, request: Message) -> int:
         """Send a request; returns its number. Raises RosBridgeError."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.core.rules import find_rule
+from sidecar.core.rules import Rules
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.service_proxy import ServiceProxy
 from sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from protos.model import ServiceName
     from sidecar.core.events import OfferService, WithdrawService
@@ -26,7 +26,7 @@ MAX_OFFERED_SERVICES = 512
 DISCOVERY_SETTLES_S = 1.0
 """After joining the domain, nothing is offered for so long: servers that run here already must be discovered first."""
 NAME_IS_FREE_S = 0.15
-"""Nobody else must have served a name for so long: two looks. In the cloud's own domain, where robot and cloud may both
+"""Nobody else must have served a name for so long. In the cloud's own domain, where robot and cloud may both
 be, the server whose service we are offered was perhaps discovered by the cloud's sidecar a moment before ours."""
 TYPE_RETRY_S = 30.0
 """How often a type that is not installed is looked for again: someone may be installing it."""
@@ -51,7 +51,7 @@ class Proxies:
         """`on_closed` is told how many requests lay at a proxy unseen."""
         self._loop = loop
         self._own_node = loop.node.get_fully_qualified_name()
-        self._rules = rules
+        self._rules = Rules(rules)
         self._stats = stats
         self._on_request = on_request
         self._on_bad_request = on_bad_request
@@ -63,11 +63,13 @@ class Proxies:
         self._left_alone: dict[ServiceName, frozenset[str]] = {}
         self._free_since: dict[ServiceName, float] = {}
         self._types_retried_at = 0.0
+        self.settling = False
+        """Whether a name is about to be free: another look is wanted soon."""
         self._settled_at = now + DISCOVERY_SETTLES_S
 
     def offer(self, event: OfferService) -> None:
         """A server in the network offers this."""
-        if find_rule(self._rules, event.name) is None:
+        if self._rules.find(event.name) is None:
             self._stats.dropped["offer_not_in_rules"] += 1
             log.error("service %s is offered, but no rule of this sidecar carries it", event.name)
             return
@@ -98,17 +100,22 @@ class Proxies:
 
     def look(
         self, served: Mapping[ServiceName, graph.Served], fallbacks: Mapping[ServiceName, str], now: float
-    ) -> None:
-        """Compare the graph with what is to be offered; create and withdraw proxies accordingly."""
+    ) -> Iterator[None]:
+        """Compare the graph with what is to be offered, in steps; create and withdraw proxies accordingly."""
+        self.settling = False
         # What has a fallback is offered without any server as well.
         wanted = {**fallbacks, **self.offers}
         for name in [name for name in self._proxies if name not in wanted]:
             self._close_proxy(name)
             log.warning("service %s is withdrawn: no server, and its fallback is gone", name)
+            yield
         retry_types = now - self._types_retried_at >= TYPE_RETRY_S
         if retry_types:
             self._types_retried_at = now
         for name, type_name in wanted.items():
+            yield
+            if name not in self.offers and name not in fallbacks:
+                continue  # withdrawn since the last step
             others = self._servers_in_our_way(name, served.get(name))
             if others:
                 self._free_since.pop(name, None)
@@ -116,6 +123,7 @@ class Proxies:
                 continue
             free_since = self._free_since.setdefault(name, now)
             if now < self._settled_at or now - free_since < NAME_IS_FREE_S:
+                self.settling = True
                 continue
             if self._left_alone.pop(name, None):
                 log.info("service %s: no other node serves it any more", name)

@@ -7,6 +7,7 @@ each type's own type support makes. What is used of the C structures, the same s
 
     rmw_request_id_t       { uint8_t writer_guid[16]; int64_t sequence_number; }
     rcutils_uint8_array_t  { uint8_t * buffer; size_t length, capacity; rcutils_allocator_t allocator; }
+    rmw_qos_profile_t, rmw_subscription_options_t (since Humble): `_Qos` and `_SubscriptionOptions` below
 
 Functions are called with the interpreter lock held where that takes microseconds, and without it where they may block
 or move much memory. All of this belongs to one thread: rcl keeps its error text per thread.
@@ -27,6 +28,8 @@ _CLIENT_TAKE_FAILED = 501
 _SERVICE_TAKE_FAILED = 601
 _ERROR_TEXT_BYTES = 1024
 """RCUTILS_ERROR_MESSAGE_MAX_LENGTH"""
+_KEEP_LAST = _RELIABLE = _TRANSIENT_LOCAL = 1
+"""Of rmw_qos_history_policy_e, rmw_qos_reliability_policy_e and rmw_qos_durability_policy_e."""
 LARGE_MESSAGE_BYTES = 65_536
 """From here on a copy takes longer than handing the interpreter lock to another thread and back (tens of µs)."""
 
@@ -74,6 +77,35 @@ class _ErrorText(ctypes.Structure):
     _fields_ = (("text", ctypes.c_char * _ERROR_TEXT_BYTES),)
 
 
+class _Time(ctypes.Structure):
+    """Zero: the rmw's default, which is without end."""
+
+    _fields_ = (("seconds", ctypes.c_uint64), ("nanoseconds", ctypes.c_uint64))
+
+
+class _Qos(ctypes.Structure):
+    _fields_ = (
+        ("history", ctypes.c_int),
+        ("depth", ctypes.c_size_t),
+        ("reliability", ctypes.c_int),
+        ("durability", ctypes.c_int),
+        ("deadline", _Time),
+        ("lifespan", _Time),
+        ("liveliness", ctypes.c_int),
+        ("liveliness_lease", _Time),
+        ("no_name_conventions", ctypes.c_bool),
+    )
+
+
+class _SubscriptionOptions(ctypes.Structure):
+    _fields_ = (
+        ("payload", ctypes.c_void_p),
+        ("ignore_local", ctypes.c_bool),
+        ("unique_endpoints", ctypes.c_int),
+        ("content_filter", ctypes.c_void_p),
+    )
+
+
 class _Functions:
     """The C functions, by a loader that holds (PyDLL) or releases (CDLL) the interpreter lock."""
 
@@ -98,6 +130,21 @@ class _Functions:
         )
         self.bytes_resize = _prototype(rcl.rcutils_uint8_array_resize, status, ctypes.POINTER(_Bytes), ctypes.c_size_t)
         self.bytes_fini = _prototype(rcl.rcutils_uint8_array_fini, status, ctypes.POINTER(_Bytes))
+        self.node_rmw_handle = _prototype(rcl.rcl_node_get_rmw_handle, pointer, pointer)
+        self.graph_guard = _prototype(rcl.rcl_node_get_graph_guard_condition, pointer, pointer)
+        self.wait_for_guard = _prototype(rcl.rcl_wait_set_add_guard_condition, status, pointer, pointer, pointer)
+        self.subscription_options = _prototype(rcl.rmw_get_default_subscription_options, _SubscriptionOptions)
+        self.create_subscription = _prototype(
+            rcl.rmw_create_subscription,
+            pointer,
+            pointer,
+            pointer,
+            ctypes.c_char_p,
+            ctypes.POINTER(_Qos),
+            ctypes.POINTER(_SubscriptionOptions),
+        )
+        self.destroy_subscription = _prototype(rcl.rmw_destroy_subscription, status, pointer, pointer)
+        self.take = _prototype(rcl.rmw_take, status, pointer, pointer, ctypes.POINTER(ctypes.c_bool), pointer)
         self.error_text = _prototype(rcl.rcutils_get_error_string, _ErrorText)
         self.reset_error = _prototype(rcl.rcutils_reset_error, None)
 
@@ -144,12 +191,14 @@ class Message:
 class MessageType:
     """A generated message class whose type support is loaded, to and from bytes (CDR with its 4-byte header)."""
 
-    __slots__ = ("_buffer", "_clean_capacity", "_create", "_destroy", "_last_length", "_type_support", "name")
+    __slots__ = ("_buffer", "_clean_capacity", "_create", "_destroy", "_last_length", "name", "type_support")
 
     def __init__(self, message_class: Any) -> None:
         self.name: str = message_class.__name__
         meta = type(message_class)
-        self._type_support = _unwrap(meta._TYPE_SUPPORT)
+        if meta._TYPE_SUPPORT is None:
+            meta.__import_type_support__()
+        self.type_support = _unwrap(meta._TYPE_SUPPORT)
         self._create = _Create(_unwrap(meta._CREATE_ROS_MESSAGE))
         self._destroy = _Destroy(_unwrap(meta._DESTROY_ROS_MESSAGE))
         self._last_length = 0
@@ -187,7 +236,7 @@ class MessageType:
         return ctypes.string_at(buffer.buffer, buffer.length)
 
     def _fill_buffer(self, message: Message) -> None:
-        if self.functions().serialize(message.pointer, self._type_support, self._buffer) != _OK:
+        if self.functions().serialize(message.pointer, self.type_support, self._buffer) != _OK:
             raise RclError(f"cannot serialise {self.name}: {_take_error()}")
 
     def _grow_buffer(self, capacity: int) -> None:
@@ -206,7 +255,7 @@ class MessageType:
         payload = bytes(payload)
         self._last_length = len(payload)
         view = _View(payload, len(payload), len(payload))
-        if self.functions().deserialize(view, self._type_support, message.pointer) != _OK:
+        if self.functions().deserialize(view, self.type_support, message.pointer) != _OK:
             raise RosBridgeError(f"the bytes are not a {self.name}: {_take_error()}")
         return message
 
@@ -249,3 +298,56 @@ def send_request(client: int, request: Message) -> int:
     if status != _OK:
         raise RclError(f"cannot send a request ({status}): {_take_error()}")
     return number.value
+
+
+def graph_guard(node: int) -> int:
+    """Return the address of the guard condition that rcl triggers when the graph of the rcl node has changed."""
+    guard = _holding.graph_guard(node)
+    if not guard:
+        raise RclError(f"no guard condition of the graph: {_take_error()}")
+    return int(guard)
+
+
+def wait_for_guard(wait_set: int, guard: int) -> None:
+    """Let the next wait on the rcl wait set end when this guard condition is triggered."""
+    status = _holding.wait_for_guard(wait_set, guard, None)
+    if status != _OK:
+        raise RclError(f"cannot wait for the graph ({status}): {_take_error()}")
+
+
+class LatchedTopic:
+    """A reader of what each publisher of a topic said last, also before this reader was there.
+
+    The topic's name is DDS's own: those of rmw itself can not be had through rcl.
+    """
+
+    def __init__(self, node: int, name: str, message_type: MessageType, depth: int) -> None:
+        self._node = _holding.node_rmw_handle(node)
+        self._type = message_type
+        qos = _Qos(
+            history=_KEEP_LAST,
+            depth=depth,
+            reliability=_RELIABLE,
+            durability=_TRANSIENT_LOCAL,
+            no_name_conventions=True,
+        )
+        options = _holding.subscription_options()
+        self._pointer = _releasing.create_subscription(
+            self._node, message_type.type_support, name.encode(), qos, options
+        )
+        if not self._pointer:
+            raise RclError(f"cannot read {name}: {_take_error()}")
+
+    def take(self) -> bytes | None:
+        """Take the next message, if there is one."""
+        message, taken = self._type.new(), ctypes.c_bool()
+        status = _holding.take(self._pointer, message.pointer, taken, None)
+        if status != _OK:
+            raise RclError(f"cannot take a message ({status}): {_take_error()}")
+        return self._type.serialize(message) if taken.value else None
+
+    def close(self) -> None:
+        """Destroy the reader."""
+        pointer, self._pointer = self._pointer, None
+        if pointer:
+            _releasing.destroy_subscription(self._node, pointer)

@@ -1,17 +1,20 @@
-"""Requests to one local server, no more at once than its queue holds.
+"""Requests to one local server, no more at once than it can work on and than its queue surely holds.
 
 A ROS server made with the default profile keeps the last 10 requests it has not taken yet; the 11th pushes the first
 one out without a trace. How many lie there cannot be asked, but follows from the answers: the requests of one client
-are taken in order, so an answer tells that its request and all earlier ones have left the queue. At most `size` later
-ones are let through; the rest wait here.
+are taken in order, so an answer tells that its request and all earlier ones have left the queue. At most SAFE_SIZE
+later ones are let through, or two more than the server was seen to work on at one moment; the rest wait here. From
+the silence of a server nothing is concluded: it may need a minute for each. Only what nobody waits for any more counts
+no longer once it is the oldest: it is what would be pushed out first.
 
-A server that works on many requests at once would be slowed down by that. It shows by answering out of order, or by
-answering nothing for a while although the window is full: then the window doubles, and stays so. At its largest, a
-silent server gets one request in STALL_S.
+That is the most. As no request can be called back from a server's queue, where nothing more urgent overtakes it, only
+as many are let through as the server needs to be busy (`server_capacity.py`): one or two, if it takes one after the
+other. An answer may be lost, though, so after a silence one more is let through, and then another, each time after
+twice as long.
 
-What is late already when its turn comes must not keep the server from what is not: after an outage a backlog comes
-first and what the robot asks now right behind it, and no request can be called back from a server's queue. So only one
-late request at a time is let through, as long as others may come.
+What is late already when its turn comes, or would be when the server has done it, must not keep the server from what is
+not: after an outage a backlog comes first and what the robot asks now right behind it. So only one late request at a
+time is let through, as long as others may come.
 """
 
 from __future__ import annotations
@@ -20,20 +23,21 @@ from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from sidecar.ros.request_queue import RequestQueue
+from sidecar.ros.server_capacity import FIRST_LIMIT, SAFE_SIZE, ServerCapacity
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterator
 
     from sidecar.core.priority import Priority
 
-FIRST_SIZE = 8
-"""Below rmw's default depth of 10: the server may have other clients."""
-MAX_SIZE = 32
-"""Also what DDS keeps of requests and of answers, and so what a killed server costs: until its lease ends, about 20 s,
-no request counts as delivered to all, and for good DDS keeps as many buffers as it held requests, each as long as the
-longest of them."""
+STALL_TIMES = 3.0
+"""A silence lasts so many times what the server's requests usually take ..."""
+SHORT_STALL_S = 0.1
+"""... but at least this long. So does the first one of a server of which nothing is known: one request may wait there,
+and the other may have been lost."""
 STALL_S = 1.0
-"""A server that takes its requests one by one and needs longer than this for one is late for any deadline."""
+"""Further silences of such a server are twice this, four times, and so on. A late request that is out for STALL_S is no
+reason any more to hold the next one back."""
 LATE_ONLY_S = 2.0
 """When nothing but late requests came for so long, they may fill the window: then the deadline is shorter than the
 way here, and one at a time would only make it worse."""
@@ -45,24 +49,33 @@ class RequestWindow(Generic[T]):
     """Which requests may go to the server now. The caller sends what `release` yields and reports `sent`."""
 
     __slots__ = (
+        "_capacity",
+        "_freed",
+        "_given_up",
         "_highest_answered",
         "_late_number",
         "_late_released",
         "_next_late_at",
         "_only_late_since",
         "_progress_at",
+        "_silences",
         "_unseen",
         "_waiting",
-        "size",
     )
 
-    def __init__(self, size: int = FIRST_SIZE) -> None:
-        self.size = size
+    def __init__(self, first: int = FIRST_LIMIT) -> None:
+        self._capacity = ServerCapacity(first)
         self._waiting: RequestQueue[T] = RequestQueue()
         self._unseen: deque[int] = deque()
         """Numbers of the sent requests that may still lie in the server's queue, ascending."""
+        self._given_up: set[int] = set()
+        """Those of them that nobody waits for any more."""
         self._highest_answered = -1
         self._progress_at = 0.0
+        self._silences = 0
+        """How often one more was let through since the last answer."""
+        self._freed = False
+        """Something was given up since `release` was called."""
         self._late_released = False
         """Whether what `release` yielded last was late."""
         self._late_number: int | None = None
@@ -76,10 +89,17 @@ class RequestWindow(Generic[T]):
         """How many requests wait."""
         return len(self._waiting)
 
+    @property
+    def size(self) -> int:
+        """How many requests the server may have that it was not seen to have taken."""
+        wanted = self._capacity.limit - self._capacity.overtaken
+        after_silences = min(wanted + self._silences, SAFE_SIZE)
+        return max(1, wanted, after_silences)
+
     def add(self, request: T, priority: Priority, deadline: float, now: float) -> None:
         """Let a request wait for its turn."""
         self._waiting.add(request, priority, deadline)
-        if deadline > now:
+        if deadline > now + self._capacity.usual_s:
             self._only_late_since = None
         elif self._only_late_since is None:
             self._only_late_since = now
@@ -98,14 +118,13 @@ class RequestWindow(Generic[T]):
 
     def release(self, now: float) -> Iterator[T]:
         """Yield waiting requests while the window is open; report each with `sent` before the next."""
-        if self._waiting and len(self._unseen) >= self.size and now - self._progress_at >= STALL_S:
+        self._freed = False
+        silent_at = self._silent_at()
+        if self._waiting and silent_at is not None and silent_at <= now:
             self._progress_at = now
-            if self.size < MAX_SIZE:
-                self._grow()
-            else:
-                self._unseen.popleft()  # most likely lost; an answer to whatever is sent next opens the window
+            self._silences += 1
         while len(self._unseen) < self.size:
-            found = self._waiting.take(now, late_too=self._late_may_go(now))
+            found = self._waiting.take(now + self._capacity.usual_s, late_too=self._late_may_go(now))
             if found is None:
                 return
             request, self._late_released = found
@@ -116,6 +135,7 @@ class RequestWindow(Generic[T]):
         if not self._unseen:
             self._progress_at = now
         self._unseen.append(number)
+        self._capacity.sent(number, len(self._unseen), now)
         if self._late_released:
             self._late_number = number
             self._next_late_at = now + STALL_S
@@ -123,32 +143,52 @@ class RequestWindow(Generic[T]):
     def answered(self, number: int, now: float) -> None:
         """The server answered request `number`."""
         self._progress_at = now
+        self._silences = 0
+        self._capacity.answered(number, now)
         self.given_up(number)
-        if number < self._highest_answered:
-            self._grow()
-            return
-        self._highest_answered = number
-        while self._unseen and self._unseen[0] <= number:
-            self._unseen.popleft()
+        if number > self._highest_answered:
+            self._highest_answered = number
+            while self._unseen and self._unseen[0] <= number:
+                self._given_up.discard(self._unseen.popleft())
+            self._drop_given_up()
 
     def given_up(self, number: int) -> None:
         """Nobody waits for the answer to request `number` any more."""
         if number == self._late_number:
             self._late_number = None
+        if number > self._highest_answered:
+            self._given_up.add(number)
+            self._drop_given_up()
+        self._capacity.given_up(number)
+        self._freed = True
+
+    def _drop_given_up(self) -> None:
+        while self._unseen and self._unseen[0] in self._given_up:
+            self._given_up.remove(self._unseen.popleft())
 
     def next_due(self) -> float | None:
         """Return when `release` may yield although no answer came, or None."""
         if not self._waiting:
             return None
-        if len(self._unseen) >= self.size or self._late_number is None:
-            return self._progress_at + STALL_S
+        if self._freed:
+            return self._progress_at
+        silent_at = self._silent_at()
+        if silent_at is not None or self._late_number is None or len(self._unseen) >= self.size:
+            return silent_at
         if self._only_late_since is None:
             return self._next_late_at
         return min(self._next_late_at, self._only_late_since + LATE_ONLY_S)
 
+    def _silent_at(self) -> float | None:
+        """When one more may go although the window is full; None: never, or it is open."""
+        if not self.size <= len(self._unseen) < SAFE_SIZE:
+            return None
+        if self._capacity.usual_s:
+            patience_s = max(SHORT_STALL_S, STALL_TIMES * self._capacity.usual_s) * 2.0**self._silences
+        else:
+            patience_s = STALL_S * 2.0**self._silences if self._silences else SHORT_STALL_S
+        return self._progress_at + patience_s
+
     def _late_may_go(self, now: float) -> bool:
         only_late = self._only_late_since is not None and now - self._only_late_since >= LATE_ONLY_S
         return self._late_number is None or now >= self._next_late_at or only_late
-
-    def _grow(self) -> None:
-        self.size = min(self.size * 2, MAX_SIZE)

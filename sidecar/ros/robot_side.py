@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,8 +22,11 @@ from sidecar.ros.notices import NoticePublisher
 from sidecar.ros.proxies import Proxies
 from sidecar.ros.reply_pacer import ReplyPacer
 from sidecar.ros.request_numbering import RequestNumbering
+from sidecar.ros.server_processes import ServerProcesses
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from protos.model import ServiceName
     from sidecar.core.events import ApplicationEvent, RequestId
     from sidecar.core.rules import ServiceRule
@@ -74,12 +78,15 @@ class RobotSide:
         self._limited = limited_log
         self._notices = NoticePublisher(loop.node, name)
         self._numbering = RequestNumbering(data_plane.session)
+        self._processes = ServerProcesses(loop.domain_id, lambda: graph.participants(loop.node), loop.wake)
+        """Of the fallbacks."""
         self._pacer: ReplyPacer[_PacedAnswer] = ReplyPacer()
         self._fallbacks = FallbackCaller(
             loop=loop,
             rules=rules,
             stats=stats,
             limited_log=limited_log,
+            processes=self._processes,
             on_answer=self._answer_from_fallback,
             on_failure=self._tell_failure,
         )
@@ -96,7 +103,7 @@ class RobotSide:
             on_closed=self._proxy_closed,
         )
         self.look_is_due = False
-        """The graph should be looked at before the next scan period is over."""
+        """The graph should be looked at although it has not changed."""
 
     # -- what the data plane says ------------------------------------------------------------------------------
 
@@ -263,20 +270,22 @@ class RobotSide:
 
     # -- what the graph shows ------------------------------------------------------------------------------------
 
-    @property
-    def scan_period_s(self) -> float:
-        """Seconds until the graph should be looked at again."""
-        return graph.SETTLING_PERIOD_S if self._fallbacks.settling else graph.SCAN_PERIOD_S
+    def settling(self) -> bool:
+        """Whether another look at the graph should follow soon, although it does not change."""
+        return self._fallbacks.settling or self._proxies.settling
 
-    def look(self, now: float) -> None:
-        """Compare the graph with what is offered and with the fallbacks."""
-        self.look_is_due = False
-        if self._proxies.offers or self._fallbacks.configured:
-            served = graph.scan(self._loop.node)
-            self._stats.scans += 1
-            self._fallbacks.look(served, self._proxies.offers, now)
-            self._proxies.look(served, self._fallbacks.types(), now)
-            self._publish_carried()
+    def look(self) -> Iterator[None]:
+        """Compare the graph with what is offered and with the fallbacks, in small steps."""
+        if not self._proxies.offers and not self._fallbacks.configured:
+            return
+        served = yield from graph.scan(self._loop.node)
+        self._stats.scans += 1
+        now = time.monotonic()
+        self._fallbacks.look(served, self._proxies.offers, now)
+        self._processes.forget_the_gone()
+        yield
+        yield from self._proxies.look(served, self._fallbacks.types(), now)
+        self._publish_carried()
 
     def _uses_changed(self) -> None:
         """What is used is what is carried and offered: another offer changes it, also of a service carried before."""
@@ -298,6 +307,8 @@ class RobotSide:
 
     def on_timer(self, now: float) -> None:
         """Ask fallbacks in time; send the answers that were held back for their clients' sake."""
+        if self._processes.take_ended():
+            self._fallbacks.strike_out(now)
         self._fallbacks.on_timer(now)
         if self._pacer.queued:
             for answer in self._pacer.take_due(now):
@@ -306,5 +317,6 @@ class RobotSide:
     def close(self) -> None:
         """Withdraw every service."""
         self._fallbacks.close()
+        self._processes.close()
         self._proxies.close()
         self._publish_carried()

@@ -17,6 +17,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, qos_profile_services_default
 from rclpy.signals import SignalHandlerOptions
 
+from sidecar.ros.rcl import graph_guard, wait_for_guard
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -68,6 +70,9 @@ class RosLoop:
             parameter_overrides=[Parameter("start_type_description_service", value=False)],
         )
         self._guard = _rclpy.GuardCondition(self._context.handle)
+        self._graph_guard = graph_guard(self.node.handle.pointer)
+        self.graph_changed = False
+        """Whether the graph changed; whoever looks at it says so by setting it back."""
         self._services: dict[Any, Waited] = {}
         self._clients: dict[Any, Waited] = {}
         self._by_pointer: dict[int, Waited] = {}
@@ -103,12 +108,15 @@ class RosLoop:
         wait_set = self._wait_set
         wait_set.clear_entities()
         wait_set.add_guard_condition(self._guard)
+        wait_for_guard(wait_set.pointer, self._graph_guard)
         for service in self._services:
             wait_set.add_service(service)
         for client in self._clients:
             wait_set.add_client(client)
         wait_set.wait(int(min(max(timeout_s, 0.0), LONGEST_WAIT_S) * _NANOSECONDS))
         self._woken = False
+        if self._graph_guard in wait_set.get_ready_entities("guard_condition"):
+            self.graph_changed = True
         ready = []
         if self._services:
             ready += wait_set.get_ready_entities("service")
@@ -127,4 +135,4 @@ class RosLoop:
         self._by_pointer = {
             handle.pointer: entity for handle, entity in (*self._services.items(), *self._clients.items())
         }
-        self._wait_set = _rclpy.WaitSet(0, 1, 0, len(self._clients), len(self._services), 0, self._context.handle)
+        self._wait_set = _rclpy.WaitSet(0, 2, 0, len(self._clients), len(self._services), 0, self._context.handle)

@@ -54,6 +54,8 @@ class ServiceRunner:
         """By rmw's sequence number."""
         self.window: RequestWindow[Execution] = RequestWindow()
         self._server = LocalServer(node, name, service_type)
+        self._heard_at = 0.0
+        """When the server answered last, or got something to do while it had nothing."""
 
     @property
     def handle(self) -> Any:
@@ -65,13 +67,15 @@ class ServiceRunner:
         """Executions at the server or waiting for it."""
         return len(self._at_server) + self.window.waiting
 
-    def is_matched(self) -> bool:
-        """True once requests reach the server: before, rmw would drop them without a word."""
-        return self._server.is_matched()
+    @property
+    def server(self) -> LocalServer:
+        """Whom it asks."""
+        return self._server
 
-    def was_replaced(self) -> bool:
-        """Whether, since the last call, another server took the place of the old one."""
-        return self._server.was_replaced()
+    @property
+    def silent_since(self) -> float | None:
+        """Since when the server has something to answer and answers nothing, or None."""
+        return self._heard_at if self._at_server else None
 
     def add(self, execution: Execution, now: float) -> bool:
         """Send `execution` now, or as soon as the server has room; return False when it has to wait."""
@@ -91,6 +95,8 @@ class ServiceRunner:
             except RosBridgeError as error:
                 self._on_unsent(self, execution, str(error))
                 continue
+            if not self._at_server:
+                self._heard_at = now
             execution.number = number
             self._at_server[number] = execution
             self.window.sent(number, now)
@@ -99,6 +105,7 @@ class ServiceRunner:
         """Take the answers that have arrived."""
         for number, payload in self._server.take():
             self.window.answered(number, now)
+            self._heard_at = now
             execution = self._at_server.pop(number, None)
             if execution is None:
                 self._on_stray_answer(self)
@@ -117,10 +124,14 @@ class ServiceRunner:
     def take_back(self) -> tuple[list[Execution], list[Execution]]:
         """Forget everything; return (executions that may have run, executions that certainly have not)."""
         sent = list(self._at_server.values())
-        unsent = self.window.take_all()
         self._at_server.clear()
+        return sent, self.take_back_unsent()
+
+    def take_back_unsent(self) -> list[Execution]:
+        """Forget what waits, which certainly has not run; what is at the server may still be answered."""
+        unsent = self.window.take_all()
         self.window = RequestWindow()
-        return sent, unsent
+        return unsent
 
     def close(self) -> None:
         """Destroy the client."""

@@ -89,7 +89,7 @@ def test_a_robot_that_calls_what_it_may_not(world: World) -> None:
 def test_a_robot_that_is_revoked_loses_its_sessions(world: World) -> None:
     """The one of the test before: its paths are up until then, and what it sends afterwards is nobody's."""
     cloud = world.system.parts["cloud_a.sidecar"]
-    assert world.counter("cloud_a", "plr_path_up", peer=ROBOT_2) == 1
+    world.system.wait("its path", lambda: world.counter("cloud_a", "plr_path_up", peer=ROBOT_2) == 1)
     tap = world.tap("cloud_a")
     with world.calls():
         source = next(one.source for one in world.towards(tap, 200) if one.source[0] in addresses(world, "robot_2"))

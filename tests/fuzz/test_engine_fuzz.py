@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from protos.model import Role, ServiceName
 from sidecar.core import frame
+from sidecar.core.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
+from sidecar.core.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
 from sidecar.core.dedup import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
 from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.fragments import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
@@ -21,10 +23,11 @@ from sidecar.core.messages import (
     ResponseMessage,
     encode_message,
 )
-from sidecar.core.outbox import MAX_BYTES, MAX_MESSAGES
 from sidecar.core.path_id import PathState
-from sidecar.core.path_table import MAX_PENDING_FRAMES
+from sidecar.core.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
 from sidecar.core.priority import Priority
+from sidecar.core.refused_copies import MAX_REFUSED_COPIES
+from sidecar.core.room import MAX_MESSAGES
 from tests.sessions import seal
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 
@@ -112,7 +115,12 @@ class Rogue:
         for link in self.victim.links.values():
             for path in link._paths.values():
                 if path.peer == self.node.name:
-                    self.send([frame.encode_probe_reply(ProbeReply(number)) for number in list(path._probes_out)])
+                    self.send(
+                        [
+                            frame.encode_probe_reply(ProbeReply(number))
+                            for number in [*path.probing._out, *path.probing._back]
+                        ]
+                    )
 
     def attack(self, kind: str, count: int) -> None:
         self.send(ATTACKS[kind](self.rng) for _ in range(count))
@@ -128,18 +136,24 @@ def assert_bounded(node: Node) -> None:
         assert len(reassembler._over) <= OVER_REMEMBERED
     assert len(engine._inbound._reassemblers) <= len(engine.peers.names())
     assert len(engine._outbox) <= MAX_MESSAGES
-    assert engine._outbox.held_bytes <= MAX_BYTES
+    assert engine._outbox.held_bytes <= MAX_PEER_BYTES * len(engine.peers.names())
+    answers = engine._serving.answers
+    assert len(answers) <= MAX_ANSWERS
+    assert answers.held_bytes <= MAX_ANSWER_BYTES
+    assert len(answers._timers) <= 2 * len(answers) + ANSWER_TIMER_SLACK + 1
     executions = engine._serving.executions
     assert executions.running <= MAX_RUNNING
     assert len(executions._finished) <= MAX_REMEMBERED + MAX_RUNNING
     assert len(executions._timers) <= 2 * executions.running + TIMER_SLACK + 1
     assert executions._cached_bytes <= MAX_CACHED_BYTES
+    assert len(executions._refused) <= MAX_REFUSED_COPIES
     assert len(engine.stats.executions) < 20
     assert len(engine.stats.dropped) < 40
     for link in node.links.values():
         assert len(link.stats.dropped) < 20
         for path in link._paths.values():
             assert len(path.pending) <= MAX_PENDING_FRAMES
+            assert len(path.finished) <= MAX_PENDING_FINISHED
             assert path.recovery.in_flight >= 0
 
 

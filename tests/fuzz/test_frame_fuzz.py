@@ -109,7 +109,7 @@ def test_frames_or_the_one_error(data: bytes) -> None:
                 assert len(item.data) == item.symbol
 
 
-@given(st.binary(max_size=40) | st.binary(max_size=40).map(lambda rest: b"\xd2\x01" + rest))
+@given(st.binary(max_size=40) | st.binary(max_size=40).map(lambda rest: b"\xd3\x01" + rest))
 def test_a_header_or_the_one_error(data: bytes) -> None:
     try:
         header = frame.decode_header(data)

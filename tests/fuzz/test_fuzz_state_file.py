@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from protos.errors import DecodeError
 from protos.model import MappingSet, NodeName, PeerSet, Version, Welcome
-from sidecar.state_file import LastGood, decode_identity, decode_last_good, encode_last_good
+from sidecar.state_file import LastGood, decode_addresses, decode_identity, decode_last_good, encode_last_good
 
 OWNER = NodeName("robot-1")
 GOOD = encode_last_good(LastGood(OWNER, Welcome(3.0, 0.5, ("s:1",)), PeerSet(Version(1), 2), MappingSet(Version(3), 4)))
@@ -28,6 +28,8 @@ def test_any_bytes(data: bytes) -> None:
         decode_identity(data)
     with pytest.raises(DecodeError):
         decode_last_good(data, OWNER)
+    with pytest.raises(DecodeError):
+        decode_addresses(data)
 
 
 @given(st.binary(max_size=200))
@@ -36,6 +38,8 @@ def test_any_body_under_a_right_checksum(body: bytes) -> None:
         decode_identity(sealed(b"plr-id\0\0", body))
     with contextlib.suppress(DecodeError):
         decode_last_good(sealed(b"plr-last", body), OWNER)
+    with contextlib.suppress(DecodeError):
+        decode_addresses(sealed(b"plr-ctrl", body))
     with contextlib.suppress(DecodeError):
         decode_last_good(sealed(b"plr-last", b"\x07robot-1" + body), OWNER)
 

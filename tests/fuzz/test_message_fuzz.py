@@ -32,7 +32,7 @@ messages = st.one_of(
         u8,
         st.sampled_from(Priority),
         u32.map(lambda n: n / 1e6),
-        u32.map(lambda n: n / 1e3),
+        u32.map(lambda n: n / 1e6),
         names.map(ServiceName),
         names,
         payloads,

@@ -18,6 +18,7 @@ from protos.model import (
 from protos.status import SyncState
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
+from sidecar.net.control_dialer import ControlDialer
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
 from tests.unit.controlplane.samples import interfaces, path, registration, use
 
@@ -68,7 +69,7 @@ def test_a_client_registers_follows_and_outlives_a_restart(tmp_path: Path) -> No
     engine = Engine()
     session = ControlSession(registration("robot", Role.ROBOT), random.Random(1))
     with ControlPlaneProcess(tmp_path, lease_ms=10_000) as plane:
-        client = ControlClient(plane.address, session, engine)
+        client = ControlClient(ControlDialer((plane.address,), session.stats), session, engine)
         client.set_candidates(interfaces("wlan0", "wwan0"))
         client.set_services((), (use(),))
         client.start()

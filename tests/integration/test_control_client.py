@@ -49,6 +49,7 @@ from sidecar import control_client
 from sidecar.control_client import ControlClient
 from sidecar.core import control_session
 from sidecar.core.control_session import ControlSession
+from sidecar.net.control_dialer import ControlDialer
 from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedControlPlane
 
@@ -110,7 +111,7 @@ class Recorder:
 
 
 class Rig:
-    def __init__(self, target: str, *, held: int = 0) -> None:
+    def __init__(self, *targets: str, held: int = 0) -> None:
         registration = Registration(
             PROTOCOL_VERSION,
             NodeName("robot-1"),
@@ -123,7 +124,7 @@ class Rig:
         )
         self.hooks = Recorder()
         session = ControlSession(registration, random.Random(1))
-        self.client = ControlClient(target, session, self.hooks)
+        self.client = ControlClient(ControlDialer(targets, session.stats), session, self.hooks)
 
 
 @pytest.fixture
@@ -312,6 +313,20 @@ def test_gives_up_a_stream_that_is_never_answered(
         wait_for(lambda: rig.client.stats.attempts >= 2)
         rig.client.stop()
     assert rig.client.stats.streams == 0
+
+
+@pytest.mark.audit("dp-12")
+def test_leaves_an_address_that_takes_connections_and_says_nothing_to_the_others(
+    server: ScriptedControlPlane, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel goes on accepting for a control plane that hangs; a hotspot's portal does the same."""
+    monkeypatch.setattr(control_session, "WELCOME_TIMEOUT_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        rig = Rig(f"127.0.0.1:{deaf.getsockname()[1]}", server.target)
+        rig.client.start()
+        wait_for(lambda: rig.client.stats.streams or rig.client.stats.attempts >= 5)
+        rig.client.stop()
+    assert (rig.client.stats.streams, rig.client.stats.attempts) == (1, 2)
 
 
 def test_judges_again_and_again_also_without_control_plane_and_whatever_comes_of_it(

@@ -41,6 +41,7 @@ from protos.model import (
 from sidecar.control_client import ControlClient
 from sidecar.core import control_session
 from sidecar.core.control_session import ControlSession
+from sidecar.net.control_dialer import ControlDialer
 from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import WAIT_S
 
@@ -107,7 +108,7 @@ class Sidecar:
             software_version="test",
         )
         self.session = ControlSession(registration, random.Random(number))
-        self.client = ControlClient(f"127.0.0.1:{port}", self.session, self)
+        self.client = ControlClient(ControlDialer((f"127.0.0.1:{port}",), self.session.stats), self.session, self)
         self.peers: queue.Queue[PeerSet] = queue.Queue()
         self.mappings: queue.Queue[MappingSet] = queue.Queue()
         self.connection: queue.Queue[bool] = queue.Queue()

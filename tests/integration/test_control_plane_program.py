@@ -68,7 +68,7 @@ def test_check_config_and_version(tmp_path: Path) -> None:
     config.write_text("insecure: true\nlisten: 127.0.0.1:0\n")
     done = run("--config", str(config), "--check-config")
     assert (done.returncode, done.stdout) == (0, f"{config}: ok\n")
-    assert re.fullmatch(r"plr-controlplane \S+ \(protocol 2\)\n", run("--version").stdout)
+    assert re.fullmatch(r"plr-controlplane \S+ \(protocol 3\)\n", run("--version").stdout)
     assert run().returncode == 2
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from protos.convert import sidecar_message_to_proto
 from protos.model import (
+    PROTOCOL_VERSION,
     Role,
     Welcome,
 )
@@ -34,7 +35,11 @@ def raw_register(**changes: object) -> control_pb2.SidecarMessage:
 @pytest.mark.parametrize(
     ("message", "code", "details"),
     [
-        (raw_register(protocol_version=1), grpc.StatusCode.FAILED_PRECONDITION, "protocol version 1 is not 2"),
+        (
+            raw_register(protocol_version=1),
+            grpc.StatusCode.FAILED_PRECONDITION,
+            f"protocol version 1 is not {PROTOCOL_VERSION}",
+        ),
         (raw_register(protocol_version=99, name="\x00"), grpc.StatusCode.FAILED_PRECONDITION, "protocol version 99"),
         (raw_register(name="no spaces, please"), grpc.StatusCode.INVALID_ARGUMENT, "name 'no spaces, please' is not"),
         (raw_register(name="../../etc"), grpc.StatusCode.INVALID_ARGUMENT, "name"),

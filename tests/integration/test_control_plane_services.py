@@ -10,6 +10,7 @@ import time
 import urllib.request
 
 import grpc
+import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
@@ -84,6 +85,7 @@ def test_metrics_of_the_contract_are_there_and_promtool_finds_nothing(plane: Con
     assert "_created" not in text
 
 
+@pytest.mark.audit("dp-12")
 def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
     with cloud(plane.address, "cloud-a"), robot(plane.address) as r:
         r.nack(r.expect(PeerSet, lambda message: bool(message.peers)), "not\nthis\tone")

@@ -162,7 +162,9 @@ def test_the_example_configuration_of_the_control_plane_loads() -> None:
 def test_the_example_configurations_belong_together() -> None:
     control = load_controlplane_config(DEPLOY / "config" / "controlplane.yaml")
     sidecars = [sidecar_config(role) for role in Role]
-    assert {split_host_port(sidecar.control_plane)[1] for sidecar in sidecars} == {split_host_port(control.listen)[1]}
+    assert {split_host_port(address)[1] for sidecar in sidecars for address in sidecar.control_plane} == {
+        split_host_port(control.listen)[1]
+    }
     listen = {"plr-sidecar": sidecars[0].metrics_listen, "plr-controlplane": control.metrics_listen}
     scrape = yaml.safe_load((DEPLOY / "prometheus" / "prometheus.yml").read_text())["scrape_configs"]
     for job in scrape:

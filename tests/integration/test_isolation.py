@@ -110,7 +110,7 @@ import socket, sys
 out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 out.connect(("127.0.0.2", int(sys.argv[1])))
 while True:
-    out.send(bytes((0xD2, 1)) + bytes(50))
+    out.send(bytes((0xD3, 1)) + bytes(50))
 """
 
 

@@ -18,6 +18,7 @@ from protos.tls_files import TlsWatch, load_tls_files
 from sidecar import control_client
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
+from sidecar.net.control_dialer import ControlDialer
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, credential_of
 from tests.integration.secured_control_plane import HOUR_S, SecuredControlPlane
 from tests.unit.controlplane.samples import registration
@@ -44,7 +45,7 @@ class Robot:
         self.tls = TlsWatch(load_tls_files(folder)) if folder is not None else None
         if self.tls is not None:
             self.claim(self.tls.current)
-        self.client = ControlClient(address, self.session, self, self.tls)
+        self.client = ControlClient(ControlDialer((address,), self.session.stats), self.session, self, self.tls)
         self.welcomes: queue.Queue[Welcome] = queue.Queue()
         self.peers: queue.Queue[PeerSet] = queue.Queue()
         self.connection: queue.Queue[tuple[bool, str]] = queue.Queue()

@@ -58,6 +58,10 @@ class Program:
         """Press Ctrl-C; its exit code."""
         return self.stop(signal.SIGINT)
 
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal that does not end it."""
+        self._process.send_signal(number)
+
     def stop(self, by: signal.Signals, timeout_s: float = END_S) -> int:
         """Send a signal; its exit code (negative: the signal that ended it)."""
         self._process.send_signal(by)

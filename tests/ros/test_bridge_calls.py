@@ -55,6 +55,16 @@ def test_200_requests_at_once_to_a_server_with_the_default_queue(mesh: Mesh) -> 
     assert mesh.cloud.stats.requests_paced > 0
 
 
+@pytest.mark.audit("dp-3")
+def test_many_requests_at_once_to_a_slow_server_with_the_default_queue(mesh: Mesh) -> None:
+    """Nothing is concluded from its silence."""
+    mesh.start()
+    mesh.serve("--plan", "/plan", "--busy-s", "1.5")
+    mesh.wait_carried("/plan")
+    result = mesh.result(mesh.call("/plan", "--count", "16", "--timeout-s", "40"))
+    assert (result["answered"], result["wrong"], result["twice"]) == (16, 0, 0)
+
+
 def test_100_answers_at_once_to_a_client_with_the_default_queue(mesh: Mesh) -> None:
     """The answers come together, as after a dark link; unpaced, such a client gets 10 to 24 of them.
 

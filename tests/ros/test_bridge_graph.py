@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -24,6 +24,21 @@ pytestmark = pytest.mark.ros
 
 PLAN = ServiceName("/plan")
 PLAN_TYPE = "nav_msgs/srv/GetPlan"
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Look at the graph often also while it does not change."""
+    monkeypatch.setattr("sidecar.ros.looks.IDLE_PERIOD_S", 0.1)
+
+
+def scanned(node: Any) -> dict[ServiceName, graph.Served]:
+    steps = graph.scan(node)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return dict(end.value)
 
 
 def test_globs_do_not_open_parameters(mesh: Mesh) -> None:
@@ -73,6 +88,39 @@ def test_a_server_that_appears_on_the_robot_takes_over(mesh: Mesh) -> None:
     assert (result["answered"], result["twice"]) == (8, 0)
 
 
+@pytest.mark.audit("dp-16")
+def test_servers_whose_nodes_share_a_name_are_all_carried(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
+    """As when one program is started twice: rmw, asked by node name, shows the services of one of them only."""
+    caplog.set_level(logging.WARNING, "sidecar")
+    mesh.start()
+    mesh.serve("--plan", "/plan")
+    mesh.serve("--negate", "/negate")
+    mesh.serve("--plan", "/plan_too", "--negate", "/negate_too")
+    mesh.wait_carried("/plan", "/negate", "/plan_too", "/negate_too")
+    assert {offer.name: offer.type for offer in mesh.link.offers} == {
+        "/plan": PLAN_TYPE,
+        "/plan_too": PLAN_TYPE,
+        "/negate": "std_srvs/srv/SetBool",
+        "/negate_too": "std_srvs/srv/SetBool",
+    }
+    assert [r for r in caplog.records if "servers here" in r.getMessage()] == []
+
+
+@pytest.mark.audit("dp-16")
+def test_two_servers_of_a_service_are_told_of_though_their_nodes_share_a_name(
+    mesh: Mesh, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING, "sidecar")
+    mesh.start()
+    mesh.serve("--plan", "/plan")
+    mesh.serve("--plan", "/plan")
+    wait_until(lambda: [r for r in caplog.records if "servers here" in r.getMessage()], "the warning")
+    assert [r.getMessage() for r in caplog.records if "servers here" in r.getMessage()] == [
+        "service /plan has 2 servers here (/test_server): each request runs on all of them, the first answer counts"
+    ]
+
+
+@pytest.mark.usefixtures("often")
 def test_two_cloud_sidecars_and_a_robot_in_one_domain(mesh: Mesh) -> None:
     """A robot's proxies are no services to offer, and a real server beside a robot sidecar is left alone."""
     mesh.robot = RosBridge(name="robot-1", role=Role.ROBOT, rules=RULES, domain_id=mesh.cloud_domain)
@@ -99,6 +147,7 @@ def test_two_cloud_sidecars_and_a_robot_in_one_domain(mesh: Mesh) -> None:
         second_link.stop()
 
 
+@pytest.mark.usefixtures("often")
 def test_two_robot_sidecars_in_one_domain_offer_a_name_once(mesh: Mesh) -> None:
     """Two proxies would answer each request twice."""
     other = RosBridge(name="robot-0", role=Role.ROBOT, rules=RULES, domain_id=mesh.robot_domain)
@@ -118,6 +167,7 @@ def test_two_robot_sidecars_in_one_domain_offer_a_name_once(mesh: Mesh) -> None:
         other_link.stop()
 
 
+@pytest.mark.usefixtures("often")
 def test_a_type_that_is_not_installed_on_the_robot(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
     mesh.start()
     for name, kind in {
@@ -161,4 +211,4 @@ def test_hidden_from_node_lists_and_without_services_of_its_own(mesh: Mesh) -> N
     mesh.wait_carried("/plan")
     node = mesh.robot._loop.node  # type: ignore[union-attr]  # a started bridge has one
     assert node.get_name() == "_plr_sidecar_robot_1"
-    assert set(graph.scan(node)) == {"/plan"}
+    assert set(scanned(node)) == {"/plan"}

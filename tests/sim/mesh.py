@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 SERVICE = ServiceName("/echo")
 IPV6 = ":6"
 """Ends the host part of an interface's other address, in a mesh with two; both lead over the same wire."""
+ROUNDING_S = 1e-9
 TYPE = "plr_test/srv/Echo"
 
 
@@ -90,12 +91,20 @@ class Node:
         """Runs this cloud's requests in place of `server_delay` and `answer`."""
         self.events: list[ApplicationEvent] = []
         self.alive = True
+        self.asleep = False
+        self.slept_s = 0.0
+        """How long it was suspended: its clock, as CLOCK_MONOTONIC, stood still."""
         self.late_s: Callable[[], float] | None = None
         """How late its threads get their turn on a busy host; what came in the meantime is taken in one go then."""
         self.start()
 
+    @property
+    def now(self) -> float:
+        """Its own clock (s); rounding must not keep it before its next timer."""
+        return self.mesh.now - self.slept_s + (ROUNDING_S if self.slept_s else 0.0)
+
     def start(self) -> None:
-        now = self.mesh.now
+        now = self.now
         self.session = SessionId(self.mesh.rng.getrandbits(64))
         self.incarnation = int(now * 1e6) + 1
         aead = self.mesh.aeads.get(self.name, Aead.AES_256_GCM)
@@ -152,7 +161,7 @@ class Node:
     def submit(self, payload: bytes, service: ServiceName = SERVICE) -> RequestId:
         self.sequence += 1
         request_id = make_request_id(self.session, b"guid", self.sequence)
-        self.engine.submit(request_id, service, payload, self.mesh.now)
+        self.engine.submit(request_id, service, payload, self.now)
         self.mesh.pump(self)
         return request_id
 
@@ -160,9 +169,9 @@ class Node:
         return [event for event in self.events if isinstance(event, ResponseArrived)]
 
     def next_timer(self) -> float:
-        if self.awaits_turn:
+        if self.awaits_turn or self.asleep:
             return float("inf")
-        return min(self.engine.next_timer(), *(link.next_timer() for link in self.links.values()))
+        return self.slept_s + min(self.engine.next_timer(), *(link.next_timer() for link in self.links.values()))
 
 
 @dataclass(order=True)
@@ -232,11 +241,19 @@ class Mesh:
             peers = tuple(
                 other.as_peer() for other in self.nodes.values() if other.role is not node.role and other.alive
             )
-            assert node.engine.apply_peers(PeerSet(Version(self.version), self.version, peers), self.now) is None
+            assert node.engine.apply_peers(PeerSet(Version(self.version), self.version, peers), node.now) is None
             self.pump(node)
 
     def push_mapping(self, node: Node, mapping: MappingSet) -> str | None:
         return node.engine.apply_mapping(mapping)
+
+    def suspend(self, node: Node, seconds: float) -> None:
+        """The node's host sleeps: nothing runs, nothing arrives, its clock stands still."""
+        node.asleep = True
+        self.run(seconds)
+        node.asleep = False
+        node.slept_s += seconds
+        self.pump(node)
 
     def at(self, delay: float, act: Callable[[], None]) -> None:
         heapq.heappush(self._due, _Due(self.now + delay, next(self._order), act))
@@ -274,10 +291,10 @@ class Mesh:
         node.awaits_turn = False
         inbox, node.inbox = node.inbox, []
         for interface, data, source in inbox:
-            node.links[interface].receive_batch(memoryview(data), len(data), source, self.now)
-        node.engine.handle_timer(self.now)
+            node.links[interface].receive_batch(memoryview(data), len(data), source, node.now)
+        node.engine.handle_timer(node.now)
         for link in node.links.values():
-            link.handle_timer(self.now)
+            link.handle_timer(node.now)
         self._pump(node)
 
     def pump(self, node: Node) -> None:
@@ -288,7 +305,7 @@ class Mesh:
             self._await_turn(node)
 
     def _pump(self, node: Node) -> None:
-        engine, now = node.engine, self.now
+        engine, now = node.engine, node.now
         while True:
             busy = False
             for interface, command in engine.take_commands():
@@ -328,7 +345,7 @@ class Mesh:
 
             def answer() -> None:
                 if node.alive and node.session == session:
-                    node.engine.complete(execution, node.answer(bytes(event.payload)), delay, self.now)
+                    node.engine.complete(execution, node.answer(bytes(event.payload)), delay, node.now)
                     self.pump(node)
 
             self.at(delay, answer)
@@ -364,10 +381,10 @@ class Mesh:
     def _arrive(self, source: Address, destination: Address, data: bytes) -> None:
         name, interface = destination[0].removesuffix(IPV6).rsplit(".", 1)
         node = self.nodes.get(name)
-        if node is None or not node.alive:
+        if node is None or not node.alive or node.asleep:
             return
         if node.late_s is None:
-            node.links[InterfaceName(interface)].receive_batch(memoryview(data), len(data), source, self.now)
+            node.links[InterfaceName(interface)].receive_batch(memoryview(data), len(data), source, node.now)
         else:
             node.inbox.append((InterfaceName(interface), data, source))
         self.pump(node)

@@ -35,6 +35,7 @@ class SerialServer:
         """Sent after the request's own first bytes."""
         self.window: RequestWindow[ExecutionId] = RequestWindow()
         self.requests: dict[ExecutionId, ExecuteRequest] = {}
+        self.expires_at: dict[ExecutionId, float] = {}
         self.ran = 0
         self._numbers = count(1)
         self._queue: deque[tuple[int, ExecutionId]] = deque()
@@ -46,17 +47,22 @@ class SerialServer:
         match event:
             case ExecuteRequest():
                 self.requests[event.execution] = event
+                self.expires_at[event.execution] = now + event.expires_s
                 self.window.add(event.execution, event.priority, now + event.deadline_s, now)
             case CancelExecution(execution) | AbandonExecution(execution):
                 if self.window.holds(execution):
                     self.window.remove(execution)
-                    del self.requests[execution]
+                    self._forget(execution)
                     if isinstance(event, CancelExecution):
                         self.node.engine.refuse(execution, RejectReason.CANCELLED, "called off", now)
         self._release()
 
     def _release(self) -> None:
         for execution in self.window.release(self.mesh.now):
+            if self.expires_at[execution] <= self.mesh.now:
+                self._forget(execution)
+                self.node.engine.refuse(execution, RejectReason.OVERLOADED, "its time is over", self.mesh.now)
+                continue
             number = next(self._numbers)
             self.window.sent(number, self.mesh.now)
             self._queue.append((number, execution))
@@ -66,10 +72,14 @@ class SerialServer:
             number, execution = self._queue.popleft()
             self.mesh.at(self.busy_s, lambda: self._done(number, execution))
 
+    def _forget(self, execution: ExecutionId) -> ExecuteRequest:
+        del self.expires_at[execution]
+        return self.requests.pop(execution)
+
     def _done(self, number: int, execution: ExecutionId) -> None:
         self._idle = True
         self.ran += 1
-        payload = self.requests.pop(execution).payload
+        payload = self._forget(execution).payload
         self.node.executed.append(RequestId(bytes(payload)))
         self.window.answered(number, self.mesh.now)
         self.node.engine.complete(execution, b"echo:" + payload[:100] + self.answer, self.busy_s, self.mesh.now)

@@ -36,7 +36,7 @@ def disagree(robot: Node, cloud: Node) -> None:
         for link in node.links.values():
             for path in link._paths.values():
                 path.remote = remote
-                path.probe_soon(node.mesh.now)
+                path.probing.begin_again(node.mesh.now)
 
 
 @pytest.mark.parametrize("delay_s", [0.001, 0.1, 0.5])

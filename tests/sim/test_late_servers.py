@@ -106,3 +106,22 @@ def test_what_waits_at_a_withdrawn_service_fails_with_it_and_once(mode: Redundan
     ended = [event.request_id for event in robot.events if isinstance(event, RequestFailed)]
     assert len(robot.responses()) == answered
     assert len(ended) == len(set(ended)) == asked
+
+
+@pytest.mark.audit("dp-16")
+@pytest.mark.parametrize("idempotent", [True, False])
+@pytest.mark.parametrize("mode", RedundancyMode)
+def test_a_server_that_is_not_there_yet_is_asked_again(mode: RedundancyMode, idempotent: bool) -> None:
+    """Its sidecar is up before its ROS side is, and nobody says when that changes."""
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(redundancy=mode, idempotent=idempotent, lifetime_s=30.0),))
+    cloud = mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(1.0)
+    cloud.engine.set_offers(())
+    mesh.at(1.5, lambda: cloud.engine.set_offers(cloud.offers))
+    asked = call_at(mesh, robot, 40, 3.0)
+    mesh.run(5.0)
+    assert [event for event in robot.events if isinstance(event, RequestFailed)] == []
+    assert len(robot.responses()) == asked
+    assert len(cloud.executed) == asked, "none ran twice"

@@ -9,7 +9,8 @@ import pytest
 
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, Peer, PeerSet, ServiceMapping, Version
 from sidecar.core.events import DeadlineMissed, OfferService, RequestFailed, WithdrawService
-from sidecar.core.paths import DOWN_FLOOR_S, FIRST_PROBE_S
+from sidecar.core.paths import DOWN_FLOOR_S
+from sidecar.core.probing import FIRST_PROBE_S
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 
 

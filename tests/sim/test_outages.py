@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from protos.model import NodeName
+from sidecar.core.path_id import PathState
+from sidecar.core.probing import FIRST_PROBE_S
 from tests.sim.mesh import Mesh, rule
 from tests.sim.test_mesh import mapped
 
@@ -12,6 +15,7 @@ EVERY_S = 0.2
 GOOD, SLOW = 2_000_000.0, 60_000.0
 QUEUE = 1_200_000.0
 SLOW_S = 4.0
+OUTAGE_S = 10.0
 
 
 @pytest.mark.parametrize("outage_s", [0.5, 1.5, 4.0, 10.0])
@@ -49,3 +53,39 @@ def test_an_outage_after_a_slow_spell_is_over_when_the_network_is_back(outage_s:
     carry(GOOD)
     ask(1.5)
     assert max(ask(3.0)) < 0.5
+
+
+@pytest.mark.audit("dp-17")
+@pytest.mark.parametrize("seed", range(12))
+def test_with_one_path_back_the_others_to_its_peer_are_sought_at_once(seed: int) -> None:
+    """What was asked in the dark and is still in time would otherwise leave over the first one alone, for as long as
+    the others' probes are apart after a long outage."""
+    mesh = Mesh(seed)
+    robot = mesh.robot("wlan0", "wwan0")
+    mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(1.0)
+    paths = [("wlan0", "cloud-a"), ("wwan0", "cloud-a")]
+    mapped(mesh, robot, *paths)
+    wires = [wire for interface, _ in paths for wire in mesh.both_ways(f"robot.{interface}", "cloud-a.eth0")]
+
+    def ask(seconds: float) -> None:
+        for _ in range(round(seconds / EVERY_S)):
+            robot.submit(bytes(1000))
+            mesh.run(EVERY_S)
+
+    ask(1.0)
+    for wire in wires:
+        wire.cut = True
+    ask(OUTAGE_S + seed * EVERY_S / 12)
+    mesh.run(seed * EVERY_S / 12)
+    for wire in wires:
+        wire.cut = False
+    back: list[float] = []
+    for _ in range(1000):
+        up = sum(route.state is PathState.UP for route in robot.engine.routes.all_to(NodeName("cloud-a")))
+        back += [mesh.now] * (up - len(back))
+        if len(back) == len(paths):
+            break
+        mesh.run(0.001)
+    assert back[1] - back[0] < FIRST_PROBE_S + 0.03  # a probe at once, but no sooner than that after the last; its way

@@ -76,7 +76,7 @@ def test_where_either_is_slow_at_aes_both_use_the_other_cipher(slow: str) -> Non
 def test_the_keys_of_an_idle_path_change_by_age() -> None:
     mesh, robot, cloud = pair(limits=KeyLimits(seconds=2.0))
     mesh.run(61.0)
-    assert min(phases(robot) + phases(cloud)) >= 20
+    assert min(phases(robot) + phases(cloud)) >= 8, "with its probes, which get rarer"
     assert dropped(robot)["unauthentic"] + dropped(cloud)["unauthentic"] == 0
 
 

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING
 from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, table_of
-from bench.dataplane.statistics import Calls, Row, median, ratio, worst
+from bench.dataplane.statistics import Calls, Row, interval, median, p99, ratio, worst
 from bench.dataplane.steady import awake, realtime
 from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, SilentCut, allow_multipath, cables
 from bench.netlab import Lab
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from bench.dataplane.section import Context
     from bench.netlab import Host
@@ -86,9 +86,17 @@ def measure(context: Context) -> Findings:
                     notes.append(f"{NAMES[key]}, repeat {repeat + 1}: {error}".splitlines()[0])
     rows = {key: [calls.between(cut).row(NAMES[key]) for calls, cut in repeats] for key, repeats in runs.items()}
     figures = _figures(rows)
+    ours = [value for calls, cut in runs.get("blackhole", []) for value in calls.between(cut).answered_ms()]
+    theirs = [row.max_ms for row in rows.get("mptcp", []) if row.max_ms is not None]
+    figures["blackhole_p99_ms"] = p99(ours)
+    figures["blackhole_mptcp_worst_over_ours"] = _median_over_p99(theirs, ours)
     lines = {NAMES[key]: repeats[-1][0].line(repeats[-1][1]) for key, repeats in runs.items()}
     return Findings(
         figures=figures,
+        intervals={
+            "blackhole_p99_ms": interval(p99, ours),
+            "blackhole_mptcp_worst_over_ours": interval(_median_over_p99, theirs, ours),
+        },
         tables=[table_of("requests after the cut", [Row.of_repeats(repeats) for repeats in rows.values()])],
         plots=[Plot("last repeat", "seconds after the cut", "latency, ms", lines=lines, log_y=True)],
         notes=notes,
@@ -103,11 +111,16 @@ def _figures(rows: dict[str, list[Row]]) -> dict[str, Figure]:
         figures[f"{key}_p99_ms"] = median(row.p99_ms for row in repeats)
         figures[f"{key}_max_ms"] = worst(row.max_ms for row in repeats)
     figures["mptcp_worst_ms"] = figures.pop("mptcp_max_ms")
-    figures["blackhole_mptcp_worst_over_ours"] = median(
+    figures["blackhole_p99_ms_of_repeats"] = figures["blackhole_p99_ms"]
+    figures["blackhole_mptcp_worst_over_ours_of_repeats"] = median(
         ratio(theirs.max_ms, ours.p99_ms)
         for theirs, ours in zip(rows.get("mptcp", []), rows.get("blackhole", []), strict=False)
     )
     return figures
+
+
+def _median_over_p99(worsts: Sequence[float], ours: Sequence[float]) -> float | None:
+    return ratio(median(worsts), p99(ours))
 
 
 def _run(world: World, client: Remote) -> tuple[Calls, float]:

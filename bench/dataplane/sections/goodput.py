@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import SERVICE, Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section
-from bench.dataplane.statistics import MS, Calls, median, ratio
+from bench.dataplane.statistics import MS, Calls, interval, median, median_ratio, ratio
 from bench.dataplane.topology import cables, ethernet_loopback
 from bench.netlab import Lab
 from bench.reporting.tables import Table
@@ -21,6 +23,8 @@ AT_ONCE = 8
 OURS_COUNT = 100
 AIOQUIC_COUNT = 25
 """It needs many times longer for each."""
+SLICE = 5
+"""Messages that arrive one after the other: the goodput of each such stretch is a sample of the intervals."""
 WARM_UP = 10
 SMALL_BYTES = 1_000
 SMALL_COUNT = 3_000
@@ -28,13 +32,24 @@ SMALL_AT_ONCE = 32
 PATIENT = {**SERVICE, "deadline_ms": 20_000.0, "lifetime_ms": 60_000.0}
 
 
+@dataclass(frozen=True, slots=True)
+class Bulk:
+    """One run of bulk messages."""
+
+    mbit_s: float | None
+    cpu_ms_per_mb: float
+    """Of all its programs."""
+    slices: list[float]
+    """Mbit/s of its stretches."""
+
+
 def measure(context: Context) -> Findings:
     """Measure."""
-    ours_runs: list[tuple[float | None, float]] = []
-    ethernet_runs: list[tuple[float | None, float]] = []
-    null_runs: list[tuple[float | None, float]] = []
-    ethernet_null_runs: list[tuple[float | None, float]] = []
-    aioquic_runs: list[tuple[float | None, float]] = []
+    ours_runs: list[Bulk] = []
+    ethernet_runs: list[Bulk] = []
+    null_runs: list[Bulk] = []
+    ethernet_null_runs: list[Bulk] = []
+    aioquic_runs: list[Bulk] = []
     small: list[float | None] = []
     with contextlib.ExitStack() as stack:
         start = stack.enter_context
@@ -78,28 +93,28 @@ def measure(context: Context) -> Findings:
             calls = ours.call(size=SMALL_BYTES, count=count, at_once=SMALL_AT_ONCE, grace_s=20.0)
             small.append(ratio(_answered(calls), calls.duration_s()))
     figures = {
-        "goodput_mbit_s": median(run[0] for run in ours_runs),
-        "aioquic_goodput_mbit_s": median(run[0] for run in aioquic_runs),
+        "goodput_mbit_s": median(run.mbit_s for run in ours_runs),
+        "aioquic_goodput_mbit_s": median(run.mbit_s for run in aioquic_runs),
         "goodput_over_aioquic": median(
-            ratio(one[0], other[0]) for one, other in zip(ours_runs, aioquic_runs, strict=True)
+            ratio(one.mbit_s, other.mbit_s) for one, other in zip(ours_runs, aioquic_runs, strict=True)
         ),
-        "cpu_ms_per_mb": median(run[1] for run in ours_runs),
-        "goodput_null_cipher_mbit_s": median(run[0] for run in null_runs),
+        "cpu_ms_per_mb": median(run.cpu_ms_per_mb for run in ours_runs),
+        "goodput_null_cipher_mbit_s": median(run.mbit_s for run in null_runs),
         "sealed_over_null_goodput": median(
-            ratio(one[0], other[0]) for one, other in zip(ours_runs, null_runs, strict=True)
+            ratio(one.mbit_s, other.mbit_s) for one, other in zip(ours_runs, null_runs, strict=True)
         ),
-        "ethernet_goodput_null_cipher_mbit_s": median(run[0] for run in ethernet_null_runs),
+        "ethernet_goodput_null_cipher_mbit_s": median(run.mbit_s for run in ethernet_null_runs),
         "ethernet_sealed_over_null_goodput": median(
-            ratio(one[0], other[0]) for one, other in zip(ethernet_runs, ethernet_null_runs, strict=True)
+            ratio(one.mbit_s, other.mbit_s) for one, other in zip(ethernet_runs, ethernet_null_runs, strict=True)
         ),
-        "ethernet_null_cipher_cpu_ms_per_mb": median(run[1] for run in ethernet_null_runs),
-        "null_cipher_cpu_ms_per_mb": median(run[1] for run in null_runs),
-        "ethernet_goodput_mbit_s": median(run[0] for run in ethernet_runs),
+        "ethernet_null_cipher_cpu_ms_per_mb": median(run.cpu_ms_per_mb for run in ethernet_null_runs),
+        "null_cipher_cpu_ms_per_mb": median(run.cpu_ms_per_mb for run in null_runs),
+        "ethernet_goodput_mbit_s": median(run.mbit_s for run in ethernet_runs),
         "ethernet_goodput_over_aioquic": median(
-            ratio(one[0], other[0]) for one, other in zip(ethernet_runs, aioquic_runs, strict=True)
+            ratio(one.mbit_s, other.mbit_s) for one, other in zip(ethernet_runs, aioquic_runs, strict=True)
         ),
-        "ethernet_cpu_ms_per_mb": median(run[1] for run in ethernet_runs),
-        "aioquic_cpu_ms_per_mb": median(run[1] for run in aioquic_runs),
+        "ethernet_cpu_ms_per_mb": median(run.cpu_ms_per_mb for run in ethernet_runs),
+        "aioquic_cpu_ms_per_mb": median(run.cpu_ms_per_mb for run in aioquic_runs),
         "requests_per_s": median(small),
     }
     rows: tuple[tuple[str, float | None, float | None], ...] = (
@@ -114,8 +129,20 @@ def measure(context: Context) -> Findings:
         ("aioquic", figures["aioquic_goodput_mbit_s"], figures["aioquic_cpu_ms_per_mb"]),
     )
     title = f"{AT_ONCE} messages of 1 MB in flight, loopback, two processes"
+    ours_slices, ethernet_slices, null_slices, ethernet_null_slices, aioquic_slices = (
+        [rate for run in runs for rate in run.slices]
+        for runs in (ours_runs, ethernet_runs, null_runs, ethernet_null_runs, aioquic_runs)
+    )
     return Findings(
         figures=dict(figures),
+        intervals={
+            "goodput_mbit_s": interval(median, ours_slices),
+            "goodput_over_aioquic": interval(median_ratio, ours_slices, aioquic_slices),
+            "sealed_over_null_goodput": interval(median_ratio, ours_slices, null_slices),
+            "ethernet_goodput_mbit_s": interval(median, ethernet_slices),
+            "ethernet_goodput_over_aioquic": interval(median_ratio, ethernet_slices, aioquic_slices),
+            "ethernet_sealed_over_null_goodput": interval(median_ratio, ethernet_slices, ethernet_null_slices),
+        },
         tables=[
             Table(title, ("", "Mbit/s", "CPU ms/MB, both processes"), rows),
             Table(f"1 kB, {SMALL_AT_ONCE} in flight, engine to engine", ("", "1/s"), (("ours", median(small)),)),
@@ -129,13 +156,18 @@ def _bulk(program: Remote, count: int) -> Calls:
     return Calls.of(program.ask("call", timeout_s=120.0, **fields))
 
 
-def _costed(programs: tuple[Remote, ...], count: int) -> tuple[float | None, float]:
-    """Mbit/s of `count` messages sent by the first program, and CPU milliseconds for each MB of all programs."""
+def _costed(programs: tuple[Remote, ...], count: int) -> Bulk:
+    """`count` messages sent by the first program, and what they cost all programs."""
     before = sum(program.ask("usage")["cpu_s"] for program in programs)
     calls = _bulk(programs[0], count)
     cpu_s = sum(program.ask("usage")["cpu_s"] for program in programs) - before
     megabytes = _answered(calls) * BULK_BYTES / 1e6
-    return ratio(megabytes * 8, calls.duration_s()), cpu_s * MS / max(megabytes, 1e-9)
+    return Bulk(ratio(megabytes * 8, calls.duration_s()), cpu_s * MS / max(megabytes, 1e-9), _slices(calls))
+
+
+def _slices(calls: Calls) -> list[float]:
+    ends = sorted(calls.arrivals())[::SLICE]
+    return [SLICE * BULK_BYTES * 8 / 1e6 / max(end - start, 1e-9) for start, end in itertools.pairwise(ends)]
 
 
 def _answered(calls: Calls) -> int:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section
-from bench.dataplane.statistics import MS, median, quantile, ratio, worst
+from bench.dataplane.statistics import MS, Interval, interval, median, median_ratio, quantile, ratio, worst
 from bench.dataplane.topology import cables, ethernet_loopback
 from bench.netlab import Lab
 from bench.reporting.tables import Table
@@ -36,6 +36,7 @@ Run = tuple[float | None, float | None]
 def measure(context: Context) -> Findings:
     """Measure."""
     runs: dict[tuple[str, str], list[Run]] = {}
+    pooled: dict[tuple[str, str], list[float]] = {}
     with contextlib.ExitStack() as stack:
         contenders = _start(context, stack)
         for name, run in contenders.items():
@@ -48,10 +49,16 @@ def measure(context: Context) -> Findings:
                     context.say(f"one way: {NAMES[name]}, {size} bytes, {repeat + 1} of {context.repeats}")
                     times = run(size, context.scaled(COUNT, 20))
                     runs.setdefault((name, key), []).append((quantile(times, 0.5), quantile(times, 0.99)))
+                    pooled.setdefault((name, key), []).extend(times)
     figures = {f"{name}_{key}_ms": median(p50 for p50, _ in repeats) for (name, key), repeats in runs.items()}
+    intervals: dict[str, Interval | None] = {}
     for name in ("engine", "ethernet"):
+        key = f"{name}_150k_over_aioquic"
         pairs = zip(runs[name, "150k"], runs["aioquic", "150k"], strict=True)
-        figures[f"{name}_150k_over_aioquic"] = median(ratio(ours[0], theirs[0]) for ours, theirs in pairs)
+        figures[f"{key}_of_repeats"] = median(ratio(ours[0], theirs[0]) for ours, theirs in pairs)
+        both = pooled[name, "150k"], pooled["aioquic", "150k"]
+        figures[key] = median_ratio(*both)
+        intervals[key] = interval(median_ratio, *both)
     figures["aioquic_150k_memory_ms"] = _in_memory(context)
     rows = tuple(
         (f"{NAMES[name]}, {SIZES[key] // 1000} kB", figures[f"{name}_{key}_ms"], worst(p99 for _, p99 in repeats))
@@ -60,6 +67,7 @@ def measure(context: Context) -> Findings:
     memory = ("aioquic, 150 kB, in one process without sockets", figures["aioquic_150k_memory_ms"], None)
     return Findings(
         figures=dict(figures),
+        intervals=intervals,
         tables=[Table("one-way time on loopback", ("", "median ms", "worst P99 ms"), (*rows, memory))],
         plots=[Plot("one-way time on loopback", "", "median, ms", bars={row[0]: row[1] for row in rows}, log_y=True)],
         notes=["engine_150k_over_aioquic compares real sockets with real sockets, two processes each."],

@@ -7,17 +7,20 @@ after it ends; both goodputs are of the TCP flow's time.
 from __future__ import annotations
 
 import json
+import statistics
 import time
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import EVERY_CARRIER, SERVICE, Ours
 from bench.dataplane.section import Findings, Plot, Section
-from bench.dataplane.statistics import median, ratio
+from bench.dataplane.statistics import interval, median, ratio
 from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, emulated
 from bench.netlab import Lab, LinkProfile
 from bench.reporting.tables import Table
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from bench.dataplane.section import Context
 
 RATE_KBPS = 20_000
@@ -28,6 +31,8 @@ AT_ONCE = 6
 """600 kB in flight are three times what link and queue hold."""
 FLOW_S = 10
 QUICK_FLOW_S = 4
+BLOCK_S = 3
+"""Seconds in a row that are drawn together for the interval: TCP grows and halves over some."""
 LEAD_S = 2.0
 """Ours alone, before the TCP flow."""
 CUBIC = ("-C", "cubic")
@@ -39,8 +44,10 @@ def measure(context: Context) -> Findings:
     """Measure."""
     flow_s = QUICK_FLOW_S if context.quick else FLOW_S
     tcp: list[float | None] = []
-    ours_mbit: list[float | None] = []
+    ours_mbit: list[float] = []
     alone: list[float | None] = []
+    seconds_of_tcp: list[float] = []
+    seconds_of_ours: list[float] = []
     with (
         Lab(emulated(LINK)) as lab,
         Ours.in_lab(lab, context.folder, mapping=EVERY_CARRIER[:1], service=PATIENT) as ours,
@@ -61,13 +68,16 @@ def measure(context: Context) -> Findings:
             tcp.append(flow["end"]["sum_received"]["bits_per_second"] / 1e6 if "end" in flow else None)
             arrivals = calls.arrivals()
             ours_mbit.append(_rate(arrivals, flow_start, flow_end))
+            seconds_of_tcp += (one["sum"]["bits_per_second"] / 1e6 for one in flow.get("intervals", ()))
+            seconds_of_ours += (_rate(arrivals, flow_start + at, flow_start + at + 1.0) for at in range(flow_s))
             alone.append(_rate(arrivals, start + LEAD_S / 2, flow_start))
         cloud.kill(server)
     figures = {
         "tcp_mbit_s": median(tcp),
         "ours_beside_tcp_mbit_s": median(ours_mbit),
         "ours_alone_mbit_s": median(alone),
-        "tcp_share_ratio": median(ratio(one, other) for one, other in zip(tcp, ours_mbit, strict=True)),
+        "tcp_share_ratio": _mean_ratio([rate for rate in tcp if rate is not None], ours_mbit),
+        "tcp_share_ratio_of_repeats": median(ratio(one, other) for one, other in zip(tcp, ours_mbit, strict=True)),
     }
     rows = (
         ("TCP (CUBIC)", figures["tcp_mbit_s"]),
@@ -76,9 +86,14 @@ def measure(context: Context) -> Findings:
     )
     return Findings(
         figures=dict(figures),
+        intervals={"tcp_share_ratio": interval(_mean_ratio, seconds_of_tcp, seconds_of_ours, block=BLOCK_S)},
         tables=[Table("20 Mbit/s, 40 ms, queue of one bandwidth-delay product", ("", "Mbit/s"), rows)],
         plots=[Plot("sharing 20 Mbit/s", "", "Mbit/s", bars=dict(rows))],
     )
+
+
+def _mean_ratio(tcp: Sequence[float], ours: Sequence[float]) -> float | None:
+    return ratio(statistics.fmean(tcp), statistics.fmean(ours)) if tcp and ours else None
 
 
 def _rate(arrivals: list[float], start: float, end: float) -> float:

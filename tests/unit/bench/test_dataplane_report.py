@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from html.parser import HTMLParser
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,19 @@ from bench.dataplane import page
 from bench.dataplane.calling import HEADER, Caller, Plan
 from bench.dataplane.report import Report
 from bench.dataplane.section import Context, Findings, Plot, Section
-from bench.dataplane.statistics import Calls, Row, difference, median, quantile, ratio, worst
+from bench.dataplane.statistics import (
+    Calls,
+    Interval,
+    Row,
+    difference,
+    interval,
+    median,
+    median_ratio,
+    p99,
+    quantile,
+    ratio,
+    worst,
+)
 from bench.dataplane.targets import TARGETS
 from bench.reporting.tables import Table
 from bench.reporting.targets import Target
@@ -60,6 +73,30 @@ def test_what_was_not_measured_stays_unknown() -> None:
     assert quantile([], 0.5) is None
 
 
+def test_an_interval_narrows_with_the_samples_and_holds_the_figure() -> None:
+    rng = random.Random(1)
+    few, many = ([rng.gauss(10.0, 1.0) for _ in range(count)] for count in (20, 2_000))
+    narrow, wide = interval(median, many), interval(median, few)
+    assert narrow is not None
+    assert wide is not None
+    assert narrow.low < 10.0 < narrow.high
+    assert narrow.high - narrow.low < 0.3 < wide.high - wide.low
+    assert (narrow.samples, wide.samples) == (2_000, 20)
+    assert interval(median, many) == narrow  # the same samples tell the same
+
+
+def test_an_interval_of_two_sets_counts_the_smaller_one() -> None:
+    found = interval(median_ratio, [2.0, 2.1, 1.9, 2.0], [1.0, 1.05, 0.95] * 10)
+    assert found is not None
+    assert found.low < 2.0 < found.high
+    assert found.samples == 4
+
+
+@pytest.mark.parametrize("samples", [[], [1.0]])
+def test_too_few_samples_have_no_interval(samples: list[float]) -> None:
+    assert interval(p99, samples) is None
+
+
 @pytest.mark.parametrize(
     ("value", "other", "met"),
     [(800, None, True), (799, None, False), (100, 5.0, True), (100, 4.9, False), (None, 9.0, None)],
@@ -104,15 +141,26 @@ def test_the_page_shows_verdicts_tables_and_plots_and_loads_nothing() -> None:
             Plot("lines", "s", "ms", lines={"ours": [(0.0, 1.0), (1.0, 2.0)]}, log_y=True),
         ],
         notes=["a < b"],
+        intervals={"blackhole_p99_ms": Interval(0.9, 1.25, 400), "fec_p99_over_lossfree_2pct": None},
     )
     report.add(Section("blackhole", "A path goes silent", lambda _context: findings), findings, 1.23)
     reader = Reader()
     reader.feed(page.render(report))
     assert reader.images == 2
-    for shown in ("A path goes silent", "lost & found", "a < b", "met", "missed", "not measured", "0.96"):
+    for shown in (
+        "A path goes silent",
+        "lost & found",
+        "a < b",
+        "met",
+        "missed",
+        "not measured",
+        "0.96",
+        "0.9 to 1.25, 400 samples",
+    ):
         assert shown in reader.text
     content = json.loads(json.dumps(report.as_json()))
     assert content["blackhole_lost"] == 1
+    assert content["intervals"] == {"blackhole_p99_ms": {"low": 0.9, "high": 1.25, "samples": 400}}
     assert content["verdicts"]["blackhole_lost"] is False
     assert content["verdicts"]["blackhole_p99_ms"] is True
     assert content["verdicts"]["loss_lost"] is content["loss_lost"] is None

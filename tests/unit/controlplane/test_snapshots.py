@@ -113,6 +113,33 @@ def test_only_what_is_refused_is_sent_again(versions: VersionSource) -> None:
     assert not snapshots.mapping.send_again
 
 
+@pytest.mark.audit("dp-12")
+def test_what_is_refused_stays_so_while_it_is_sent_again(versions: VersionSource) -> None:
+    snapshots = Snapshots()
+    snapshots.send_mapping((), versions)
+    assert nack(snapshots.mapping)
+    for _ in range(2):
+        snapshots.send_refused_again()
+        snapshots.send_mapping((), versions)
+        assert (state(snapshots.mapping), snapshots.mapping.error) == (SyncState.REJECTED, "no such peer")
+        snapshots.send_refused_again()
+        assert not snapshots.mapping.send_again, "not answered yet"
+        assert nack(snapshots.mapping)
+    snapshots.send_refused_again()
+    snapshots.send_mapping((), versions)
+    assert ack(snapshots.mapping)
+    assert (state(snapshots.mapping), snapshots.mapping.error) == (SyncState.SYNCED, "")
+
+
+def test_who_took_what_was_sent_again_and_lost_its_stream_needs_nothing(versions: VersionSource) -> None:
+    snapshots = Snapshots()
+    snapshots.send_mapping((), versions)
+    assert nack(snapshots.mapping)
+    snapshots.send_refused_again()
+    snapshots.mapping.begin_stream(snapshots.send_mapping((), versions).version)
+    assert (state(snapshots.mapping), snapshots.mapping.error) == (SyncState.SYNCED, "")
+
+
 def test_a_nack_after_the_ack_wins(versions: VersionSource) -> None:
     track: Track[str] = Track()
     track.send("a", versions)

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from protos.errors import ConfigError
 from protos.identity import Identity, IdentityRole
-from protos.model import NodeName, Role
+from protos.model import InterfaceName, NodeName, Role
 from sidecar.config import (
     DEFAULT_CLOUD_UDP_PORT,
     LogLevel,
@@ -20,6 +20,7 @@ from sidecar.config import (
     parse_config,
     refuse_exposed,
 )
+from sidecar.core.control_ways import Price
 from tests.unit.sidecar.configs import CLOUD, ROBOT, SOURCE, parse
 
 
@@ -164,3 +165,23 @@ def test_insecure_mode_is_for_the_same_machine() -> None:
     for target in ("192.0.2.1:1", "[2001:db8::1]:1", "control.example.org:1"):
         with pytest.raises(ConfigError, match="control_plane: expected a loopback address with insecure: true"):
             refuse_exposed(parse(ROBOT, control_plane=target), SOURCE)
+
+    both = ["127.0.0.1:1", "192.0.2.1:1"]
+    with pytest.raises(ConfigError, match=r"with insecure: true, got '192\.0\.2\.1:1'"):
+        refuse_exposed(parse(ROBOT, control_plane=both), SOURCE)
+
+
+def test_the_control_plane_has_one_address_or_several() -> None:
+    assert parse(ROBOT, control_plane="a:1").control_plane == ("a:1",)
+    assert parse(ROBOT, control_plane=["a:1", "[2001:db8::1]:2"]).control_plane == ("a:1", "[2001:db8::1]:2")
+
+
+def test_what_the_control_stream_costs_comes_from_the_networks() -> None:
+    networks = [
+        {"interface": "wwan0", "extra_mb_per_day": 100, "cost_per_request": 0.1},
+        {"interface": "wwan*", "cost_per_request": 2.0},
+    ]
+    config = parse(ROBOT, networks=networks)
+    prices = [config.price(InterfaceName(name)) for name in ("wlan0", "wwan1", "wwan0")]
+    assert prices == [Price(charge=1.0), Price(charge=2.0), Price(billed=True, charge=0.1)]
+    assert prices == sorted(prices)

@@ -32,6 +32,13 @@ def test_rules_of_a_robot(keys: dict[str, float], deadline_s: float, lifetime_s:
     assert rule.drop_late
 
 
+@pytest.mark.audit("dp-13")
+@pytest.mark.parametrize(("deadline_ms", "lifetime_s"), [(100, 30.0), (3500, 35.0), (60_000, 300.0)])
+def test_late_answers_are_waited_for_longer_where_they_are_wanted(deadline_ms: float, lifetime_s: float) -> None:
+    (rule,) = parse(with_service(ROBOT, deadline_ms=deadline_ms)).service_rules()
+    assert rule.lifetime_s == pytest.approx(lifetime_s)
+
+
 def test_copies_to_several_servers_only_when_asked_for() -> None:
     (rule,) = parse(ROBOT).service_rules()
     assert not rule.idempotent

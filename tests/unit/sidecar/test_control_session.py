@@ -200,6 +200,38 @@ def test_a_new_stream_says_what_is_held_by_now_and_forgets_old_nonces() -> None:
     assert not any(isinstance(message, Ack) for message in session.messages_to_send(2.0))
 
 
+def test_a_stream_that_moves_is_opened_again_at_once_and_costs_no_patience() -> None:
+    session = make_session()
+    for number in range(20):
+        session.opened(float(number))
+        assert session.closed(float(number), moved=True) == 0.0
+        assert session.retry_at == float(number)
+    session.opened(20.0)
+    assert session.closed(20.0) <= RETRY_FIRST_S
+
+
+def test_a_change_of_the_network_brings_the_next_attempt_forward() -> None:
+    session = make_session()
+    for _ in range(20):
+        session.opened(100.0)
+        session.closed(100.0)
+    session._retry_at = 110.0
+    session.network_changed(100.5)
+    assert 101.0 <= session.retry_at <= 101.0 + RETRY_FIRST_S, "not at every change"
+    session._retry_at = 110.0
+    session.network_changed(105.0)
+    assert 105.0 <= session.retry_at <= 105.0 + RETRY_FIRST_S
+    sooner = session.retry_at
+    session.network_changed(109.0)
+    assert session.retry_at == sooner, "never later"
+    session.opened(110.0)
+    session.network_changed(110.0)
+    session.closed(110.0, refused=True)
+    refused_until = session.retry_at
+    session.network_changed(110.0)
+    assert session.retry_at == refused_until, "it would be refused again"
+
+
 def test_what_the_disk_held_in_vain_is_asked_for_again() -> None:
     session = make_session(peers=4, mapping=5)
     held = Apply(ResourceKind.MAPPING, mapping(5))

@@ -37,6 +37,6 @@ def test_a_new_outage_is_told_at_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     outage = OutageLog(LOG, "plr:1")
     for now in (0.0, 1.0):
-        outage.over()
+        outage.over("plr:1 over wlan0")
         outage.failed("reset", 0.1, now, was_connected=True)
         assert len(warnings(caplog)) == 1

@@ -31,14 +31,17 @@ from protos.model import (
     Welcome,
 )
 from sidecar.state_file import (
+    ControlAddresses,
     Identity,
     LastGood,
+    decode_addresses,
     decode_identity,
     decode_last_good,
+    encode_addresses,
     encode_identity,
     encode_last_good,
 )
-from sidecar.state_store import IDENTITY_FILE, LAST_GOOD_FILE, StateDirError, StateStore
+from sidecar.state_store import ADDRESSES_FILE, IDENTITY_FILE, LAST_GOOD_FILE, StateDirError, StateStore
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -122,6 +125,23 @@ def test_what_was_in_force_is_found_after_a_restart(tmp_path: Path) -> None:
     store = reopen(store, tmp_path)
     assert store.last_good == LastGood(OWNER, WELCOME, PEERS, newer)
     assert not store.failures
+    store.close()
+
+
+def test_addresses_of_a_control_plane_are_found_under_the_names_that_are_configured(tmp_path: Path) -> None:
+    names = ("cp.example:50051", "[2001:db8::1]:50051")
+    addresses = (("192.0.2.1", 50051), ("2001:db8::1", 50051))
+    store = StateStore(tmp_path, OWNER)
+    assert store.control_addresses(names) == ()
+    store.remember_addresses(names, addresses)
+    store = reopen(store, tmp_path)
+    assert store.control_addresses(names) == addresses
+    assert store.control_addresses(names[:1]) == ()
+    store.close()
+    (tmp_path / ADDRESSES_FILE).write_bytes(b"spoilt")
+    store = StateStore(tmp_path, OWNER)
+    assert store.control_addresses(names) == ()
+    assert store.failures == {"control_addresses_refused": 1}
     store.close()
 
 
@@ -278,6 +298,8 @@ def test_contents_come_back_from_their_encoding() -> None:
     assert decode_last_good(encode_last_good(EVERYTHING), OWNER) == EVERYTHING
     identity = Identity(bytes(range(16)), (1 << 64) - 1)
     assert decode_identity(encode_identity(identity)) == identity
+    known = ControlAddresses(("cp.example:50051",), (("192.0.2.1", 50051), ("::1", 1)))
+    assert decode_addresses(encode_addresses(known)) == known
 
 
 def test_one_file_is_not_taken_for_the_other() -> None:
@@ -285,3 +307,5 @@ def test_one_file_is_not_taken_for_the_other() -> None:
         decode_identity(encode_last_good(EVERYTHING))
     with pytest.raises(DecodeError, match="not a file of this kind"):
         decode_last_good(encode_identity(Identity(bytes(16), 1)), OWNER)
+    with pytest.raises(DecodeError, match="not a file of this kind"):
+        decode_addresses(encode_identity(Identity(bytes(16), 1)))

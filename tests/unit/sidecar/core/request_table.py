@@ -17,7 +17,7 @@ from sidecar.core.priority import Priority
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 
@@ -49,10 +49,11 @@ class Table:
         self.events: list[ApplicationEvent] = []
         self.sought: list[frozenset[NodeName]] = []
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
-        offers = Offers((self.rule,))
-        offers.set_peers([peer(A), peer(B, session=2)])
+        offers = Offers(Rules((self.rule,)))
+        for one in (peer(A), peer(B, session=2)):
+            offers.set_peer(one)
         self.mapping = MappingTable(self.routes)
-        parts = RequestParts(
+        self.parts = RequestParts(
             offers,
             self.mapping,
             self.routes,
@@ -63,7 +64,7 @@ class Table:
             self.sought.append,
             budgets,
         )
-        self.table = RequestTable(parts)
+        self.table = RequestTable(self.parts)
         for known in SERVERS.values():
             self.routes.set_state(known, PathState.UP)
 
@@ -72,6 +73,12 @@ class Table:
         for command in self.commands if begun else ():
             if isinstance(command, Send):
                 command.message.begun = True
+
+    def handle_timers(self, now: float) -> None:
+        """Let time pass, in as many turns as that takes."""
+        while (timer := self.table.next_timer()) is not None and timer <= now:
+            self.parts.backlog.begin_turn(now)
+            self.table.handle_timer(now)
 
     def sent(self) -> list[PathId]:
         """Paths that got copies since the last look."""
@@ -111,6 +118,17 @@ class Table:
     def change(self, changed: PathId, state: PathState, now: float = 0.1) -> None:
         self.routes.set_state(changed, state)
         self.table.on_path_changed(changed, state, now)
+        self.finish(now)
+
+    def use_room(self, now: float) -> None:
+        self.table.on_room(now)
+        self.finish(now)
+
+    def finish(self, now: float) -> None:
+        """Let the table do what it had no time for in one turn."""
+        while len(self.parts.backlog):
+            self.parts.backlog.begin_turn(now)
+            self.parts.backlog.run(now)
 
     def only_failure(self) -> RequestFailed:
         (failed,) = [event for event in self.events if isinstance(event, RequestFailed)]

@@ -129,7 +129,7 @@ def test_a_request_is_measured_with_all_its_copies_or_not_at_all() -> None:
         if number % 2:
             table.respond(B, copy=1, number=number, now=0.2)
     for now in (1.0, 10.0):
-        table.table.handle_timer(now)
+        table.handle_timers(now)
     races = 64 // OBSERVED_ONE_IN
     assert table.latencies() == {A: (races, 0), B: (0, races)}, "all races have even numbers"
     table.cancelled()

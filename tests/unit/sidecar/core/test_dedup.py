@@ -4,6 +4,7 @@ import pytest
 
 from protos.model import NodeName, ServiceName
 from sidecar.core import dedup
+from sidecar.core.backlog import Backlog
 from sidecar.core.dedup import (
     MAX_CACHED_BYTES,
     MAX_RUNNING,
@@ -111,9 +112,9 @@ def test_an_execution_nobody_waits_for_is_abandoned_and_never_run_again() -> Non
     execution = run(executions, request(lifetime_s=5.0)).execution
     assert executions.next_timer() == 6.0
     executions.on_request(ROBOT_2ND, request(copy=1, lifetime_s=7.0), 2.0)
-    assert executions.handle_timer(6.0) == ([], []), "the second copy waits longer"
+    assert executions.handle_timer(6.0, Backlog()) == ([], []), "the second copy waits longer"
     assert executions.next_timer() == 9.0
-    (abandoned,), replies = executions.handle_timer(9.0)
+    (abandoned,), replies = executions.handle_timer(9.0, Backlog())
     assert replies == [], "nobody waits any more"
     assert abandoned.execution == execution
     assert executions.running == 0
@@ -203,8 +204,9 @@ def test_a_robot_that_said_goodbye_is_not_waited_for() -> None:
     both = (ROBOT.peer, OTHER.peer)
     assert executions.awaited(both) == 2
     assert executions.awaited((OTHER.peer,)) == 1
-    assert executions.cancel_all(ROBOT.peer) == [CancelExecution(mine.execution)]
-    assert executions.cancel_all(ROBOT.peer) == []
+    (awaited,) = executions.of_robot(ROBOT.peer)
+    assert executions.call_off(ROBOT.peer, awaited) == CancelExecution(mine.execution)
+    assert executions.of_robot(ROBOT.peer) == []
     assert (executions.awaited(both), executions.running) == (1, 2)
     assert executions.complete(mine.execution, b"answer", 0.0, 1.1) == []
 
@@ -251,7 +253,7 @@ def test_a_full_table_refuses_one_robot_and_still_serves_another() -> None:
     assert isinstance(executions.on_request(OTHER, request(100_000), 1.0), ExecuteRequest)
     executions.complete(ExecutionId(0), b"", 0.0, 1.1)
     executions.complete(ExecutionId(1), b"", 0.0, 1.1)
-    run(executions, request(99_999), 1.2)
+    run(executions, request(99_999, copy=1), 1.2)
 
 
 def test_remembered_ids_are_capped_per_robot(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,7 +263,7 @@ def test_remembered_ids_are_capped_per_robot(monkeypatch: pytest.MonkeyPatch) ->
         executions.complete(run(executions, request(number)).execution, b"", 0.0, 1.0)
     assert isinstance(executions.on_request(ROBOT, request(10), 1.0), Reply)
     assert isinstance(executions.on_request(OTHER, request(11), 1.0), ExecuteRequest)
-    run(executions, request(10), 1.0 + MIN_REMEMBER_S)
+    run(executions, request(10, copy=1), 1.0 + MIN_REMEMBER_S)
 
 
 def test_what_is_over_leaves_no_timers_behind() -> None:
@@ -293,8 +295,8 @@ def test_a_server_is_given_up_before_the_robot_gives_up_and_the_robot_is_told() 
     outcome = executions.on_request(ROBOT, request(lifetime_s=20.0), 1.0, patience_s=3.0)
     assert isinstance(outcome, ExecuteRequest)
     assert outcome.expires_s == 3.0
-    assert executions.handle_timer(3.9) == ([], [])
-    (abandoned,), (reply,) = executions.handle_timer(4.0)
+    assert executions.handle_timer(3.9, Backlog()) == ([], [])
+    (abandoned,), (reply,) = executions.handle_timer(4.0, Backlog())
     assert abandoned.execution == outcome.execution
     assert isinstance(reply.message, RejectionMessage)
     assert reply.message.reason is RejectReason.SERVER_LOST

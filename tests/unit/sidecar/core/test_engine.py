@@ -256,12 +256,16 @@ def test_the_robot_offers_what_a_reachable_cloud_offers_and_says_what_it_carries
     assert engine.uses() == (ServiceUse(ECHO, TYPE, 0.1, idempotent=True, fallback_up=True),)
 
 
+@pytest.mark.audit("dp-14")
 def test_a_request_for_a_service_that_is_not_offered_fails_at_once() -> None:
     sidecar = robot()
     sidecar.engine.submit(request_id(1), ServiceName("/none"), b"", 0.1)
     (failed,) = sidecar.take()[1]
     assert isinstance(failed, RequestFailed)
     assert failed.outcome == "rejected"
+    assert sidecar.engine.stats.requests[ServiceName("/none"), "rejected"] == 1
+    (told,) = sidecar.engine.take_report().outcomes
+    assert (told.service, told.failed) == ("/none", 1), "the control plane learns of it as of any other"
 
 
 def test_a_goodbye_ends_the_requests_there_and_leaves_nothing_in_the_outbox() -> None:

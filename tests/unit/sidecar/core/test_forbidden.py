@@ -10,6 +10,7 @@ from sidecar.core.messages import RejectionMessage, ResponseMessage, decode_mess
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
+from sidecar.core.rules import Rules
 from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, path, request, rule
@@ -35,7 +36,7 @@ class Cloud:
         outbox = Outbox(routes, self.commands.append, self.stats)
         self.serving = Serving(
             ServingParts(
-                (rule("/*"),),
+                Rules((rule("/*"),)),
                 routes,
                 outbox,
                 self.stats,

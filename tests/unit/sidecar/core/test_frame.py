@@ -9,7 +9,7 @@ from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import AckFrame, Close, Finished, Fragment, Header, Probe, ProbeReply
 
 HEADER = Header(InterfaceId(1), InterfaceId(2), SessionId(0x0102030405060708), 0x1112131415161718)
-CLEAR = "d2 01 01 02 01 02 03 04 05 06 07 08 11 12 13 14 15 16 17 18"
+CLEAR = "d3 01 01 02 01 02 03 04 05 06 07 08 11 12 13 14 15 16 17 18"
 SYMBOL = bytes(range(256))
 
 GOLDENS = {
@@ -21,9 +21,9 @@ GOLDENS = {
         AckFrame(((90, 100), (80, 85), (3, 3)), 0.001234),
     ),
     "fragment": (
-        frame.encode_fragment_head(7, 300, 256, 0) + SYMBOL,
-        "04 0000000000000007 0000012c 0100 0000" + SYMBOL.hex(),
-        Fragment(7, 300, 256, 0, memoryview(SYMBOL)),
+        frame.encode_fragment_head(7, 300, 256, 0, 1_500_000) + SYMBOL,
+        "04 0000000000000007 0000012c 0100 0000 0016e360" + SYMBOL.hex(),
+        Fragment(7, 300, 256, 0, memoryview(SYMBOL), 1_500_000),
     ),
     "finished": (frame.encode_finished(Finished(9)), "06 0000000000000009", Finished(9)),
     "close": (frame.encode_close(), "08", Close()),
@@ -130,3 +130,11 @@ BROKEN = {
 def test_broken_frames_are_refused(kind: str) -> None:
     with pytest.raises(DecodeError):
         frame.decode_frames(memoryview(bytes.fromhex(BROKEN[kind])))
+
+
+@pytest.mark.audit("dp-2")
+def test_one_datagram_acknowledges_once() -> None:
+    """Each acknowledgement is work, and a peer could put 64 of them into a datagram."""
+    ack = frame.encode_ack([(90, 100)], 0.0)
+    with pytest.raises(DecodeError, match="more than one"):
+        frame.decode_frames(memoryview(ack + frame.encode_probe(Probe(1)) + ack))

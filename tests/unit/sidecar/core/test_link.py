@@ -10,6 +10,7 @@ from sidecar.core.frame import Probe, ProbeReply
 from sidecar.core.introduction import Introduction
 from sidecar.core.link import Link
 from sidecar.core.link_events import (
+    CheckPaths,
     FragmentsLost,
     PathChanged,
     PathMeasured,
@@ -24,7 +25,8 @@ from sidecar.core.link_events import (
     SetReady,
 )
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, IDLE_PROBE_S, MAX_PROBE_S
+from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S
+from sidecar.core.probing import IDLE_PROBE_S, MAX_PROBE_S
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
 from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import (
@@ -44,6 +46,9 @@ PATH = PathId(WLAN, A, InterfaceId(0))
 OTHER_SESSION = SessionId(99)
 OUR_INTRODUCTION = Introduction(0, credential_of(OUR_NAME, Role.ROBOT, OUR_SESSION, OUR_INCARNATION))
 ELSEWHERE = ("203.0.113.9", 666)
+NO_ADDRESS: frozenset[str] = frozenset()
+NO_FAMILY: frozenset[int] = frozenset()
+OURS, OURS_TOO, OURS_V6 = "198.51.100.7", "198.51.100.8", "2001:db8::aaaa"
 PROBE = frame.encode_probe(Probe(1))
 
 
@@ -193,7 +198,7 @@ def test_a_rebinding_makes_a_path_unstable_until_it_answers_and_resends_what_was
     bench.link.execute(Send(PATH, sent), bench.now)
     bench.sent()
     bench.now += 0.001
-    bench.link.execute(Rebind(), bench.now)
+    bench.link.execute(Rebind(NO_ADDRESS, frozenset({4})), bench.now)
     events = bench.events()
     assert PathChanged(PATH, PathState.UNSTABLE, "rebinding") in events
     lost = [event for event in events if isinstance(event, FragmentsLost)]
@@ -204,6 +209,53 @@ def test_a_rebinding_makes_a_path_unstable_until_it_answers_and_resends_what_was
     assert state_changes(bench) == [PathState.UP]
     bench.link.handle_timer(bench.now + 1)
     assert bench.link.stats.paths[A].srtt_s == pytest.approx(0.03), "the round-trip time is the new way's alone"
+
+
+@pytest.mark.audit("dp-14")
+@pytest.mark.parametrize(
+    ("source", "command", "concerned"),
+    [
+        # A temporary IPv6 address is deprecated: an IPv4 path does not care, whatever the driver knows of it.
+        (None, Rebind(frozenset({OURS_V6}), NO_FAMILY), False),
+        (OURS, Rebind(frozenset({OURS_V6}), NO_FAMILY), False),
+        (OURS, Rebind(NO_ADDRESS, frozenset({6})), False),
+        (OURS, Rebind(NO_ADDRESS, NO_FAMILY), False),
+        # Another address of the same family: it depends on which one the path leaves from.
+        (OURS, Rebind(frozenset({OURS_TOO}), NO_FAMILY), False),
+        (OURS, Rebind(frozenset({OURS, OURS_V6}), NO_FAMILY), True),
+        (None, Rebind(frozenset({OURS_TOO}), NO_FAMILY), True),
+        (OURS, Rebind(NO_ADDRESS, frozenset({4, 6})), True),
+    ],
+)
+def test_only_paths_that_left_from_what_is_lost_are_rebound(
+    source: str | None, command: Rebind, concerned: bool
+) -> None:
+    bench = up()
+    bench.link.note_source(PATH, lambda remote: source if remote == PEER_ADDRESS else None)
+    sent = message()
+    bench.link.execute(Send(PATH, sent), bench.now)
+    bench.sent()
+    bench.link.execute(command, bench.now)
+    events = bench.events()
+    assert (PathChanged(PATH, PathState.UNSTABLE, "rebinding") in events) is concerned
+    assert any(isinstance(event, FragmentsLost) for event in events) is concerned
+
+
+@pytest.mark.audit("dp-14")
+def test_the_driver_is_asked_again_where_a_path_leaves_from_once_it_leads_elsewhere() -> None:
+    bench = up()
+    bench.link.note_source(PATH, lambda remote: OURS)
+    bench.receive_datagram(bench.datagram(fragment()), ELSEWHERE)
+    bench.link.execute(Rebind(frozenset({OURS_TOO}), NO_FAMILY), bench.now)
+    assert state_changes(bench) == [PathState.UNSTABLE], "the family alone is known again"
+    assert bench.link.living() == [PATH]
+
+
+def test_what_is_down_is_looked_for_at_once_after_any_change_of_addresses() -> None:
+    bench = Bench()
+    bench.wait(30.0)
+    bench.link.execute(Rebind(NO_ADDRESS, NO_FAMILY), bench.now)
+    assert bench.frames(bench.sent())
 
 
 def test_a_path_that_lives_outlives_a_view_that_forgot_it() -> None:
@@ -235,6 +287,17 @@ def test_a_link_whose_driver_hangs_keeps_packet_numbers_for_what_it_may_yet_seal
     bench.execute(Send(PATH, message(size=30_000)))
     memory = bench.link.remember(hangs=True)
     assert max(numbers(bench.sent())) < memory.next_number
+
+
+def test_an_idle_path_is_probed_when_its_interface_is_doubted_but_not_without_end() -> None:
+    bench = up()
+    bench.wait(0.1)
+    bench.sent()
+    bench.execute(CheckPaths())
+    assert [type(one) for one in bench.frames(bench.wait(0.01))] == [Probe]
+    for _ in range(10):
+        bench.execute(CheckPaths())
+    assert bench.wait(0.01) == []
 
 
 def test_the_peers_newest_address_is_followed() -> None:

@@ -15,7 +15,7 @@ from sidecar.core.link_events import (
 )
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_table import MAX_PATHS_OF_A_PEER
-from sidecar.core.paths import FIRST_PROBE_S
+from sidecar.core.probing import FIRST_PROBE_S
 from tests.unit.sidecar.core.builders import (
     PEER_ADDRESS,
     WLAN,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from sidecar.core import frame, pmtu
 from sidecar.core.frame import AckFrame, Finished, Fragment
 from sidecar.core.link_events import (
@@ -13,6 +15,8 @@ from sidecar.core.link_events import (
     SendFinished,
     SetCarrier,
 )
+from sidecar.core.messages import Encoded
+from sidecar.core.outbound import OutboundMessage
 from sidecar.core.received import MAX_ACK_DELAY_S
 from tests.unit.sidecar.core.builders import (
     PEER_SESSION,
@@ -113,3 +117,27 @@ def test_expired_messages_are_not_sent_and_counted() -> None:
     bench.execute(Send(PATH, message(expires=bench.now - 1)))
     assert bench.sent() == []
     assert bench.link.stats.dropped["expired"] == 1
+
+
+class EndedMeanwhile(OutboundMessage):
+    """The engine ends it while its link cuts it."""
+
+    __slots__ = ()
+
+    def symbol_data(self, index: int) -> bytes | memoryview:
+        data = super().symbol_data(index)
+        self.over = True
+        return data
+
+
+@pytest.mark.audit("dp-7")
+@pytest.mark.parametrize("size", [3000, 100])
+def test_what_is_ended_while_it_is_cut_does_not_leave_and_what_is_owed_does(size: int) -> None:
+    bench = up()
+    bench.execute(SendFinished(PATH, 7))
+    ended = EndedMeanwhile(1, PATH, Encoded(b"", bytes(size)), deadline=10.0, expires=20.0)
+    bench.execute(Send(PATH, ended))
+    assert [type(item) for item in bench.frames(bench.sent())] == [Finished]
+    assert ended.begun
+    bench.execute(Send(PATH, message(2, size=100)))
+    assert [type(item) for item in bench.frames(bench.sent())] == [Fragment]

@@ -13,7 +13,7 @@ from sidecar.core.introduction import Introduction
 from sidecar.core.link_events import (
     Send,
 )
-from sidecar.core.paths import FIRST_PROBE_S
+from sidecar.core.probing import FIRST_PROBE_S
 from tests.unit.sidecar.core.builders import (
     Bench,
     message,
@@ -44,10 +44,10 @@ BAD = {
     "truncated header": (good()[:19], "malformed"),
     "no room for a frame": (good()[:36], "malformed"),
     "another version": (b"\xd1" + good()[1:], "version"),
-    "unsealed": (b"\xd2\x00" + good()[2:], "unsealed"),
-    "unknown flags": (b"\xd2\x09" + good()[2:], "malformed"),
-    "a frame in clear": (b"\xd2\x01" + good()[2:20] + PROBE.ljust(40, b"\0"), "unauthentic"),
-    "another phase of the keys": (b"\xd2\x03" + good()[2:], "unauthentic"),
+    "unsealed": (b"\xd3\x00" + good()[2:], "unsealed"),
+    "unknown flags": (b"\xd3\x09" + good()[2:], "malformed"),
+    "a frame in clear": (b"\xd3\x01" + good()[2:20] + PROBE.ljust(40, b"\0"), "unauthentic"),
+    "another phase of the keys": (b"\xd3\x03" + good()[2:], "unauthentic"),
     "a changed packet number": (flipped(good(), 19), "unauthentic"),
     "a changed frame": (flipped(good(), 22), "unauthentic"),
     "a changed tag": (flipped(good(), -1), "unauthentic"),

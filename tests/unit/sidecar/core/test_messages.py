@@ -22,7 +22,7 @@ ID = RequestId(bytes(range(16)))
 GOLDENS: dict[str, tuple[Message, str]] = {
     "request": (
         RequestMessage(ID, 2, Priority.LOW, 0.1, 1.5, ServiceName("/a"), "t", b"xyz"),
-        "01" + ID.hex() + "02 02 000186a0 000005dc 0002 2f61 0001 74 78797a",
+        "01" + ID.hex() + "02 02 000186a0 0016e360 0002 2f61 0001 74 78797a",
     ),
     "response": (ResponseMessage(ID, 1, 0.25, b"xyz"), "02" + ID.hex() + "01 0003d090 78797a"),
     "rejection": (

@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from protos.model import Peer, ServiceName, ServiceOffer
 from sidecar.core.events import OfferService, WithdrawService
 from sidecar.core.offers import WITHDRAW_AFTER_S, Offers
 from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
+from sidecar.core.rules import Rules
 from tests.unit.sidecar.core.builders import ECHO, TYPE, A, B, path, peer, rule
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 OTHER_TYPE = (ServiceOffer(ECHO, "t/srv/Other"),)
 
@@ -15,10 +21,16 @@ class Robot:
 
     def __init__(self, *peers: Peer, lifetime_s: float = 10.0) -> None:
         self.routes = Routes()
-        self.offers = Offers((rule(ECHO, lifetime_s=lifetime_s),))
+        self.offers = Offers(Rules((rule(ECHO, lifetime_s=lifetime_s),)))
         for known in (A, B):
             self.reach(known)
-        self.offers.set_peers(list(peers))
+        self.set_peers(peers)
+
+    def set_peers(self, peers: Sequence[Peer]) -> None:
+        for known in peers:
+            self.offers.set_peer(known)
+        for gone in self.offers.others({known.name for known in peers}):
+            self.offers.forget_peer(gone)
 
     def reach(self, name: str, state: PathState = PathState.UP) -> None:
         self.routes.set_state(path(peer=name), state)
@@ -91,13 +103,13 @@ def test_light_in_between_starts_the_wait_anew() -> None:
 def test_servers_that_leave_may_come_back_for_a_while() -> None:
     robot = Robot(peer(A))
     robot.update()
-    robot.offers.set_peers([])
+    robot.set_peers([])
     assert robot.update(2.0) == []
     assert robot.offers.offered == {ECHO: TYPE}
-    robot.offers.set_peers([peer(B, session=2)])
+    robot.set_peers([peer(B, session=2)])
     assert robot.update(10.0) == []
     assert robot.offers.next_timer() is None
-    robot.offers.set_peers([])
+    robot.set_peers([])
     assert robot.update(20.0) == []
     assert robot.offers.next_timer() == 20.0 + WITHDRAW_AFTER_S
     assert robot.update(20.0 + WITHDRAW_AFTER_S) == [WithdrawService(ECHO, "no live server for 15 s")]
@@ -114,7 +126,7 @@ def test_the_type_of_most_servers_wins_and_the_odd_one_is_named() -> None:
     assert robot.update() == [OfferService(ECHO, TYPE)]
     assert robot.offers.servers(ECHO) == (A, B)
     assert robot.offers.conflicts == {(ECHO, "odd", "t/srv/Other")}
-    robot.offers.set_peers([peer(A)])
+    robot.set_peers([peer(A)])
     assert robot.offers.conflicts == set(), "settled conflicts are forgotten"
 
 
@@ -125,7 +137,7 @@ def test_in_a_tie_the_type_already_offered_stays() -> None:
     ):
         robot = Robot(peer(A, offers=(first,)))
         robot.update()
-        robot.offers.set_peers([peer(A, offers=(first,)), peer(B, session=2, offers=(second,))])
+        robot.set_peers([peer(A, offers=(first,)), peer(B, session=2, offers=(second,))])
         assert robot.update() == []
         assert robot.offers.servers(ECHO) == (A,)
 
@@ -133,7 +145,7 @@ def test_in_a_tie_the_type_already_offered_stays() -> None:
 def test_when_the_type_changes_the_old_offer_goes_and_the_new_one_comes() -> None:
     robot = Robot(peer(A))
     robot.update()
-    robot.offers.set_peers([peer(A, offers=OTHER_TYPE)])
+    robot.set_peers([peer(A, offers=OTHER_TYPE)])
     assert robot.update() == [
         WithdrawService(ECHO, "its servers offer it as t/srv/Other now"),
         OfferService(ECHO, "t/srv/Other"),
@@ -143,14 +155,14 @@ def test_when_the_type_changes_the_old_offer_goes_and_the_new_one_comes() -> Non
 def test_a_service_gains_each_new_server_once() -> None:
     robot = Robot(peer(A))
     assert robot.offers.take_gained() == {ECHO}
-    robot.offers.set_peers([peer(A)])
+    robot.set_peers([peer(A)])
     assert robot.offers.take_gained() == set()
-    robot.offers.set_peers([peer(A), peer(B, session=2)])
+    robot.set_peers([peer(A), peer(B, session=2)])
     assert robot.offers.take_gained() == {ECHO}
-    robot.offers.set_peers([peer(B, session=2)])
+    robot.set_peers([peer(B, session=2)])
     assert robot.offers.take_gained() == set()
-    robot.offers.set_peers([peer(A, draining=True)])
+    robot.set_peers([peer(A, draining=True)])
     assert robot.offers.take_gained() == {ECHO}
-    robot.offers.set_peers([peer(B, session=2)])
-    robot.offers.set_peers([])
+    robot.set_peers([peer(B, session=2)])
+    robot.set_peers([])
     assert robot.offers.take_gained() == set(), "a service that nobody offers any more has not gained"

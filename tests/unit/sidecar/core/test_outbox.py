@@ -2,23 +2,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core import outbox as outbox_module
 from sidecar.core.events import RequestId
 from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
 from sidecar.core.messages import Encoded
-from sidecar.core.outbox import MAX_BYTES, MAX_GENERATIONS, MAX_MESSAGES, Outbox
+from sidecar.core.outbox import MAX_GENERATIONS, Outbox
 from sidecar.core.path_id import PathState
 from sidecar.core.pmtu import BASE_BYTES
 from sidecar.core.priority import Priority
 from sidecar.core.redundancy import MAX_COPIES
+from sidecar.core.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
 
 if TYPE_CHECKING:
-    import pytest
-
+    from sidecar.core.backlog import Step
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_id import PathId
 
@@ -36,6 +35,14 @@ class Box:
         self.commands: list[LinkCommand] = []
         self.stats = EngineStats()
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
+
+    def come_up(self, path: PathId) -> None:
+        self.routes.set_state(path, PathState.UP)
+        self.do(self.outbox.on_path_up(path))
+
+    def do(self, steps: list[Step], now: float = 0.0) -> None:
+        for step in steps:
+            step(now)
 
     def send(self, over: PathId = OVER_WLAN, size: int = 3000, expires: float = 10.0) -> OutboundMessage:
         message = self.outbox.send(
@@ -149,7 +156,7 @@ def test_copies_do_not_hold_back_what_an_interface_took_with_it() -> None:
     box.lost(message, 0)
     box.commands.clear()
     box.routes.set_state(OVER_WLAN, PathState.DOWN)
-    box.outbox.on_interface_gone(WLAN, 1.0)
+    box.do(box.outbox.on_interface_gone(WLAN), 1.0)
     assert box.commands == [Resend(OVER_WWAN, message, (0, 1, 2))]
 
 
@@ -161,7 +168,7 @@ def test_copies_do_not_hold_back_what_waited_for_a_path() -> None:
     box.routes.set_state(OVER_WLAN, PathState.DOWN)
     box.lost(message, 0, 1)
     box.commands.clear()
-    box.outbox.on_path_up(OVER_WWAN)
+    box.come_up(OVER_WWAN)
     assert box.commands == [Resend(OVER_WWAN, message, (0, 1, 2))]
 
 
@@ -175,11 +182,11 @@ def test_without_a_path_messages_wait_and_all_missing_symbols_leave_with_the_fir
     message.acked[1] = 1
     box.outbox.on_finished(A, delivered.number)
     box.outbox.drop(called_off)
-    box.outbox.on_path_up(TO_B)
+    box.come_up(TO_B)
     assert not box.commands
-    box.outbox.on_path_up(OVER_WWAN)
+    box.come_up(OVER_WWAN)
     assert box.commands == [Resend(OVER_WWAN, message, (0, 2))]
-    box.outbox.on_path_up(OVER_WLAN)
+    box.come_up(OVER_WLAN)
     assert len(box.commands) == 1, "they wait no more"
 
 
@@ -187,11 +194,11 @@ def test_expired_messages_are_dropped_and_counted_also_when_they_wait() -> None:
     box = Box()
     message, longer = box.send(expires=5.0), box.send(expires=6.0)
     box.lost(message, 0)
-    box.outbox.expire(5.0)
+    box.do(box.outbox.expired(5.0), 5.0)
     assert message.over
     assert not longer.over
     assert box.stats.dropped["message_expired"] == 1
-    box.outbox.on_path_up(OVER_WLAN)
+    box.come_up(OVER_WLAN)
     assert not box.commands
 
 
@@ -228,7 +235,7 @@ def test_the_answers_to_a_request_are_dropped_together_and_nothing_else() -> Non
 def test_dropping_a_peer_ends_its_messages_and_nobody_elses() -> None:
     box = Box(OVER_WLAN, TO_B)
     gone, stays = box.send(OVER_WLAN), box.send(TO_B)
-    box.outbox.drop_peer(A)
+    box.do(box.outbox.drop_peer(A))
     assert gone.over
     assert not stays.over
     assert box.outbox.held_bytes == 3000
@@ -240,7 +247,7 @@ def test_an_interface_that_goes_leaves_none_of_its_messages_behind() -> None:
     box.lost(partly_there, 0, timed_out=True)  # its other symbols are still queued on wlan0
     box.commands.clear()
     box.routes.forget_interface(WLAN)
-    box.outbox.on_interface_gone(WLAN, 1.0)
+    box.do(box.outbox.on_interface_gone(WLAN), 1.0)
     assert box.commands == [
         Resend(OVER_WWAN, only_there, (0, 1, 2)),
         Resend(OVER_WWAN, partly_there, (0, 1, 2)),
@@ -254,7 +261,7 @@ def test_what_moved_to_another_interface_is_not_left_behind_there_either() -> No
     box.lost(message, 0, timed_out=True)
     assert box.commands.pop() == Resend(OVER_WWAN, message, (0,))
     box.routes.forget_interface(WWAN)
-    box.outbox.on_interface_gone(WWAN, 1.0)
+    box.do(box.outbox.on_interface_gone(WWAN), 1.0)
     assert box.commands == [Resend(OVER_WLAN, message, (0, 1, 2))]
 
 
@@ -268,15 +275,18 @@ def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
     assert box.outbox.has_room(B, 1000)
 
 
-def test_one_peer_never_gets_more_bytes_than_it_can_reassemble(monkeypatch: pytest.MonkeyPatch) -> None:
-    box = Box(OVER_WLAN)
-    size = MAX_PEER_BYTES // 4
-    for _ in range(4):
-        box.send(size=size)
-    assert not box.outbox.has_room(A, 1)
-    assert box.outbox.has_room(B, size)
-    monkeypatch.setattr(outbox_module, "REASSEMBLED_PEER_BYTES", MAX_BYTES)
-    assert box.outbox.has_room(A, 1)
+def test_one_peer_never_gets_more_bytes_than_it_can_reassemble() -> None:
+    box = Box(OVER_WLAN, TO_B)
+    assert SMALL_ROOM_BYTES + LARGE_ROOM_BYTES == MAX_PEER_BYTES
+    for _ in range(3):
+        box.send(size=LARGE_ROOM_BYTES // 3)
+    assert not box.outbox.has_room(A, SMALL_BYTES + 1)
+    assert box.outbox.has_room(B, LARGE_ROOM_BYTES // 3)
+    for _ in range(SMALL_ROOM_BYTES // SMALL_BYTES):
+        box.send(size=SMALL_BYTES)
+    assert not box.outbox.has_room(A, BASE_BYTES)
+    assert box.outbox.held_bytes == MAX_PEER_BYTES
+    assert box.outbox.has_room(A, 1000), "what one datagram holds takes nothing there"
 
 
 def carries(box: Box, over: PathId, size: int) -> None:
@@ -339,7 +349,7 @@ def test_what_waits_for_a_path_is_cut_to_the_one_that_comes() -> None:
     box.lost(message, 0)
     assert not box.commands
     box.routes.set_state(OVER_WLAN, PathState.UP)
-    box.outbox.on_path_up(OVER_WLAN)
+    box.come_up(OVER_WLAN)
     assert box.commands == [Send(OVER_WLAN, message.newest)]
     assert message.newest.datagram_bytes == BASE_BYTES
 

@@ -22,7 +22,7 @@ from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import peer
 
 LIMITS = KeyLimits(datagrams=10, seconds=5.0)
-SECRET, HEAD = bytes(32), 0xD2010000
+SECRET, HEAD = bytes(32), 0xD3010000
 
 
 def ends(limits: KeyLimits = LIMITS, aead: Aead = Aead.AES_256_GCM) -> tuple[SealingKeys, OpeningKeys]:

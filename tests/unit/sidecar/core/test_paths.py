@@ -9,15 +9,11 @@ from protos.model import InterfaceId, SessionId
 from sidecar.core.key_schedule import PairKeys
 from sidecar.core.path_id import PathState
 from sidecar.core.path_keys import DEFAULT_LIMITS, make_path_keys
-from sidecar.core.paths import (
-    DOWN_FACTOR,
-    DOWN_FLOOR_S,
+from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
+from sidecar.core.probing import (
     FIRST_PROBE_S,
     IDLE_PROBE_S,
     MAX_PROBE_S,
-    MAX_PROBES_OUT,
-    MAX_RTT_SAMPLES,
-    Path,
 )
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
 from tests.unit.sidecar.core.builders import path
@@ -29,13 +25,13 @@ HERE, THERE, ELSEWHERE = ("192.0.2.1", 1), ("192.0.2.2", 2), ("192.0.2.3", 3)
 def new() -> Path:
     pair = PairKeys(bytes(32), Aead.AES_256_GCM, first=True)
     keys = make_path_keys(pair, InterfaceId(0), InterfaceId(0), DEFAULT_LIMITS, 100.0)
-    return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0)
+    return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0, leads=True)
 
 
 def up(now: float = 100.0, rtt_s: float = 0.01) -> Path:
     subject = new()
     probe = subject.next_probe(now - rtt_s, RNG)
-    assert subject.answered_probe(probe, now)
+    assert subject.answered_probe(probe, now) == now - rtt_s
     assert subject.made_progress(now)
     return subject
 
@@ -45,7 +41,6 @@ def test_a_new_path_is_down_and_probes_with_growing_gaps() -> None:
     assert subject.state is PathState.DOWN
     now, gaps = 100.0, []
     for _ in range(12):
-        assert subject.probe_at is not None
         gaps.append(subject.probe_at - now)
         now = subject.probe_at
         subject.next_probe(now, RNG)
@@ -101,7 +96,6 @@ def test_an_unstable_path_is_probed_fast() -> None:
     subject.waits_for_answer(101.0)
     subject.check_silence(101.1)
     subject.next_probe(101.1, RNG)
-    assert subject.probe_at is not None
     assert subject.probe_at <= 101.1 + 1.1 * FIRST_PROBE_S
 
 
@@ -112,7 +106,6 @@ def test_a_path_that_was_up_is_asked_at_least_four_times_a_second_for_ten_second
     while sum(gaps) < 100.0:
         now = 101.0 + sum(gaps)
         subject.next_probe(now, RNG)
-        assert subject.probe_at is not None
         gaps.append(subject.probe_at - now)
     within = [gap for count, gap in enumerate(gaps) if sum(gaps[:count]) < 10.0]
     assert max(within) < 0.3
@@ -127,7 +120,6 @@ def test_hearing_a_dead_path_hastens_its_probe_but_no_flood_does() -> None:
         subject.next_probe(now, RNG)
         now += 2.0
     subject.hasten_probe(now)
-    assert subject.probe_at is not None
     assert subject.probe_at <= now
     subject.next_probe(now, RNG)
     for _ in range(100):
@@ -135,15 +127,41 @@ def test_hearing_a_dead_path_hastens_its_probe_but_no_flood_does() -> None:
     assert subject.probe_at == pytest.approx(now + FIRST_PROBE_S)
 
 
+@pytest.mark.audit("dp-2")
+def test_of_a_slow_path_nothing_is_expected_before_its_round_trip_is_over() -> None:
+    subject = up(rtt_s=4.0)
+    subject.waits_for_answer(200.0)
+    assert subject.check_silence(204.9) is None
+    assert subject.check_silence(205.1) is PathState.UNSTABLE
+    assert subject.check_silence(206.9) is None
+    assert subject.check_silence(207.1) is PathState.DOWN
+
+
+@pytest.mark.audit("dp-2")
+def test_a_queue_that_is_in_use_is_dead_a_second_after_its_last_sign_of_life() -> None:
+    """What stands in it arrives one after the other."""
+    subject = up(rtt_s=0.05)
+    for turn in range(20):
+        subject.recovery.on_finished_sent(subject.recovery.take_numbers(), 101.0 + turn / 10, 100, ())
+        subject.waits_for_answer(101.0 + turn / 10)
+        subject.recovery.rtt.sample(1.0, 102.0 + turn / 10)
+    subject.recovery.sent = subject.recovery.sent[10:]
+    subject.made_progress(103.0)
+    assert subject.silence_timer == pytest.approx(104.2, abs=0.2)
+
+
+@pytest.mark.audit("dp-2")
 def test_only_what_was_asked_counts_as_an_answer_and_once() -> None:
     subject = new()
     probe = subject.next_probe(100.0, RNG)
     assert not subject.answered_probe(probe + 1, 100.1)
     assert subject.answered_probe(probe, 100.1)
     assert not subject.answered_probe(probe, 100.1)
-    stale = subject.next_probe(100.2, RNG)
+    assert subject.made_progress(100.1)
+    late = subject.next_probe(100.2, RNG)
     subject.go_down()
-    assert not subject.answered_probe(stale, 100.3)
+    assert subject.answered_probe(late, 104.2) == 100.2, "a slow path is not a dead one"
+    assert subject.recovery.rtt.latest == pytest.approx(4.0)
 
 
 def test_unanswered_probes_and_samples_are_capped() -> None:
@@ -151,7 +169,6 @@ def test_unanswered_probes_and_samples_are_capped() -> None:
     for step in range(1000):
         subject.next_probe(100.0 + step, RNG)
         subject.note_rtt()
-    assert len(subject._probes_out) == MAX_PROBES_OUT
     assert len(subject.rtts) == MAX_RTT_SAMPLES
 
 

@@ -127,7 +127,7 @@ def test_when_the_path_answers_again_the_probe_timeout_is_now() -> None:
 
 def test_giving_up_leaves_nothing_in_flight() -> None:
     recovery = with_sent(7)
-    assert numbers(recovery.give_up_all()) == list(range(7))
+    assert numbers(recovery.give_up_all(forget=False)) == list(range(7))
     assert (recovery.in_flight, recovery.total_lost, recovery.pto_timer) == (0, 7, None)
 
 

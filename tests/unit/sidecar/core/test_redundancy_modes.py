@@ -141,7 +141,7 @@ def test_hedges_that_win_do_not_make_the_next_ones_sooner() -> None:
     learn(table, 0.1, 60)
     for number in range(1, 60):
         table.submit(number)
-        table.table.handle_timer(0.3)
+        table.handle_timers(0.3)
         table.respond(B, 1, number, now=0.35)
     table.submit(500)
     timer = table.table.next_timer()
@@ -155,7 +155,7 @@ def test_a_pair_that_misses_loses_its_place() -> None:
     for number in range(1, 3):
         table.submit(number)
         assert table.sent() == [WLAN_A]
-        table.table.handle_timer(1.0)
+        table.handle_timers(1.0)
     table.submit(3)
     assert table.sent() == [WWAN_B]
 

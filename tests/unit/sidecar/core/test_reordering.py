@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import pytest
 
+from sidecar.core.frame import MAX_ACK_RANGES
 from sidecar.core.reordering import MAX_REMEMBERED, PACKET_THRESHOLD, PERSISTS, Reordering
-from sidecar.core.rtt import RttEstimator
+from sidecar.core.rtt import LONGEST_ANSWER_S, RttEstimator
 from sidecar.core.sent import Sent
 from tests.unit.sidecar.core.builders import message
 
@@ -87,5 +88,70 @@ def test_what_is_remembered_is_bounded_and_forgotten_in_time() -> None:
     known.note_lost([run(number) for number in range(10 * MAX_REMEMBERED)], by_threshold=True)
     assert len(known.late([(0, 10 * MAX_REMEMBERED)], rtt, 10.1)) == MAX_REMEMBERED
     known.note_lost([run(1), run(2, at=99.9)], by_threshold=True)
-    known.forget_old(rtt, 100.0)
+    known.forget_old(100.0)
     assert [part.first for part in known.late([(0, 9)], rtt, 100.0)] == [2]
+
+
+@pytest.mark.audit("dp-2")
+def test_what_a_timeout_gave_up_is_missed_only_once_something_later_arrived() -> None:
+    known = Reordering()
+    known.note_lost([run(1), run(2)], by_threshold=False)
+    assert known.missed == 0
+    known.overtaken(2)
+    assert known.missed == 1
+    assert known.late([(2, 2)], steady(), 14.0), "a slow path, not a loss"
+    known.overtaken(9)
+    assert known.missed == 1
+    assert known.late([(1, 1)], steady(), 14.1)
+    assert (known.missed, known.spurious) == (0, 2)
+
+
+@pytest.mark.audit("dp-2")
+def test_what_a_path_carried_when_it_went_down_may_turn_up_and_was_never_missed() -> None:
+    known = Reordering()
+    known.note_given_up([run(1), run(2)])
+    assert [part.first for part in known.late([(1, 1)], steady(), 10.0 + 0.9 * LONGEST_ANSWER_S)] == [1]
+    assert known.packet_threshold == PACKET_THRESHOLD
+    known.overtaken(9)
+    assert known.missed == 0
+    known.forget()
+    assert known.late([(2, 2)], steady(), 10.1) == []
+
+
+def test_no_message_that_is_over_is_held() -> None:
+    known = Reordering()
+    given_up = run(1)
+    known.note_given_up([given_up])
+    assert given_up.message is not None
+    given_up.message.over = True
+    known.forget_old(10.1)
+    assert known.remembers
+    (late,) = known.late([(1, 1)], steady(), 10.2)
+    assert late.message is None
+    assert not known.remembers
+
+
+@pytest.mark.audit("dp-2")
+def test_ranges_that_acknowledge_nothing_are_hardly_looked_at() -> None:
+    """A peer may say 32 of them in each datagram, of its choice, while the most that can be is remembered."""
+    looked_at = 0
+
+    class Numbers(int):
+        """A range's end that counts how often it is compared."""
+
+        def __lt__(self, other: int) -> bool:
+            nonlocal looked_at
+            looked_at += 1
+            return int(self) < int(other)
+
+        def __add__(self, other: int) -> int:
+            nonlocal looked_at
+            looked_at += 1
+            return int(self) + other
+
+    known = Reordering()
+    known.note_lost([run(1000 + 4 * number) for number in range(MAX_REMEMBERED)], by_threshold=True)
+    none = [(number, Numbers(number)) for number in range(990, 990 - 2 * MAX_ACK_RANGES, -2)]
+    assert known.late(none, steady(), 10.1) == []
+    assert looked_at <= 7 * MAX_REMEMBERED, "not 32 times as often"
+    assert len(known.late([(1000, 1004), (0, 9)], steady(), 10.1)) == 2

@@ -137,7 +137,9 @@ def test_a_request_without_any_path_has_the_links_look_for_one() -> None:
 
 def siblings(table: Table, number: int = 1) -> list[PathId]:
     """Over which paths those copies travel that may leave the request to each other."""
-    copy = table.table._requests[request_id(number)].copies[-1]
+    request = table.table._requests.get(request_id(number))
+    assert request is not None
+    copy = request.copies[-1]
     return [message.path for message in copy.message.siblings]
 
 
@@ -178,7 +180,9 @@ def test_what_is_sent_in_trouble_is_left_to_nobody() -> None:
 def test_messages_do_not_hold_each_other_in_memory_when_their_request_is_over() -> None:
     table = Table()
     table.submit()
-    shared = table.table._requests[request_id(1)].messages
+    request = table.table._requests.get(request_id(1))
+    assert request is not None
+    shared = request.messages
     assert len(shared) == 2
     table.respond(A)
     table.table.handle_timer(20.0)

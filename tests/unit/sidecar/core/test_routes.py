@@ -89,3 +89,21 @@ def test_what_a_policer_dropped_is_not_expected_to_go_on() -> None:
     assert table.loss(FAST).share > 0.1
     table.note_fates(FAST, 90, 10, policed=True)
     assert table.loss(FAST).share == 0.0
+
+
+def test_the_best_state_of_each_interface_is_told_when_it_changes() -> None:
+    table = routes()
+    assert table.best == {WLAN: PathState.UP, WWAN: PathState.UP}
+    before = table.best
+    table.set_state(SHAKY, PathState.UP)
+    table.set_state(FAST, PathState.UNSTABLE)
+    assert table.best is before
+    table.set_state(SHAKY, PathState.DOWN)
+    assert table.best == {WLAN: PathState.UNSTABLE, WWAN: PathState.UP}
+    assert before == {WLAN: PathState.UP, WWAN: PathState.UP}
+    table.forget_peer(A)
+    assert table.best == {WLAN: PathState.DOWN}
+    table.forget_interface(WLAN)
+    assert table.best == {}
+    table.set_state(FAST, PathState.UP)
+    assert table.best == {WLAN: PathState.UP}

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import pytest
+
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.priority import Priority
 from sidecar.core.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SHARE, SendQueue
@@ -121,11 +123,51 @@ def test_what_is_over_holds_no_memory_although_it_never_comes_up() -> None:
     assert drain(queue) == [(0, 0), (0, 1), (0, 2)]
 
 
+@pytest.mark.audit("dp-13")
+def test_of_the_late_the_oldest_that_can_still_be_of_use_goes_first() -> None:
+    queue = SendQueue()
+    for number, deadline, expires in ((1, 1.0, 5.1), (2, 2.0, 5.4), (3, 3.0, 13.0), (4, 4.0, 14.0), (5, 5.5, 15.0)):
+        queue.add(message(number, 50_000, deadline=deadline, expires=expires))
+    order = []
+    while (run := queue.take(5.0, MUCH, PACE)) is not None:
+        order += [run.message.number] * (run.message.number not in order)
+    assert order == [5, 3, 4, 2, 1], "what can not arrive before it expires goes last, in case the pace rises"
+
+
+@pytest.mark.audit("dp-13")
+def test_of_what_is_hopeless_at_this_pace_the_oldest_goes_first() -> None:
+    queue = SendQueue()
+    for number in (1, 2, 3):
+        queue.add(message(number, 150_000, deadline=number * 0.2, expires=100.0))
+    assert take(queue, pace=PACE)[0] == 1
+    assert take(queue, now=1.0, pace=PACE)[0] == 1
+
+
+@pytest.mark.audit("dp-13")
+def test_what_seemed_hopeless_is_fresh_again_when_the_pace_rises() -> None:
+    queue = SendQueue()
+    for number, size, deadline in ((1, 400_000, 1.0), (2, 150_000, 1.1), (3, 120_000, 1.2)):
+        queue.add(message(number, size, deadline=deadline, expires=100.0))
+    assert take(queue, pace=PACE)[0] == 1
+    assert take(queue, now=0.1, pace=PACE)[0] == 1
+    assert take(queue, now=0.1, pace=2 * PACE)[0] == 2
+    assert take(queue, now=0.1, pace=2 * PACE)[0] == 2
+
+
+def test_what_seemed_hopeless_is_not_remembered_when_it_has_left() -> None:
+    queue = SendQueue()
+    for number in range(1, 2000):
+        queue.add(message(number, 100, deadline=number + 0.001, expires=1e9))
+        assert take(queue, now=float(number), pace=PACE)[0] == number
+    held = queue._classes[Priority.NORMAL].newest
+    assert len(held) <= 2 * PURGE_AT
+
+
 def test_the_late_wait_for_all_that_can_still_make_it() -> None:
     queue = SendQueue()
     for number, deadline in ((1, 1.0), (2, 2.0), (3, 6.0), (4, 7.0)):
         queue.add(message(number, 10, deadline=deadline))
-    assert drain(queue, now=5.0) == [(3, 0), (4, 0), (2, 0), (1, 0)]
+    assert drain(queue, now=5.0) == [(3, 0), (4, 0), (1, 0), (2, 0)]
 
 
 def test_what_is_begun_is_finished_before_newer_late_ones() -> None:

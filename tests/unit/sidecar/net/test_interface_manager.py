@@ -39,7 +39,7 @@ class Host:
         config = SidecarConfig(
             name="robot",
             role=Role.ROBOT,
-            control_plane="127.0.0.1:1",
+            control_plane=("127.0.0.1:1",),
             insecure=True,
             services=(ServiceConfig(name="/echo", deadline_ms=100),),
             interfaces=("lo",),

@@ -5,11 +5,22 @@ from dataclasses import replace
 import pytest
 
 from protos.model import InterfaceName
+from sidecar.core.link_events import Rebind
 from sidecar.net.interfaces import LOOPBACK, Interface, SkippedInterface, choose, list_interfaces
 
 WLAN = Interface(
-    InterfaceName("wlan0"), 3, "", up=True, carrier=True, mtu=1500, addresses=("192.0.2.2",), gateways=("192.0.2.1",)
+    InterfaceName("wlan0"),
+    3,
+    "",
+    up=True,
+    carrier=True,
+    mtu=1500,
+    addresses=("192.0.2.2",),
+    gateways=((4, "192.0.2.1"),),
 )
+
+
+NONE: frozenset[int] = frozenset()
 
 
 def interface(name: str, kind: str = "") -> Interface:
@@ -116,17 +127,18 @@ def test_this_host_has_a_loopback_interface() -> None:
 @pytest.mark.parametrize(
     ("after", "rebound"),
     [
-        (WLAN, False),
-        (replace(WLAN, addresses=("192.0.2.3",)), True),
-        (replace(WLAN, addresses=()), True),
-        (replace(WLAN, addresses=("2001:db8::2", "192.0.2.2")), False),
-        (replace(WLAN, gateways=("192.0.2.9",)), True),
-        (replace(WLAN, gateways=()), True),
-        (replace(WLAN, mtu=1280), False),
+        (WLAN, None),
+        (replace(WLAN, addresses=("192.0.2.3",)), Rebind(frozenset({"192.0.2.2"}), NONE)),
+        (replace(WLAN, addresses=()), Rebind(frozenset({"192.0.2.2"}), NONE)),
+        (replace(WLAN, addresses=("2001:db8::2", "192.0.2.2")), Rebind(frozenset(), NONE)),
+        (replace(WLAN, gateways=((4, "192.0.2.9"),)), Rebind(frozenset(), frozenset({4}))),
+        (replace(WLAN, gateways=()), Rebind(frozenset(), frozenset({4}))),
+        (replace(WLAN, gateways=((4, "192.0.2.1"), (6, "fe80::1"))), Rebind(frozenset(), frozenset({6}))),
+        (replace(WLAN, mtu=1280), None),
     ],
 )
-def test_a_lost_address_or_another_gateway_rebinds(after: Interface, rebound: bool) -> None:
-    assert after.rebound_since(WLAN) is rebound
+def test_a_lost_address_or_another_gateway_rebinds_what_uses_it(after: Interface, rebound: Rebind | None) -> None:
+    assert after.rebound_since(WLAN) == rebound
 
 
 def test_the_families_are_those_of_the_addresses() -> None:

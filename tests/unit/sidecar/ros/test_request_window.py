@@ -9,7 +9,8 @@ from itertools import count
 import pytest
 
 from sidecar.core.priority import Priority
-from sidecar.ros.request_window import FIRST_SIZE, LATE_ONLY_S, MAX_SIZE, STALL_S, RequestWindow
+from sidecar.ros.request_window import LATE_ONLY_S, SHORT_STALL_S, STALL_S, STALL_TIMES, RequestWindow
+from sidecar.ros.server_capacity import SAFE_SIZE
 
 _items = count()
 
@@ -37,73 +38,108 @@ def numbers() -> deque[int]:
     return deque(range(1, 100_000))
 
 
-def test_an_answer_lets_the_next_through(numbers: deque[int]) -> None:
+def of_size(size: int) -> RequestWindow[int]:
+    """A window that knows how long a request takes alone, 20 ms, and lets so many through."""
+    window: RequestWindow[int] = RequestWindow(size)
+    fill(window, 1)
+    for _ in window.release(-1.0):
+        window.sent(0, -1.0)
+    window.answered(0, -0.98)
+    assert window.size == size
+    return window
+
+
+def test_nothing_is_sent_beside_the_first_until_it_is_answered(numbers: deque[int]) -> None:
     window: RequestWindow[int] = RequestWindow()
+    fill(window, 20)
+    assert release(window, 0.0, numbers) == [1]
+    window.answered(1, 0.1)
+    assert release(window, 0.1, numbers) == [2, 3]
+
+
+def test_an_answer_lets_the_next_through(numbers: deque[int]) -> None:
+    window = of_size(8)
     fill(window, 20)
     assert release(window, 0.0, numbers) == [1, 2, 3, 4, 5, 6, 7, 8]
-    assert release(window, 0.1, numbers) == []
-    window.answered(1, 0.1)
-    assert release(window, 0.1, numbers) == [9]
-    window.answered(4, 0.2)  # 2 and 3 left the server's queue too, whatever becomes of them
-    assert release(window, 0.2, numbers) == [10, 11, 12]
-    assert window.size == FIRST_SIZE
+    assert release(window, 0.01, numbers) == []
+    window.answered(1, 0.02)
+    assert release(window, 0.02, numbers) == [9]
+    window.answered(4, 0.04)  # 2 and 3 left the server's queue too, whatever becomes of them
+    assert release(window, 0.04, numbers) == [10, 11, 12]
 
 
-def test_answers_out_of_order_widen_the_window(numbers: deque[int]) -> None:
-    window: RequestWindow[int] = RequestWindow()
-    fill(window, 20)
-    release(window, 0.0, numbers)
-    window.answered(5, 0.1)
-    assert window.size == FIRST_SIZE
-    window.answered(2, 0.2)
-    assert window.size == 2 * FIRST_SIZE
-
-
-def test_a_silent_server_gets_more_after_a_while(numbers: deque[int]) -> None:
+@pytest.mark.audit("dp-3")
+def test_a_silent_server_gets_one_more_after_ever_longer_silences_but_no_more_than_its_queue_holds(
+    numbers: deque[int],
+) -> None:
     window: RequestWindow[int] = RequestWindow()
     fill(window, 200)
-    assert len(release(window, 5.0, numbers)) == 8
-    assert window.next_due() == 5.0 + STALL_S
-    assert release(window, 5.0 + STALL_S * 0.9, numbers) == []
-    assert len(release(window, 5.0 + STALL_S, numbers)) == 8
-    assert len(release(window, 5.0 + 2 * STALL_S, numbers)) == 16
-    assert window.size == MAX_SIZE
-    assert len(release(window, 5.0 + 3 * STALL_S, numbers)) == 1
-
-
-def test_a_server_that_never_answers_gets_one_request_at_a_time_but_is_not_given_up(numbers: deque[int]) -> None:
-    window: RequestWindow[int] = RequestWindow()
-    fill(window, 100)
-    now = 0.0
-    sent = len(release(window, now, numbers))
-    while sent < 100:
-        due = window.next_due()
-        assert due is not None
+    assert release(window, 5.0, numbers) == [1]
+    now, times = 5.0, []
+    while (due := window.next_due()) is not None:
+        assert release(window, due - 0.01, numbers) == []
+        assert len(release(window, due, numbers)) == 1
+        times.append(due - now)
         now = due
-        sent += len(release(window, now, numbers))
-        assert sent <= MAX_SIZE + now / STALL_S
-    assert now == pytest.approx((2 + 100 - MAX_SIZE) * STALL_S)
+    assert times == [
+        pytest.approx(STALL_S * 2**silence if silence else SHORT_STALL_S) for silence in range(SAFE_SIZE - 1)
+    ]
+    assert release(window, now + 1e6, numbers) == []
+
+
+def test_a_server_that_is_quick_as_a_rule_is_not_waited_for_so_long(numbers: deque[int]) -> None:
+    window: RequestWindow[int] = RequestWindow()
+    fill(window, 200)
+    release(window, 0.0, numbers)
+    window.answered(1, 0.002)
+    release(window, 0.002, numbers)
+    assert window.next_due() == pytest.approx(0.002 + SHORT_STALL_S)
+
+
+def test_a_silence_is_longer_than_what_requests_take(numbers: deque[int]) -> None:
+    window: RequestWindow[int] = RequestWindow()
+    fill(window, 200)
+    release(window, 0.0, numbers)
+    window.answered(1, 10.0)
+    assert release(window, 10.0, numbers) == [2, 3]
+    assert window.next_due() == 10.0 + STALL_TIMES * 10.0
+
+
+@pytest.mark.audit("dp-3")
+def test_what_nobody_waits_for_makes_room_once_it_is_the_oldest(numbers: deque[int]) -> None:
+    """The server hangs with a full queue: the next one pushes the oldest out, which nobody misses."""
+    window = of_size(8)
+    fill(window, 100)
+    sent = release(window, 0.0, numbers)
+    window.given_up(sent[1])
+    assert release(window, 1e3, numbers) == [], "the second is pushed out after the first only"
+    assert window.next_due() is None
+    window.given_up(sent[0])
+    assert window.next_due() is not None
+    assert len(release(window, 1e3, numbers)) == 2
+    for number in sent[2:]:
+        window.given_up(number)
+    assert len(release(window, 2e3, numbers)) == 6
 
 
 def test_a_server_that_comes_back_opens_the_window_by_its_first_answer(numbers: deque[int]) -> None:
-    window: RequestWindow[int] = RequestWindow()
+    window = of_size(2)
     fill(window, 1000)
+    release(window, 0.0, numbers)
     now = 0.0
-    for _ in range(20):
-        release(window, now, numbers)
-        now += STALL_S
-    (number,) = release(window, now, numbers)
-    window.answered(number, now)
-    assert len(release(window, now, numbers)) == window.size == MAX_SIZE
+    while (due := window.next_due()) is not None:
+        now, sent = due, release(window, due, numbers)
+    window.answered(sent[-1], now)
+    assert len(release(window, now, numbers)) == window.size == 2
 
 
 def test_a_window_that_is_not_full_does_not_grow(numbers: deque[int]) -> None:
-    window: RequestWindow[int] = RequestWindow()
+    window = of_size(2)
     fill(window, 1)
     release(window, 0.0, numbers)
     fill(window, 1)
     release(window, 10 * STALL_S, numbers)
-    assert window.size == FIRST_SIZE
+    assert window.size == 2
     assert window.next_due() is None
 
 
@@ -145,7 +181,7 @@ def test_a_serial_server_with_a_queue_of_ten_loses_nothing(seed: int) -> None:
 
 
 def test_one_late_request_at_a_time_and_whatever_is_fresh_beside_it(numbers: deque[int]) -> None:
-    window: RequestWindow[int] = RequestWindow()
+    window = of_size(8)
     fill(window, 50, deadline=5.0, now=10.0)
     assert release(window, 10.0, numbers) == [1]
     fill(window, 3, deadline=20.0, now=10.1)
@@ -162,7 +198,7 @@ def test_one_late_request_at_a_time_and_whatever_is_fresh_beside_it(numbers: deq
 
 
 def test_late_requests_fill_the_window_when_nothing_else_comes(numbers: deque[int]) -> None:
-    window: RequestWindow[int] = RequestWindow()
+    window = of_size(8)
     now = 10.0
     fill(window, 50, deadline=5.0, now=now)
     released = 0
@@ -175,14 +211,14 @@ def test_late_requests_fill_the_window_when_nothing_else_comes(numbers: deque[in
         assert due is not None
         now += 0.5
     assert released <= 5
-    assert len(release(window, now, numbers)) == FIRST_SIZE
+    assert len(release(window, now, numbers)) == 8
     fill(window, 1, deadline=20.0, now=now)
     window.answered(numbers[0] - 1, now)
     assert len(release(window, now, numbers)) == 2, "the fresh one, and one late"
 
 
 def test_a_request_that_becomes_late_while_it_waits_goes_behind_the_fresh_ones(numbers: deque[int]) -> None:
-    window: RequestWindow[int] = RequestWindow(size=2)
+    window = of_size(2)
     first = fill(window, 6, deadline=1.0)
     assert release(window, 0.0, numbers) == [1, 2]
     (fresh,) = fill(window, 1, deadline=9.0, now=2.0)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.net import stun_names
-from sidecar.net.stun_names import StunNames
+from sidecar.net import host_names
+from sidecar.net.host_names import HostNames
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -19,15 +19,15 @@ TIMEOUT_S = 30.0
 
 
 @pytest.fixture
-def found() -> Iterator[tuple[StunNames, queue.Queue[tuple[Address, ...]]]]:
+def found() -> Iterator[tuple[HostNames, queue.Queue[tuple[Address, ...]]]]:
     results: queue.Queue[tuple[Address, ...]] = queue.Queue()
-    names = StunNames(results.put)
+    names = HostNames("STUN server", results.put)
     yield names, results
     names.stop()
 
 
 def test_numeric_addresses_are_found_at_once_and_again_only_when_they_change(
-    found: tuple[StunNames, queue.Queue[tuple[Address, ...]]],
+    found: tuple[HostNames, queue.Queue[tuple[Address, ...]]],
 ) -> None:
     names, results = found
     names.look_up(("192.0.2.1:3478", "[2001:db8::1]:3479"))
@@ -39,8 +39,33 @@ def test_numeric_addresses_are_found_at_once_and_again_only_when_they_change(
     assert results.empty()
 
 
+def test_numeric_addresses_do_not_wait_for_names_and_names_keep_what_they_had(
+    found: tuple[HostNames, queue.Queue[tuple[Address, ...]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answering = threading.Event()
+    lost = threading.Event()
+
+    def getaddrinfo(host: str, port: int, **_: Any) -> list[Any]:
+        assert answering.wait(TIMEOUT_S)
+        if lost.is_set():
+            raise socket.gaierror("no such host")
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("192.0.2.9", port))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
+    names, results = found
+    wanted = ("name.example:1", "192.0.2.1:2")
+    names.look_up(wanted)
+    names.start()
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.1", 2),)
+    answering.set()
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.9", 1), ("192.0.2.1", 2))
+    lost.set()
+    names.look_up((*wanted, "192.0.2.3:3"))
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.9", 1), ("192.0.2.1", 2), ("192.0.2.3", 3))
+
+
 def test_a_name_without_address_is_logged_once_and_tried_again(
-    found: tuple[StunNames, queue.Queue[tuple[Address, ...]]],
+    found: tuple[HostNames, queue.Queue[tuple[Address, ...]]],
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -55,10 +80,10 @@ def test_a_name_without_address_is_logged_once_and_tried_again(
             raise socket.gaierror("no such host")
         return [(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("192.0.2.9", port))]
 
-    monkeypatch.setattr(stun_names, "RETRY_S", 0.01)
+    monkeypatch.setattr(host_names, "RETRY_S", 0.01)
     monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
     names, results = found
     names.look_up(("stun.example:3478",))
     names.start()
     assert results.get(timeout=TIMEOUT_S) == (("192.0.2.9", 3478),)
-    assert caplog.text.count("no such host") == 1
+    assert caplog.text.count("stun.example:3478: no such host") == 1

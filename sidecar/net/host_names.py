@@ -1,6 +1,7 @@
-"""Turns the STUN servers' host names into addresses on a thread of its own, since a dead network's DNS takes minutes.
+"""Turns host names into addresses on a thread of its own, since a dead network's DNS takes minutes.
 
-Names are looked up again now and then: a control plane may move.
+Names are looked up again now and then: what they name may move. A name that cannot be looked up keeps the addresses
+that it had.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import socket
 import threading
 from typing import TYPE_CHECKING
 
-from protos.config_fields import split_host_port
+from protos.config_fields import numeric_host, split_host_port
 from sidecar.net.sockets import normalise
 
 if TYPE_CHECKING:
@@ -26,14 +27,16 @@ RETRY_S = 2.0
 """While some name has no address."""
 
 
-class StunNames:
-    """Looks up host:port names and tells the addresses whenever they change."""
+class HostNames:
+    """Looks up host:port names and tells all their addresses whenever these change."""
 
-    def __init__(self, found: Callable[[tuple[Address, ...]], None]) -> None:
-        """`found` is called on the thread of this object."""
+    def __init__(self, what: str, found: Callable[[tuple[Address, ...]], None]) -> None:
+        """`what` the names are of, for the log; `found` is called on the thread of this object."""
+        self._what = what
         self._found = found
         self._names: tuple[str, ...] = ()
-        self._addresses: tuple[Address, ...] = ()
+        self._by_name: dict[str, tuple[Address, ...]] = {}
+        self._told: tuple[Address, ...] = ()
         self._failing: frozenset[str] = frozenset()
         self._wake = threading.Event()
         self._stopping = False
@@ -60,20 +63,28 @@ class StunNames:
             self._wake.clear()
 
     def _look_up_all(self) -> None:
-        addresses: list[Address] = []
+        names = self._names
+        self._by_name = {name: self._by_name[name] for name in names if name in self._by_name}
+        self._by_name |= {name: (address,) for name in names if (address := numeric_host(name)) is not None}
+        self._tell()  # these need not wait for a name server that does not answer
         failing: dict[str, OSError] = {}
-        for name in self._names:
+        for name in names:
+            if numeric_host(name) is not None:
+                continue
             host, port = split_host_port(name)
             try:
                 found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
             except OSError as error:
                 failing[name] = error
                 continue
-            addresses.extend(normalise(entry[4]) for entry in found)
+            self._by_name[name] = tuple(normalise(entry[4]) for entry in found)
+            self._tell()
         for name in failing.keys() - self._failing:
-            log.warning("STUN server %s: %s; trying again", name, failing[name])
+            log.warning("%s %s: %s; trying again", self._what, name, failing[name])
         self._failing = frozenset(failing)
-        unique = tuple(dict.fromkeys(addresses))
-        if unique and unique != self._addresses and not self._stopping:
-            self._addresses = unique
+
+    def _tell(self) -> None:
+        unique = tuple(dict.fromkeys(address for name in self._names for address in self._by_name.get(name, ())))
+        if unique and unique != self._told and not self._stopping:
+            self._told = unique
             self._found(unique)

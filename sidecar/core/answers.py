@@ -1,0 +1,373 @@
+"""Cloud side: answers from the moment they are known until they are delivered, or nobody waits for them any more.
+
+An answer that finds no room to be sent waits for it. Each robot has lines of its own, one for each lane (`room.py`), so
+none holds up another. Several copies that asked share the answer's bytes here, but each travels apart: the answer goes
+over one path first, and to the other copies when no answer waits for its first.
+
+What came of a request must not vanish: an answer that has no room to wait either, or that has not begun to leave when
+its time is nearly over, is replaced by a rejection that says so.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import OrderedDict
+from dataclasses import dataclass, field, replace
+from itertools import chain, count, islice
+from typing import TYPE_CHECKING
+
+from sidecar.core.backlog import in_groups
+from sidecar.core.copies import is_race
+from sidecar.core.dedup import Waiter
+from sidecar.core.events import RejectReason
+from sidecar.core.messages import RejectionMessage, ResponseMessage, encode_message
+from sidecar.core.path_id import PathState
+from sidecar.core.priority import Priority
+from sidecar.core.room import Lane
+from sidecar.core.shares import Shares
+from sidecar.core.waiting_line import WaitingLine
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
+    from protos.model import NodeName
+    from sidecar.core.backlog import Backlog, Step
+    from sidecar.core.dedup import Reply
+    from sidecar.core.events import RequestId
+    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.outbox import Outbox
+    from sidecar.core.path_id import PathId
+    from sidecar.core.routes import Routes
+    from sidecar.core.rules import Rules
+    from sidecar.core.stats import EngineStats
+
+MAX_ANSWERS = 32_768
+"""Answers and rejections that wait or are under way; one robot may have half: twice what it may have in flight."""
+MAX_ANSWER_BYTES = 512 * 1024 * 1024
+"""Payloads of those answers, as much as those of the requests that run; one robot may hold half."""
+TELL_BEFORE = 0.1
+"""An answer of which nothing has left when this part of its time remains ..."""
+TELL_BEFORE_S = 1.0
+"""... but no more than this, is given up: the robot has time to learn it, and maybe to ask elsewhere."""
+ROBOTS_AT_ONCE = 16
+"""Robots whose lines are looked at when a message ends, besides its own: the number of messages is shared by all."""
+TIMER_SLACK = 1024
+"""Timers of answers that are over that may lie around before they are swept out."""
+
+
+@dataclass(slots=True, eq=False)
+class _Answer:
+    """A response, or a rejection of one copy."""
+
+    number: int
+    reply: Reply
+    """To the first copy that asked."""
+    size: int
+    """Bytes of one message of it."""
+    waiting: dict[int, PathId] = field(default_factory=dict)
+    """Copies it was not sent to yet, and how they came."""
+    sent: dict[int, PathId] = field(default_factory=dict)
+    """Copies it was sent to, and how they came."""
+    messages: list[OutboundMessage] = field(default_factory=list)
+    """What carries it, of a large one: siblings, so that paths with more to carry than they bear share it."""
+
+    @property
+    def robot(self) -> NodeName:
+        return self.reply.waiter.path.peer
+
+    @property
+    def request_id(self) -> RequestId:
+        return self.reply.message.request_id
+
+    @property
+    def held(self) -> int:
+        """Bytes that stay in memory for it."""
+        message = self.reply.message
+        return len(message.payload) if isinstance(message, ResponseMessage) else 0
+
+    @property
+    def lane(self) -> Lane:
+        return Lane.of(self.size)
+
+
+class _Lines:
+    """What waits to be sent to one robot in one lane."""
+
+    __slots__ = ("copies", "firsts")
+
+    def __init__(self) -> None:
+        self.firsts: WaitingLine[int] = WaitingLine()
+        """Answers of which nothing was sent."""
+        self.copies: WaitingLine[tuple[int, int]] = WaitingLine()
+        """(answer, copy) of answers that were sent to another copy."""
+
+    def __len__(self) -> int:
+        return len(self.firsts) + len(self.copies)
+
+
+class Answers:
+    """All answers on their way."""
+
+    def __init__(self, rules: Rules, routes: Routes, outbox: Outbox, stats: EngineStats) -> None:
+        self._rules = rules
+        self._routes = routes
+        self._outbox = outbox
+        self._stats = stats
+        self._answers: dict[int, _Answer] = {}
+        self._of: dict[NodeName, dict[RequestId, list[_Answer]]] = {}
+        self._got: dict[NodeName, dict[int, None]] = {}
+        """Answers that the robot has got, and that wait for further copies only."""
+        self._lines: OrderedDict[NodeName, tuple[_Lines, ...]] = OrderedDict()
+        """Of robots with answers that wait, the one whose turn is longest ago first."""
+        self._number_shares = Shares(MAX_ANSWERS)
+        self._byte_shares = Shares(MAX_ANSWER_BYTES)
+        self._timers: list[tuple[float, int]] = []
+        self._numbers = count()
+
+    def __len__(self) -> int:
+        """How many answers wait or are under way."""
+        return len(self._answers)
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of their payloads."""
+        return self._byte_shares.used
+
+    def unsent(self, robots: Collection[NodeName]) -> int:
+        """How many answers to these robots wait for room, and are not on their way to any copy."""
+        return sum(len(line.firsts) for robot in robots for line in self._lines.get(robot, ()))
+
+    # -- what comes in --------------------------------------------------------------------------------------------
+
+    def send(self, replies: list[Reply], now: float) -> None:
+        """Send these as soon as there is room."""
+        for reply in replies:
+            self._take(reply, now)
+        for robot in dict.fromkeys(reply.waiter.path.peer for reply in replies):
+            self._use_room(robot, now)
+
+    def _take(self, reply: Reply, now: float) -> None:
+        copy, path = reply.waiter.copy, reply.waiter.path
+        answer = self._known(path.peer, reply)
+        if answer is None:
+            answer = self._enter(reply, now)
+            if answer is not None:
+                answer.waiting[copy] = path
+                line = self._lines_of(answer).firsts
+                line.add(answer.number, reply.priority, reply.deadline, answer.size)
+        elif copy not in answer.waiting and copy not in answer.sent:
+            answer.waiting[copy] = path
+            if answer.sent:
+                self._line_up_copies(answer, (copy,))
+        # Else that copy came twice, cut anew: its answer is on its way.
+
+    def _known(self, robot: NodeName, reply: Reply) -> _Answer | None:
+        """Return what is on its way already and says the same, or more: the answer's bytes may be kept here only."""
+        message = reply.message
+        for answer in self._of.get(robot, {}).get(message.request_id, ()):
+            known = answer.reply.message
+            if isinstance(known, ResponseMessage):
+                if isinstance(message, ResponseMessage) or message.reason is RejectReason.FORGOTTEN:
+                    return answer
+            elif known == message:
+                return answer
+        return None
+
+    def _enter(self, reply: Reply, now: float) -> _Answer | None:
+        answer = _Answer(next(self._numbers), reply, encode_message(reply.message).size)
+        robot, held = answer.robot, answer.held
+        if not self._number_shares.fits(robot):
+            self._stats.dropped["answers_full"] += 1
+            return None
+        if held and not (self._byte_shares.fits(robot, held) or self._let_copies_go(robot, held)):
+            self._stats.dropped["answers_full"] += 1
+            return self._enter(self._refusal(answer, "too much waits to be sent to this robot already"), now)
+        self._number_shares.take(robot)
+        self._byte_shares.take(robot, held)
+        self._answers[answer.number] = answer
+        self._of.setdefault(robot, {}).setdefault(answer.request_id, []).append(answer)
+        left_s = reply.expires - now
+        self._arm(reply.expires - (min(TELL_BEFORE_S, TELL_BEFORE * left_s) if held else 0.0), answer.number)
+        return answer
+
+    def _refusal(self, answer: _Answer, why: str) -> Reply:
+        text = f"it ran, but its answer of {answer.held} bytes is not sent: {why}"
+        rejection = RejectionMessage(answer.request_id, answer.reply.waiter.copy, RejectReason.FORGOTTEN, text)
+        # The answer's deadline may be over; this is of use until its time is, and waits behind no large answer.
+        return replace(answer.reply, message=rejection, priority=Priority.HIGH, deadline=answer.reply.expires)
+
+    def _let_copies_go(self, robot: NodeName, held: int) -> bool:
+        """Make room in memory: let go what the robot has got already."""
+        for number in list(self._got.get(robot, ())):
+            self._forgo_copies(self._answers[number])
+            if self._byte_shares.fits(robot, held):
+                return True
+        return False
+
+    def _forgo_copies(self, answer: _Answer) -> None:
+        self._stats.dropped["answer_copies_unsent"] += len(answer.waiting)
+        self._remove(answer)
+
+    # -- what goes out --------------------------------------------------------------------------------------------
+
+    def on_room(self, now: float) -> None:
+        """Messages ended: what waits may find room."""
+        robots: dict[NodeName, None] = {}
+        for robot, request_id in self._outbox.take_answers_over():
+            robots[robot] = None
+            for answer in self._of.get(robot, {}).get(request_id, [])[:]:
+                if answer.sent and answer.waiting:
+                    self._got.setdefault(robot, {})[answer.number] = None
+                elif answer.sent:
+                    self._remove(answer)
+        robots.update(dict.fromkeys(islice(self._lines, ROBOTS_AT_ONCE)))
+        for robot in robots:
+            self._use_room(robot, now)
+
+    def _use_room(self, robot: NodeName, now: float) -> None:
+        lines = self._lines.get(robot)
+        if lines is None:
+            return
+        self._lines.move_to_end(robot)
+        for line in lines:
+            while (number := line.firsts.first(now)) is not None:
+                answer = self._answers[number]
+                if not self._outbox.has_room(robot, answer.size):
+                    break
+                line.firsts.went(number)
+                self._send(answer, self._best_copy(answer))
+                self._line_up_copies(answer, answer.waiting)
+            while not len(line.firsts) and (key := line.copies.first(now)) is not None:
+                answer = self._answers[key[0]]
+                if not self._outbox.has_room(robot, answer.size):
+                    break
+                line.copies.went(key)
+                self._send(answer, key[1])
+        self._forget_lines(robot)
+
+    def _best_copy(self, answer: _Answer) -> int:
+        """Return the copy to which a large answer goes first: by a path that is up and has the least to carry."""
+
+        def load(copy: int) -> tuple[bool, int]:
+            path = answer.waiting[copy]
+            return self._routes.state(path) is not PathState.UP, self._outbox.sent_over(path)
+
+        return min(answer.waiting, key=load) if answer.lane is Lane.LARGE else next(iter(answer.waiting))
+
+    def _send(self, answer: _Answer, copy: int) -> None:
+        reply = answer.reply
+        path = answer.sent[copy] = answer.waiting.pop(copy)
+        self._forget_got(answer)
+        if self._routes.state(path) is PathState.DOWN:
+            path = self._routes.best_to(path.peer) or path
+        rule = self._rules.find(reply.service)
+        self._outbox.send(
+            path,
+            encode_message(replace(reply.message, copy=copy)),
+            priority=reply.priority,
+            deadline=reply.deadline,
+            expires=reply.expires,
+            fec=rule.fec if rule else None,
+            answers=answer.request_id,
+            siblings=answer.messages if answer.lane is Lane.LARGE and not is_race(answer.request_id) else None,
+        )
+
+    def _line_up_copies(self, answer: _Answer, copies: Iterable[int]) -> None:
+        reply = answer.reply
+        for copy in copies:
+            line = self._lines_of(answer).copies
+            line.add((answer.number, copy), reply.priority, reply.deadline, answer.size)
+
+    def _lines_of(self, answer: _Answer) -> _Lines:
+        lines = self._lines.get(answer.robot)
+        if lines is None:
+            lines = self._lines[answer.robot] = tuple(_Lines() for _ in Lane)
+        return lines[answer.lane]
+
+    def _forget_lines(self, robot: NodeName) -> None:
+        if not any(map(len, self._lines.get(robot, ()))):
+            self._lines.pop(robot, None)
+
+    # -- what ends otherwise --------------------------------------------------------------------------------------
+
+    def drop(self, robot: NodeName, request_id: RequestId) -> None:
+        """The robot called this request off: what is unsent of its answers stays here."""
+        for answer in self._of.get(robot, {}).get(request_id, [])[:]:
+            self._remove(answer)
+        self._outbox.drop_answers(robot, request_id)
+
+    def drop_robot(self, robot: NodeName) -> list[Step]:
+        """The robot's session is over, and so is what was on its way there. Returns what lets go of it."""
+        self._lines.pop(robot, None)  # at once: letting go makes room, which nothing of it is to take
+        return in_groups(self._remove, chain.from_iterable(self._of.get(robot, {}).values()))
+
+    def _remove(self, answer: _Answer) -> None:
+        if self._answers.pop(answer.number, None) is None:
+            return
+        robot, request_id = answer.robot, answer.request_id
+        self._number_shares.give_back(robot)
+        self._byte_shares.give_back(robot, answer.held)
+        self._forget_got(answer)
+        answer.messages.clear()
+        of_robot = self._of[robot]
+        of_robot[request_id].remove(answer)
+        if not of_robot[request_id]:
+            del of_robot[request_id]
+            if not of_robot:
+                del self._of[robot]
+        if answer.waiting:
+            line = self._lines_of(answer)
+            line.firsts.remove(answer.number)
+            for copy in answer.waiting:
+                line.copies.remove((answer.number, copy))
+            self._forget_lines(robot)
+
+    def _forget_got(self, answer: _Answer) -> None:
+        got = self._got.get(answer.robot)
+        if got is not None:
+            got.pop(answer.number, None)
+            if not got:
+                del self._got[answer.robot]
+
+    # -- time -----------------------------------------------------------------------------------------------------
+
+    def _arm(self, at: float, number: int) -> None:
+        heapq.heappush(self._timers, (at, number))
+        if len(self._timers) > 2 * len(self._answers) + TIMER_SLACK:
+            self._timers = [timer for timer in self._timers if timer[1] in self._answers]
+            heapq.heapify(self._timers)
+
+    def next_timer(self) -> float | None:
+        """When `handle_timer` is wanted."""
+        while self._timers and self._timers[0][1] not in self._answers:
+            heapq.heappop(self._timers)
+        return self._timers[0][0] if self._timers else None
+
+    def handle_timer(self, now: float, backlog: Backlog) -> None:
+        """Give up what is of no use any more, and say so of answers of which nothing has left."""
+        while self._timers and self._timers[0][0] <= now and backlog.allows(now):
+            answer = self._answers.get(heapq.heappop(self._timers)[1])
+            if answer is not None:
+                self._judge(answer, now)
+
+    def _judge(self, answer: _Answer, now: float) -> None:
+        robot, request_id = answer.robot, answer.request_id
+        if answer.sent and not self._outbox.carries_answer(robot, request_id):
+            self._forgo_copies(answer)
+        elif answer.reply.expires <= now:
+            if not answer.sent:
+                self._stats.dropped["answer_unsent"] += 1
+            self._remove(answer)
+        elif self._outbox.answer_has_begun(robot, request_id):
+            self._arm(answer.reply.expires, answer.number)
+        else:
+            self._stats.dropped["answer_unsent"] += 1
+            self.drop(robot, request_id)
+            self.send(self._refusals(answer), now)
+
+    def _refusals(self, answer: _Answer) -> list[Reply]:
+        refusal = self._refusal(answer, "nothing of it could leave until its time was nearly over")
+        return [
+            replace(refusal, waiter=Waiter(path, copy), message=replace(refusal.message, copy=copy))
+            for copy, path in {**answer.sent, **answer.waiting}.items()
+        ]

@@ -1,0 +1,31 @@
+"""Which servers requests go to at present: links are told, so that the paths to them do not rest."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+
+ATTEND_EVERY_S = 0.5
+"""While requests come, links are told this often: as often as a path in use is probed."""
+
+
+class Attention:
+    """The servers that links were told of a moment ago."""
+
+    __slots__ = ("_told", "_until")
+
+    def __init__(self, now: float) -> None:
+        self._told: frozenset[NodeName] = frozenset()
+        self._until = now
+
+    def needs(self, servers: frozenset[NodeName], now: float) -> bool:
+        """A request goes to some of these servers: whether links must be told."""
+        if now >= self._until:
+            self._told = frozenset()
+            self._until = now + ATTEND_EVERY_S
+        if servers <= self._told:
+            return False
+        self._told |= servers
+        return True

@@ -1,0 +1,74 @@
+"""Cloud side: copies that were refused although their requests have not run.
+
+Who sent such a copy may go to another server with the request, as it certainly did not run. The same copy may come once
+more, cut anew as another message, when the server would take it: then it is refused again. Another copy of the request
+is sent only by who knows what became of all the others: it may run.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import TYPE_CHECKING, NamedTuple
+
+from sidecar.core.shares import Shares
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+    from sidecar.core.events import RejectReason, RequestId
+    from sidecar.core.stats import EngineStats
+
+MAX_REFUSED_COPIES = 65_536
+"""Copies remembered; one robot may fill half: 500 refused copies a second for a minute. What is not remembered may run
+if it comes once more, and somewhere else besides."""
+FORGOTTEN_AT_ONCE = 128
+"""Copies forgotten in one call: less than a millisecond."""
+
+
+class RefusedCopy(NamedTuple):
+    """A copy by its robot, its request and its number."""
+
+    robot: NodeName
+    request_id: RequestId
+    copy: int
+
+
+class RefusedCopies:
+    """Which copies were refused, and why."""
+
+    __slots__ = ("_forget_at", "_reasons", "_shares", "_stats")
+
+    def __init__(self, stats: EngineStats) -> None:
+        self._stats = stats
+        self._shares = Shares(MAX_REFUSED_COPIES)
+        self._reasons: dict[RefusedCopy, tuple[RejectReason, str]] = {}
+        self._forget_at: list[tuple[float, RefusedCopy]] = []
+        """A heap."""
+
+    def __len__(self) -> int:
+        return len(self._reasons)
+
+    def add(self, copy: RefusedCopy, reason: RejectReason, text: str, forget_at: float, now: float) -> None:
+        """This copy is refused. It cannot come any more from `forget_at` on."""
+        self._forget_old(now)
+        if copy in self._reasons:
+            return
+        if not self._shares.fits(copy.robot):
+            self._stats.dropped["refused_copies_full"] += 1
+            return
+        self._shares.take(copy.robot)
+        self._reasons[copy] = reason, text
+        heapq.heappush(self._forget_at, (forget_at, copy))
+
+    def why(self, copy: RefusedCopy, now: float) -> tuple[RejectReason, str] | None:
+        """Return why this copy was refused; None when it was not."""
+        self._forget_old(now)
+        return self._reasons.get(copy)
+
+    def _forget_old(self, now: float) -> None:
+        """Those of a burst, the rest the next times: what stays longer is refused longer, though it cannot come."""
+        for _ in range(FORGOTTEN_AT_ONCE):
+            if not self._forget_at or self._forget_at[0][0] > now:
+                return
+            copy = heapq.heappop(self._forget_at)[1]
+            del self._reasons[copy]
+            self._shares.give_back(copy.robot)

@@ -1,0 +1,256 @@
+"""How many requests a local server should have at once, found from what its answers take.
+
+What is sent too early stands in the server's queue, first in, first out, where nothing that is more urgent can overtake
+it. What is sent too late lets the server idle for the way to the sidecar and back. So the number is found by Little's
+law: with `n` requests at the server at a time that take `r` seconds each, where a request alone takes `a`, it does the
+work of `n * a / r` requests alone. Of a server that takes one after the other, that is 1, and a little more where the
+way there takes a part of `a`; of one with four threads 4. As long as it keeps pace with `n`, twice as many are tried.
+
+Means are compared, not extremes: service times may vary. `a` is measured where requests are too few to meet. Under load
+the server is emptied for that now and then, and when it seems to have fallen behind: either its work became longer, or
+its threads fewer. A server whose threads share one processor gains nothing from several at once, and counts as one that
+takes one after the other.
+
+Apart from that, answers out of order prove that several were in work at one moment, as requests are taken in order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+FIRST_LIMIT = 2
+"""One in work and one that is there when that is done."""
+SAFE_SIZE = 8
+"""Requests that a server's queue surely holds: rmw's default depth is 10, but the server may have other clients."""
+MOST_AT_ONCE = 32
+"""Also what DDS keeps of requests and of answers, and so what a killed server costs: until its lease ends, about 20 s,
+no request counts as delivered to all, and DDS keeps as many buffers until the client goes, each as long as the longest
+of those requests."""
+WAITING_S = 0.005
+"""Work that may wait at the server, for it not to idle on the way to the sidecar and back: on a busy host a few times
+the 0.2 to 0.5 ms of a call. At least one request waits ..."""
+LONG_S = 0.1
+"""... unless requests take longer than this alone: then the server idles for a few per cent of its time at most, and
+order is worth more."""
+KEEPS_PACE = 0.4
+"""With no more than so many requests waiting at the server as it seems, more at once are tried: twice as many until it
+falls behind for the first time, then one more."""
+ROUNDING = 0.25
+"""Of a server that works on one at once, the law gives a little more by chance."""
+LEAST_ROUND = 4
+"""Answers by which the limit is judged, or as many as the limit. Once it fell behind, twice as many of either."""
+ALONE_WEIGHT = 0.25
+"""Of the newest request that was alone, in their mean."""
+USUAL_WEIGHT = 0.125
+"""Of the newest answer, in the mean of what all take."""
+ALONE_FOR_S = 0.02
+"""Requests are sent one by one until they took this long together, one at least."""
+STALE_AFTER, STALE_S, STALE_TIMES = 32, 1.0, 16
+"""After so many answers, so long, and so many times what a request alone takes, that may have changed: it is measured
+again before the limit is lowered for it. The times bound what that costs."""
+ALONE_AGAIN_S = 10.0
+FIRST_ROUNDS, MOST_ROUNDS = 8, 64
+"""The time alone is measured again after so long and so many answers for each request at once; these double each time.
+That costs a few per cent of the work of a server with many threads, nothing of one that takes one after the other."""
+FIRST_TRY_AFTER, LAST_TRY_AFTER = 4, 64
+"""Answers to single requests after which two at once are tried again; they double each time."""
+REMEMBERED = 64
+"""Answers that are looked at for overlaps, and requests whose times are known: twice MOST_AT_ONCE."""
+
+
+@dataclass(slots=True)
+class _Sent:
+    at: float
+    out: int
+    """How many the server may have had by then, this one included."""
+    alone: bool
+    """Nothing else was sent while it was there; what was overtaken, which may be in work for long, does not count."""
+
+
+class ServerCapacity:
+    """What is known of one server. Request numbers ascend; times are seconds."""
+
+    __slots__ = (
+        "_alone_at",
+        "_answers",
+        "_calibrated_s",
+        "_calibrating",
+        "_events",
+        "_fell_behind",
+        "_highest",
+        "_in_work",
+        "_limit",
+        "_only",
+        "_overtaken",
+        "_round",
+        "_round_out",
+        "_round_s",
+        "_rounds",
+        "_sent",
+        "_singles",
+        "_try_after",
+        "alone_s",
+        "overlap",
+        "usual_s",
+    )
+
+    def __init__(self, first: int = FIRST_LIMIT) -> None:
+        self._limit = first
+        self.alone_s = 0.0
+        """What a request alone takes, the hop included; 0: not known yet."""
+        self.usual_s = 0.0
+        """What one takes as things are, the wait in the server's queue included; 0: not known yet."""
+        self.overlap = 1
+        """The most requests that were in work at one moment of late, as answers out of order prove."""
+        self._fell_behind = False
+        self._calibrating = True
+        self._calibrated_s = 0.0
+        self._alone_at = 0.0
+        self._answers = 0
+        """Since a request was alone for the last time."""
+        self._round = self._round_out = 0
+        self._round_s = 0.0
+        self._rounds = FIRST_ROUNDS
+        self._singles = 0
+        """Answers since the limit is 1."""
+        self._try_after = FIRST_TRY_AFTER
+        self._sent: dict[int, _Sent] = {}
+        self._only: int | None = None
+        """The request that is alone at the server."""
+        self._highest = -1
+        self._events = 0
+        self._in_work: deque[int] = deque(maxlen=REMEMBERED)
+        """For each of the last answers, how many requests are known to have been in work just before it."""
+        self._overtaken: dict[int, int] = {}
+        """Unanswered requests with a lower number than one that is answered, by the answer that first told."""
+
+    @property
+    def limit(self) -> int:
+        """How many requests the server should have at once, the overtaken among them."""
+        return 1 if self._calibrating else min(self._limit, self.most)
+
+    @property
+    def most(self) -> int:
+        """How many it can have without the risk that one is pushed out, also when it is busy with something else."""
+        return min(max(SAFE_SIZE, self.overlap + FIRST_LIMIT), MOST_AT_ONCE)
+
+    @property
+    def overtaken(self) -> int:
+        """Requests that are in work although later ones are answered; of a server that works on one at once, lost."""
+        return min(len(self._overtaken), self.overlap - 1)
+
+    def given_up(self, number: int) -> None:
+        """Nobody waits for this request any more."""
+        self._sent.pop(number, None)
+        self._overtaken.pop(number, None)
+
+    def sent(self, number: int, unseen: int, now: float) -> None:
+        """A request was sent; with it the server has so many that it was not seen to have taken."""
+        if self._only is not None and self._only in self._sent:
+            self._sent[self._only].alone = False
+        self._only = number if unseen == 1 else None
+        self._sent[number] = _Sent(now, unseen + self.overtaken, alone=unseen == 1)
+        if len(self._sent) > REMEMBERED:
+            del self._sent[next(iter(self._sent))]
+
+    def answered(self, number: int, now: float) -> None:
+        """The server answered one of them; what it answers twice counts once."""
+        sent = self._sent.pop(number, None)
+        if sent is None:
+            return
+        self._note_order(number)
+        took_s = max(now - sent.at, 1e-6)
+        self.usual_s += (took_s - self.usual_s) * (USUAL_WEIGHT if self.usual_s else 1.0)
+        self._answers += 1
+        if sent.alone:
+            self._was_alone(took_s, now)
+        elif sent.out > 1 and not self._calibrating:
+            self._round += 1
+            self._round_out += sent.out
+            self._round_s += took_s
+            if self._round >= max(LEAST_ROUND, self._limit) * (2 if self._fell_behind else 1):
+                self._judge(now)
+
+    def _was_alone(self, took_s: float, now: float) -> None:
+        before = self.alone_s or took_s
+        self.alone_s = before + (took_s - before) * ALONE_WEIGHT
+        self._alone_at = now
+        self._answers = 0
+        if self._calibrating:
+            self._calibrated_s += took_s
+            self._calibrating = self._calibrated_s < ALONE_FOR_S
+            return
+        if self._limit == 1:
+            self._singles += 1
+            if self._singles >= self._try_after:
+                self._try_after = min(2 * self._try_after, LAST_TRY_AFTER)
+                self._set_limit(FIRST_LIMIT)
+
+    def _judge(self, now: float) -> None:
+        """Set the limit by the last round of requests that were not alone."""
+        out = self._round_out / self._round
+        at_once = self._round_out * self.alone_s / self._round_s
+        if out - at_once > KEEPS_PACE:
+            self._fell_behind = True
+            wanted = self._wanted(at_once)
+            if out <= self._limit - 1:
+                wanted = max(wanted, min(math.ceil(out), self._limit))  # more were never there: little is known
+            if wanted < self._limit and self._is_stale(now):
+                self._calibrate()
+            else:
+                self._set_limit(wanted)
+        elif out > self._limit - 1:
+            more = self._limit + 1 if self._fell_behind else 2 * self._limit
+            self._set_limit(min(more, self.most))
+        else:
+            self._set_limit(self._limit)
+        if now - self._alone_at >= ALONE_AGAIN_S and self._answers >= self._rounds * self._limit:
+            self._rounds = min(2 * self._rounds, MOST_ROUNDS)
+            self._calibrate()
+
+    def _wanted(self, at_once: float) -> int:
+        """How many to have at a server that does the work of so many requests at once."""
+        wanted = max(1, math.ceil(at_once - ROUNDING))
+        if self.alone_s < LONG_S:
+            wanted += math.ceil(at_once * WAITING_S / self.alone_s)
+        if 1 < self.overlap <= 2 * at_once:
+            wanted = max(wanted, self.overlap + 1)
+        return min(wanted, self.most)
+
+    def _is_stale(self, now: float) -> bool:
+        age_s = now - self._alone_at
+        return self._answers > STALE_AFTER and age_s > max(STALE_S, STALE_TIMES * self.alone_s)
+
+    def _calibrate(self) -> None:
+        self._calibrating = True
+        self._calibrated_s = 0.0
+        self._set_limit(self._limit)
+
+    def _set_limit(self, limit: int) -> None:
+        self._limit = limit
+        self._singles = 0
+        self._round = self._round_out = 0
+        self._round_s = 0.0
+
+    # -- overlaps -------------------------------------------------------------------------------------------------
+
+    def _note_order(self, number: int) -> None:
+        """Count what was in work together: a request is from when it is overtaken until it is answered."""
+        event = self._events
+        self._events += 1
+        self._in_work.append(1)
+        since = self._overtaken.pop(number, None)
+        if since is not None:
+            oldest = self._events - len(self._in_work)
+            for index in range(max(since - oldest, 0), len(self._in_work) - 1):
+                self._in_work[index] += 1
+        elif number > self._highest:
+            self._highest = number
+            for earlier in self._sent:
+                if earlier < number:
+                    self._overtaken.setdefault(earlier, event)
+        self.overlap = max(self._in_work)
+        while self._overtaken and next(iter(self._overtaken.values())) < self._events - REMEMBERED:
+            del self._overtaken[next(iter(self._overtaken))]
