@@ -82,6 +82,7 @@ class CongestionController:
 
     __slots__ = (
         "_believed_before",
+        "_collapsed_at",
         "_drained_at",
         "_first_window",
         "_phase_rounds",
@@ -115,6 +116,7 @@ class CongestionController:
         self._probe_credit = 0
         self._was_down = False
         self._silent_since = 0.0
+        self._collapsed_at = float("-inf")
         self._rate_before_silence = 0.0
         self._search = BandwidthSearch()
         self._unproven_bytes: float | None = None
@@ -269,8 +271,8 @@ class CongestionController:
     def on_lost(self, lost_bytes: int, sent_at: float, in_flight: int, now: float) -> None:
         """These bytes were lost, the newest of them sent at `sent_at`; `in_flight` is what is left."""
         rtt = self._rtt
-        if rtt is None:
-            return
+        if rtt is None or sent_at <= self._collapsed_at:
+            return  # that was answered by beginning again with the least, and says nothing of what is sent since
         # What start-up overflows fills in one round: nothing stands yet.
         queued = self.phase is Phase.STARTUP and self._stands(self._round_max_rtt, rtt)
         queued = queued or self.ceiling.meets_queue(rtt)
@@ -290,7 +292,7 @@ class CongestionController:
         self._probe_credit = 2 * DATAGRAM_BYTES
         rtt = self._rtt
         if rtt is not None and now - self._silent_since > PERSISTENT_FACTOR * rtt.probe_timeout(END_HOST_S):
-            self._collapse(rtt)
+            self._collapse(rtt, now)
 
     def on_path_down(self) -> None:
         """The path is dead."""
@@ -375,8 +377,9 @@ class CongestionController:
         self._enter(Phase.CRUISE)
         self._search.begin_cycle()
 
-    def _collapse(self, rtt: RttEstimator) -> None:
+    def _collapse(self, rtt: RttEstimator, now: float) -> None:
         """Persistent congestion: begin again with the least (RFC 9002 section 7.6.2), unless it was an outage."""
+        self._collapsed_at = now
         self._rate_before_silence = max(self._rate_before_silence, self.rate.best)
         self.rate.restart(MIN_WINDOW_BYTES / max(rtt.smoothed, 1e-3))
         self.ceiling.forget()

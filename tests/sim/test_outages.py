@@ -89,3 +89,40 @@ def test_with_one_path_back_the_others_to_its_peer_are_sought_at_once(seed: int)
             break
         mesh.run(0.001)
     assert back[1] - back[0] < FIRST_PROBE_S + 0.03  # a probe at once, but no sooner than that after the last; its way
+
+
+@pytest.mark.audit("dp-16")
+@pytest.mark.parametrize("trouble", ["blackout", "shorter packets"])
+def test_what_was_lost_in_a_silence_does_not_end_the_start_after_it(trouble: str) -> None:
+    """A handover of 0.2 s, or a route that takes shorter packets from now on, in the middle of 4 MB at 60 Mbit/s.
+
+    The sender begins again with the least, and doubles. What it had under way before is found lost only then.
+    """
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", rules=(rule(lifetime_s=60.0, deadline_s=20.0),))
+    cloud = mesh.cloud("cloud-a")
+    cloud.answer = lambda payload: payload[:4]
+    wires = mesh.both_ways("robot.wlan0", "cloud-a.eth0")
+    for wire in wires:
+        wire.bytes_per_s, wire.buffer_bytes, wire.mtu = 7.5e6, QUEUE, 1500
+    mesh.push_views()
+    mesh.run(3.0)
+    mapped(mesh, robot, ("wlan0", "cloud-a"))
+    for _ in range(10):
+        robot.submit(bytes(100_000))
+        mesh.run(0.2)
+
+    def change(**to: object) -> None:
+        for wire in wires:
+            for name, value in to.items():
+                setattr(wire, name, value)
+
+    if trouble == "blackout":
+        mesh.at(0.25, lambda: change(cut=True))
+        mesh.at(0.45, lambda: change(cut=False))
+    else:
+        mesh.at(0.25, lambda: change(mtu=1300))
+    robot.submit(bytes(4_000_000))
+    mesh.run(4.0)
+    # 0.55 s of sending, 0.2 s of silence; half a second to begin again; it took 1.8 s when start-up ended early.
+    assert robot.responses()[-1].elapsed_s < 1.5
