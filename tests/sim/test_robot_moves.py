@@ -1,4 +1,4 @@
-"""What befalls a robot as a whole: its host sleeps, and its NATs may have forgotten it meanwhile."""
+"""What befalls a robot as a whole: its NATs forget it in the middle of a large message, its host sleeps."""
 
 from __future__ import annotations
 
@@ -10,6 +10,37 @@ from tests.sim.nat import NatMesh
 from tests.sim.test_mesh import mapped
 
 pytestmark = pytest.mark.audit("dp-16")
+
+BYTES = 6_000_000
+RATE = 6.25e6
+QUEUE = 1_200_000.0
+
+
+def transfer_s(*rebinds_s: float) -> float:
+    """How long BYTES take both ways over one carrier while its NAT rebinds at these seconds; it runs once."""
+    mesh = NatMesh(1)
+    robot = mesh.robot("wlan0", rules=(rule(lifetime_s=30.0, deadline_s=10.0),))
+    cloud = mesh.cloud("cloud-a")
+    cloud.answer = lambda _payload: bytes(BYTES)
+    for wire in mesh.both_ways("robot.wlan0", "cloud-a.eth0"):
+        wire.bytes_per_s, wire.buffer_bytes, wire.mtu = RATE, QUEUE, 1500
+    mesh.push_views()
+    mesh.run(3.0)
+    mapped(mesh, robot, ("wlan0", "cloud-a"))
+    for moment in rebinds_s:
+        mesh.at(moment, lambda: mesh.rebind("robot.wlan0"))
+    robot.submit(bytes(BYTES))
+    mesh.run(6.0)
+    answered = robot.responses()
+    assert [len(answer.payload) for answer in answered] == [BYTES]
+    assert len(cloud.executed) == 1
+    assert mesh.refused or not rebinds_s
+    return answered[0].elapsed_s
+
+
+def test_a_nat_that_rebinds_in_the_middle_of_a_large_message_both_ways() -> None:
+    undisturbed = transfer_s()
+    assert transfer_s(0.5, 1.5, 1.8) < undisturbed + 1.5
 
 
 @pytest.mark.parametrize("rebinds", [False, True])
