@@ -88,6 +88,7 @@ class Policer:
         "_delivered",
         "_dry",
         "_fates",
+        "_found_share",
         "_overrun_at",
         "_paused",
         "_random",
@@ -113,6 +114,8 @@ class Policer:
         self._fates = _Fates(float("-inf"))
         self._tried_share: float | None = None
         """What was lost before the trial under way; None: there is none."""
+        self._found_share = 0.0
+        """What was lost before the trial that found the policer."""
         self._usual = 0.0
         """What is lost below the token rate."""
         self._random = 0.0
@@ -177,11 +180,13 @@ class Policer:
         `queued`: it may have met a queue, which is another's affair.
         """
         self._rtt_s = rtt_s
+        trial = self._tried_share is not None
+        if trial or not queued:  # a loss that the lower rate did not prevent is one, whatever it met
+            self._fates.note(size, sent_at, lost=True)
         if queued:
             self._span = None
             return False
-        self._fates.note(size, sent_at, lost=True)
-        if self._tried_share is not None or (self._token_rate and sent_at <= self._fates.since):
+        if trial or (self._token_rate and sent_at <= self._fates.since):
             return False
         if self._token_rate and self._gain > 1:
             self._on_overrun(sent_at, now)
@@ -249,8 +254,9 @@ class Policer:
         share = self._fates.share
         self._fates = _Fates(now)
         if share >= RANDOM * tried_share:
-            self._token_rate = self._before
-            self._random, self._rejected_at = tried_share, now
+            # As much as before a policer was thought to be found: then that was chance.
+            self._token_rate = 0.0 if share >= RANDOM * self._found_share else self._before
+            self._random, self._rejected_at = max(tried_share, share), now
             self._tried_share = None
         elif share > POLICED * tried_share:
             sent_at, _ = self._acks[-1]
@@ -260,6 +266,8 @@ class Policer:
         else:
             self._tried_share = None
             self._random = 0.0
+            if not self._before:
+                self._found_share = tried_share
             self.was_found = True
 
     def _on_overrun(self, sent_at: float, now: float) -> None:

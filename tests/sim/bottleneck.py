@@ -90,7 +90,7 @@ class Flow:
         self.largest = -1
         self.delivered = 0
         self.rtt = RttEstimator()
-        self._checked_at = 0.0
+        self._heard_at = 0.0
         self._armed = False
 
     @property
@@ -103,7 +103,7 @@ class Flow:
         self.net.carry(SIZE, lambda: self.acked(number))
 
     def acked(self, number: int) -> None:
-        now = self.net.now
+        now = self._heard_at = self.net.now
         sent_at = self.sent.pop(number, None)
         self.largest = max(self.largest, number)
         if sent_at is not None:
@@ -121,8 +121,8 @@ class Flow:
     def watch(self) -> None:
         """Give up what is in flight when nothing was heard for long."""
         if self.sent:
-            oldest = next(iter(self.sent.values()))
-            if self.net.now - oldest > self.rtt.probe_timeout(0.005) + 0.1:
+            since = max(self._heard_at, next(iter(self.sent.values())))
+            if self.net.now - since > self.rtt.probe_timeout(0.005) + 0.1:
                 self.lose(list(self.sent))
         self.pump()
         self.net.at(self.net.now + 0.05, self.watch)

@@ -85,6 +85,29 @@ def test_losses_that_do_not_end_at_a_lower_rate_are_no_policer(every: int) -> No
     assert not sender.policer.was_found
 
 
+@pytest.mark.audit("dp-9")
+def test_losses_of_a_trial_count_though_they_meet_a_queue() -> None:
+    sender = Sender(2 * TOKENS, every=6)
+    while sender.policer.rate is None:
+        sender.run(0.01)
+    sender.run(5.0, queued=True)
+    assert sender.policer.rate is None
+    assert not sender.policer.was_found
+
+
+@pytest.mark.audit("dp-9")
+def test_a_policer_found_by_chance_is_given_up_when_as_much_is_lost_as_before() -> None:
+    sender = Sender(2 * TOKENS, every=6)
+    while sender.policer.rate is None:
+        sender.run(0.01)
+    sender.every = 10**9
+    while not sender.policer.was_found:
+        sender.run(0.01)
+    sender.every = 6
+    sender.run(1.0)
+    assert sender.policer.rate is None
+
+
 def test_a_few_losses_are_no_reason_for_a_trial() -> None:
     sender = Sender(2 * TOKENS, every=15)
     sender.run(10.0)
