@@ -28,6 +28,9 @@ MAX_WINDOW_BYTES = 16 * 1024 * 1024
 """Never more in flight: 1 Gbit/s over 134 ms."""
 MAX_BURST_BYTES = 64 * 1024
 """Largest burst between two pauses: one segmentation offload."""
+UNPROVEN_S = 0.005
+"""Of a rate that nothing confirmed of late, the first burst takes what it carries in this time, and no less than that of
+an unknown path: after a fall to a fiftieth, a quarter of a second in the modem. Its acknowledgements prove the rate."""
 BURST_S = 0.001
 """A burst is what the path carries in this time, where that is more than two datagrams."""
 LATE_S = 0.025
@@ -148,15 +151,11 @@ class CongestionController:
         return max(int(room), DATAGRAM_BYTES)
 
     def _validate(self, now: float) -> None:
-        """Rely on the rate as far as it was confirmed of late, and look for more (RFC 7661; RFC 9002 section 7.8).
-
-        What an unknown path gets may leave in any case.
-        """
-        reliance = self.rate.reliance(now)
-        if reliance < 1 and self.rate.best:
+        """Let a first burst prove a rate that nothing confirmed of late (RFC 7661; RFC 9002 section 7.8)."""
+        if self.rate.best and not self.rate.is_confirmed(now):
             if self._unproven_bytes is None and self.phase is Phase.CRUISE:
                 self._look_for_more()
-            self._unproven_bytes = max(float(INITIAL_WINDOW_BYTES), reliance * self._model_window())
+            self._unproven_bytes = max(float(INITIAL_WINDOW_BYTES), UNPROVEN_S * self.rate.best)
 
     @property
     def _allowance_s(self) -> float:
@@ -248,7 +247,7 @@ class CongestionController:
         held_back = held_back or self.phase is Phase.PROBE_RTT or self._ceiling_binds(rtt)
         self.policer.on_acked(sample.acked_bytes, sample.sent_at)
         round_over = self.rate.on_acked(sample.acked_bytes, sample.sent_at, now, limit, held_back=held_back)
-        if self.rate.reliance(now) >= 1:
+        if self.rate.is_confirmed(now):
             self._unproven_bytes = None
         elif self._unproven_bytes is not None and not self._stands(sample.rtt_s or float("inf"), rtt):
             self._unproven_bytes += sample.acked_bytes  # as in slow start, where acknowledgements come in clumps

@@ -25,11 +25,8 @@ CONFIRMS = 0.5
 """A train at this share of the rate confirms it: trains are paced, in some rounds at three quarters of the rate."""
 PROVES_BYTES = 2 * MIN_ROUND_BYTES
 """The spacing of so much confirms a rate, or takes the place of one that nothing confirmed for long."""
-FRESH_S = 10.0
-"""A rate is relied upon for so long after it was last confirmed. With 3 s, a path that is taken only when the other is
-poor begins too low: on a recorded drive, `single` then misses 124 of 600 requests instead of 116 ..."""
-HALF_LIFE_S = 1.0
-"""... and half as much with each further time of this length."""
+FRESH_S = 3.0
+"""A rate is relied upon for so long after it was last confirmed."""
 
 
 class DeliveryRate:
@@ -116,7 +113,7 @@ class DeliveryRate:
         rate = min(self._bytes / max(acked_s, sent_s, 1e-9), limit)
         if rate >= CONFIRMS * self.settled or acked_s <= LIMITED_FACTOR * sent_s:
             self.confirmed_at = now  # as fast as ever, or as fast as it was sent
-        elif self.reliance(now) < 1:
+        elif not self.is_confirmed(now):
             self._rounds.clear()
             self._rounds.append(rate)
             self.confirmed_at = now
@@ -128,10 +125,9 @@ class DeliveryRate:
         self._rate = 0.0
         self._limited = True
 
-    def reliance(self, now: float) -> float:
-        """How far the best rate may be relied upon, 0 to 1: the path may have changed since it was confirmed."""
-        stale_s = now - self.confirmed_at - FRESH_S
-        return 1.0 if stale_s <= 0 else 0.5 ** (stale_s / HALF_LIFE_S)
+    def is_confirmed(self, now: float) -> bool:
+        """Whether the best rate may be relied upon: the path may have changed since it was confirmed."""
+        return now - self.confirmed_at <= FRESH_S
 
     def _close(self, *, sender: bool) -> bool:
         """End the round; `sender`: for want of data. A round that the sender limited can only raise the rate."""
