@@ -29,7 +29,7 @@ MAX_WINDOW_BYTES = 16 * 1024 * 1024
 MAX_BURST_BYTES = 64 * 1024
 """Largest burst between two pauses: one segmentation offload."""
 UNPROVEN_S = 0.005
-"""Of a rate that nothing confirmed of late, the first burst takes what it carries in this time, and no less than that of
+"""Where nothing confirmed the rate for some time, the first burst is what it carries in this time, and no less than on
 an unknown path: after a fall to a fiftieth, a quarter of a second in the modem. Its acknowledgements prove the rate."""
 BURST_S = 0.001
 """A burst is what the path carries in this time, where that is more than two datagrams."""
@@ -151,7 +151,7 @@ class CongestionController:
         return max(int(room), DATAGRAM_BYTES)
 
     def _validate(self, now: float) -> None:
-        """Let a first burst prove a rate that nothing confirmed of late (RFC 7661; RFC 9002 section 7.8)."""
+        """Let a first burst prove a rate that nothing confirmed for some time (RFC 7661; RFC 9002 section 7.8)."""
         if self.rate.best and not self.rate.is_confirmed(now):
             if self._unproven_bytes is None and self.phase is Phase.CRUISE:
                 self._look_for_more()

@@ -53,6 +53,8 @@ BURST_S = 0.025
 LEAST_BURST = 2 * DATAGRAM_BYTES
 """What the rate allows in BURST_S may leave at once at first, as without a policer; half of it whenever losses begin
 below the rate: then the bucket holds less."""
+SMALL_BURST = 16_000
+"""Buckets hold no less (bytes): what goes on being lost with bursts of this is not lost to bursts."""
 CUT = 0.9
 """What is left of the rate then, if the burst is the least already and the rate could not be measured."""
 MAX_REMEMBERED = 64
@@ -219,7 +221,10 @@ class Policer:
                 self._judge(self._tried_share, now)
         elif self._overrun_at is not None:
             if now - self._overrun_at > self._unit_s:
-                self._overrun_at = None  # nothing more was lost
+                if any(train > self._overrun_at for train in self._trains):
+                    self._set(self._token_rate, now, now)  # not enough was asked for to measure more
+                else:
+                    self._overrun_at = None  # nothing more was lost
         elif not dry:
             below = self._gain <= 1
             self._asked_s += elapsed
@@ -253,12 +258,13 @@ class Policer:
     def _judge(self, tried_share: float, now: float) -> None:
         share = self._fates.share
         self._fates = _Fates(now)
-        if share >= RANDOM * tried_share:
+        if share >= RANDOM * tried_share and (not self._before or self.burst <= SMALL_BURST):
             # As much as before a policer was thought to be found: then that was chance.
             self._token_rate = 0.0 if share >= RANDOM * self._found_share else self._before
             self._random, self._rejected_at = max(tried_share, share), now
             self._tried_share = None
         elif share > POLICED * tried_share:
+            self.burst = max(self.burst / 2, LEAST_BURST) if self._before else self.burst
             sent_at, _ = self._acks[-1]
             measured = self._measure(sent_at)
             self._set(min(self._token_rate, measured or self._token_rate), sent_at, now)

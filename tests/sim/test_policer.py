@@ -19,6 +19,9 @@ MBIT = 1e6 / 8
 REQUEST_BYTES = 180_000
 LEARNING_S = 10.0
 """After the first datagram that is dropped."""
+START_BYTES, START_BUCKETS, START_S = 350e3, 2.5, 0.1
+"""Dropped at most until then: start-up doubles as long as the bucket lasts, and learns a round trip later that it is
+empty. This much, and so many times the bucket, and what the tokens allow in so long."""
 
 
 class Outcome(NamedTuple):
@@ -67,6 +70,26 @@ def test_hardly_anything_is_lost_at_nine_tenths_of_the_token_rate(
     rate: float, seconds: float, bucket: float, load: float | None
 ) -> None:
     net = Policed(rate * MBIT, 0.05, bucket)
+    flow = flow_over(net, load)
+    learn(net)
+    assert net.policed < START_BYTES + START_BUCKETS * bucket + START_S * net.token_rate
+    outcome = measure(net, flow, seconds, load)
+    assert outcome.loss < 0.02
+    assert outcome.goodput >= 0.9
+
+
+@pytest.mark.audit("dp-9")
+@pytest.mark.parametrize(
+    ("rate", "bucket", "rtt_s", "full", "load", "seconds"),
+    [(50.0, 16e3, 0.03, 2 / 3, None, 6.0), (1.0, 64e3, 0.08, 1.0, 0.8, 30.0)],
+    ids=["bursts", "pauses"],
+)
+def test_bursts_above_the_bucket_and_pauses_that_fill_it(
+    rate: float, bucket: float, rtt_s: float, full: float, load: float | None, seconds: float
+) -> None:
+    """The first rate found is much too low, then its bursts too large; or no train lasts for a measurement."""
+    net = Policed(rate * MBIT, rtt_s, bucket)
+    net.tokens = full * bucket
     flow = flow_over(net, load)
     learn(net)
     outcome = measure(net, flow, seconds, load)

@@ -122,7 +122,7 @@ def test_a_pause_keeps_the_rate(cruising: Sender) -> None:
 
 
 @pytest.mark.audit("dp-6")
-def test_a_burst_proves_a_rate_that_nothing_confirmed_of_late(cruising: Sender) -> None:
+def test_a_burst_proves_a_rate_that_nothing_confirmed_for_some_time(cruising: Sender) -> None:
     control = cruising.control
     before = control.window
     cruising.run(FRESH_S - RTT_S, sending=False)

@@ -43,6 +43,10 @@ class Sender:
                 self._round = self.now
                 self.policer.end_round(self.now)
 
+    def run_until_tried(self) -> None:
+        while self.policer.rate is None:
+            self.run(0.01)
+
 
 def test_nothing_is_known_at_first() -> None:
     assert Policer().rate is None
@@ -88,8 +92,7 @@ def test_losses_that_do_not_end_at_a_lower_rate_are_no_policer(every: int) -> No
 @pytest.mark.audit("dp-9")
 def test_losses_of_a_trial_count_though_they_meet_a_queue() -> None:
     sender = Sender(2 * TOKENS, every=6)
-    while sender.policer.rate is None:
-        sender.run(0.01)
+    sender.run_until_tried()
     sender.run(5.0, queued=True)
     assert sender.policer.rate is None
     assert not sender.policer.was_found
@@ -98,8 +101,7 @@ def test_losses_of_a_trial_count_though_they_meet_a_queue() -> None:
 @pytest.mark.audit("dp-9")
 def test_a_policer_found_by_chance_is_given_up_when_as_much_is_lost_as_before() -> None:
     sender = Sender(2 * TOKENS, every=6)
-    while sender.policer.rate is None:
-        sender.run(0.01)
+    sender.run_until_tried()
     sender.every = 10**9
     while not sender.policer.was_found:
         sender.run(0.01)
