@@ -166,8 +166,9 @@ def policed(mesh: Mesh, source: str, rate: float, bucket: float) -> Callable[[],
 
 
 @pytest.mark.audit("dp-9")
-def test_requests_get_through_a_policer_and_no_repair_symbols_are_sent_for_what_it_dropped() -> None:
-    mesh, rate, size, hz, seconds = Mesh(1), 10 * MBIT, 200_000, 12.5, 12.0
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_requests_get_through_a_policer_and_no_repair_symbols_are_sent_for_what_it_dropped(seed: int) -> None:
+    mesh, rate, size, hz, seconds = Mesh(seed), 10 * MBIT, 200_000, 12.5, 12.0
     robot = mesh.robot("wlan0", rules=(rule(deadline_s=2.0, lifetime_s=10.0),))
     cloud = mesh.cloud("cloud-a")
     complete = cloud.engine.complete
@@ -182,13 +183,10 @@ def test_requests_get_through_a_policer_and_no_repair_symbols_are_sent_for_what_
     up.bytes_per_s = 20 * rate
     dropped = policed(mesh, "robot.wlan0", rate, 64e3)
     (link,) = robot.links.values()
-    first = 0
     for number in range(int(seconds * hz)):
-        if number == int(2.0 * hz):
-            first = dropped()
         robot.submit(number.to_bytes(4, "big") + bytes(size))
         mesh.run(1 / hz)
     sent = link.stats.datagrams["sent", "data"] + link.stats.datagrams["sent", "repair"]
-    assert dropped() - first < 0.02 * sent
-    assert link.stats.datagrams["sent", "repair"] < 0.06 * sent
-    assert len(robot.responses()) * size / seconds > 0.85 * rate
+    assert dropped() < 0.02 * sent
+    assert link.stats.datagrams["sent", "repair"] < 0.05 * sent
+    assert len(robot.responses()) * size / seconds > 0.88 * rate
