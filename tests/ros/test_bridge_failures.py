@@ -120,7 +120,10 @@ def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.Mo
         node = mesh.cloud._loop.node  # type: ignore[union-attr]  # a started bridge has one
         wait_until(lambda: list(graph.server_endpoints(node, PLAN).values()) == [True], "only the new one")
     wait_until(lambda: len(mesh.link.refusals) == 4, "refusals")
-    assert mesh.link.refusals[0] == (RejectReason.SERVER_LOST, "the server was replaced")
+    # What still stood in the window may have been told before: on a busy machine the new one takes seconds to come up.
+    told = set(mesh.link.refusals)
+    assert (RejectReason.SERVER_LOST, "the server was replaced") in told
+    assert {reason for reason, _ in told} <= {RejectReason.SERVER_LOST, RejectReason.NOT_OFFERED}
     assert mesh.result(mesh.call("/plan"))["answered"] == 1
 
 
