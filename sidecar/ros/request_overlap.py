@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-REMEMBERED = 128
-"""Answers that are looked at: four times what one server has at once."""
+REMEMBERED = 256
+"""Answers that are looked at: eight times what one server has at once ..."""
+IN_ORDER = 64
+"""... unless so many were in order since: then threads have ended."""
 LOST_AFTER = 512
 """What was overtaken by so many answers counts as lost. One thread of 16 may be busy for long with one request."""
 
@@ -22,13 +24,15 @@ LOST_AFTER = 512
 class RequestOverlap:
     """What the last answers of one server prove. Request numbers ascend."""
 
-    __slots__ = ("_events", "_highest", "_in_work", "_overtaken", "most")
+    __slots__ = ("_events", "_highest", "_in_order", "_in_work", "_overtaken", "most")
 
     def __init__(self) -> None:
         self.most = 1
         """The most requests that were in work at one moment."""
         self._highest = -1
         self._events = 0
+        self._in_order = 0
+        """Answers since one that was overtaken was answered."""
         self._in_work: deque[int] = deque(maxlen=REMEMBERED)
         """For each of the last answers, how many requests are known to have been in work just before it."""
         self._overtaken: dict[int, int] = {}
@@ -49,7 +53,9 @@ class RequestOverlap:
         self._events += 1
         self._in_work.append(1)
         since = self._overtaken.pop(number, None)
+        self._in_order += 1
         if since is not None:
+            self._in_order = 0
             oldest = self._events - len(self._in_work)
             for index in range(max(since - oldest, 0), len(self._in_work) - 1):
                 self._in_work[index] += 1
@@ -58,6 +64,9 @@ class RequestOverlap:
             for earlier in unanswered:
                 if earlier < number:
                     self._overtaken.setdefault(earlier, event)
+        if self._in_order == IN_ORDER:
+            self._in_work.clear()
+            self._in_work.append(1)
         self.most = max(self._in_work)
         while self._overtaken and next(iter(self._overtaken.values())) < self._events - LOST_AFTER:
             del self._overtaken[next(iter(self._overtaken))]

@@ -46,6 +46,8 @@ LEAST_ROUND = 4
 """Answers by which the limit is judged, or as many as the limit. Once it fell behind, twice as many of either."""
 ALONE_KEPT = 8
 """Requests that were alone have at least one part of so many in their mean."""
+SURER = 4
+"""Rounds that are waited for if that may show that the limit is right."""
 LEAST_ALONE = 4
 """Fewer may not show how much they vary."""
 SURE = 2.0
@@ -179,10 +181,14 @@ class ServerCapacity:
             self._was_alone(took_s, now)
         elif sent.out > 1 and not self._calibrating and not in_trial:
             self._round.add(took_s, sent.out)
-            if self._round.count >= max(LEAST_ROUND, self._limit) * (2 if self._fell_behind else 1):
+            if self._round.count >= self._least_round:
                 self._judge(now)
         if 1 < self._proved >= self._limit < self.most:
             self._set_limit(self._proved + 1)
+
+    @property
+    def _least_round(self) -> int:
+        return max(LEAST_ROUND, self._limit) * (2 if self._fell_behind else 1)
 
     def _was_alone(self, took_s: float, now: float) -> None:
         self._alone.add(took_s)
@@ -210,6 +216,9 @@ class ServerCapacity:
             wanted = self._wanted(at_once)
             if out <= self._limit - 1:
                 wanted = max(wanted, min(math.ceil(out), self._limit))  # more were never there: little is known
+            surer = self._round.count < SURER * self._least_round
+            if surer and wanted < min(self._limit, self._wanted(min(self._round.rate * self._alone.mean_s, out))):
+                return
             few = self._alone.count < LEAST_ALONE and self._wanted(self._round.rate * self._alone.mean_s) > wanted
             if few or (wanted < self._limit and self._needs_times and self._is_stale(now)):
                 self._calibrate()
