@@ -161,7 +161,9 @@ class ServerCapacity:
         if self._only is not None and self._only in self._sent:
             self._sent[self._only].alone = False
         self._only = number if unseen == 1 else None
-        self._sent[number] = _Sent(now, unseen + self.overtaken, alone=unseen == 1)
+        out = unseen + self.overtaken
+        self._sent[number] = _Sent(now, out, alone=unseen == 1)
+        self._gain.sent(out, now)
         if len(self._sent) > 2 * MOST_AT_ONCE:
             del self._sent[next(iter(self._sent))]
 
@@ -176,7 +178,7 @@ class ServerCapacity:
         self._answers += 1
         in_trial = self._gain.at_once > 0
         if not self._calibrating:
-            self._gain.answered(sent.at, took_s, sent.out, self.overlap)
+            self._gain.answered(took_s, sent.out, self.overlap, now)
         if sent.alone:
             self._was_alone(took_s, now)
         elif sent.out > 1 and not self._calibrating and not in_trial:
