@@ -20,6 +20,8 @@ LEAST_ANSWERS, MOST_ANSWERS = 16, 128
 """Of a trial. It ends as soon as the answers tell ..."""
 SURE = 2.0
 """... by so many standard errors. If they do not, the server is believed to gain."""
+STEP = 1.25
+"""When the server works on so many times more, what it did before is no measure."""
 FIRST_TRIAL_AFTER, LAST_TRIAL_AFTER = 64, 8192
 """Answers of several at once between two trials; four times as many after each that showed a gain."""
 FIRST_IGNORED, LAST_IGNORED = 512, 8192
@@ -58,10 +60,11 @@ class OverlapGain:
         self._ignored = 0
         self._next_ignored = FIRST_IGNORED
 
-    @property
-    def counts(self) -> bool:
-        """Whether it is of use that the server works on several at once, as far as is known."""
-        return not self._ignored
+    def of_use(self, overlap: int) -> int:
+        """How many at once it is of use to have in work at a server that works on so many, as far as is known."""
+        if self._ignored:
+            return 1
+        return min(overlap, FEWER) if self._doubted else overlap
 
     def sent(self, out: int, now: float) -> None:
         """One was sent as one of so many."""
@@ -71,13 +74,14 @@ class OverlapGain:
 
     def answered(self, took_s: float, out: int, overlap: int, now: float) -> None:
         """One is answered that was sent as one of `out`, by a server that works on so many at once."""
+        overlap = self.of_use(overlap)
         if self._ignored:
             self._ignored -= 1
         elif self.at_once:
             self._answers += self._since < now
             if self._answers >= LEAST_ANSWERS:
                 self._judge(now)
-        elif overlap > self._overlap or overlap == 1:
+        elif overlap > STEP * self._overlap or overlap == 1:
             self._overlap = overlap
             self._before = ServiceTimes(MOST_ANSWERS)
             self._until = self._after

@@ -149,7 +149,7 @@ class ServerCapacity:
     @property
     def _proved(self) -> int:
         """How many it works on at once at least."""
-        return self.overlap if self._gain.counts else 1
+        return self._gain.of_use(self.overlap)
 
     def given_up(self, number: int) -> None:
         """Nobody waits for this request any more."""
