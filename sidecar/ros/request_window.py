@@ -93,8 +93,7 @@ class RequestWindow(Generic[T]):
     def size(self) -> int:
         """How many requests the server may have that it was not seen to have taken."""
         wanted = self._capacity.limit - self._capacity.overtaken
-        after_silences = min(wanted + self._silences, SAFE_SIZE)
-        return max(1, wanted, after_silences)
+        return max(1, min(wanted + self._silences, SAFE_SIZE))
 
     def add(self, request: T, priority: Priority, deadline: float, now: float) -> None:
         """Let a request wait for its turn."""

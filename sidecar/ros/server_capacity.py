@@ -129,12 +129,12 @@ class ServerCapacity:
     @property
     def limit(self) -> int:
         """How many requests the server should have at once, the overtaken among them."""
-        return 1 if self._calibrating else min(self._gain.at_once or self._limit, self.most)
+        return 1 if self._calibrating else self._gain.at_once or self._limit
 
     @property
-    def most(self) -> int:
-        """How many it can have without the risk that one is pushed out, also when it is busy with something else."""
-        return min(max(SAFE_SIZE, self.overlap + FIRST_LIMIT), MOST_AT_ONCE)
+    def _most(self) -> int:
+        """How many are of use: besides those that were overtaken, no more go than a queue surely holds."""
+        return min(self.overlap - 1 + SAFE_SIZE, MOST_AT_ONCE)
 
     @property
     def overlap(self) -> int:
@@ -185,7 +185,7 @@ class ServerCapacity:
             self._round.add(took_s, sent.out)
             if self._round.count >= self._least_round:
                 self._judge(now)
-        if 1 < self._proved >= self._limit < self.most:
+        if 1 < self._proved >= self._limit < self._most:
             self._set_limit(self._proved + 1)
 
     @property
@@ -222,13 +222,17 @@ class ServerCapacity:
             if surer and wanted < min(self._limit, self._wanted(min(self._round.rate * self._alone.mean_s, out))):
                 return
             few = self._alone.count < LEAST_ALONE and self._wanted(self._round.rate * self._alone.mean_s) > wanted
-            if few or (wanted < self._limit and self._needs_times and self._is_stale(now)):
+            if few:
                 self._calibrate()
+            elif wanted < self._limit and self._needs_times and self._is_stale(now):
+                self._calibrate_afresh()
             else:
                 self._set_limit(wanted)
+        elif at_least > out + KEEPS_PACE and self._is_stale(now):
+            self._calibrate_afresh()  # more than were there: what a request alone takes became less
         elif out > self._limit - 1:
             more = self._limit + 1 if self._fell_behind else 2 * self._limit
-            self._set_limit(min(more, self.most))
+            self._set_limit(min(more, self._most))
         else:
             self._set_limit(self._limit)
         if not self._needs_times:
@@ -257,17 +261,22 @@ class ServerCapacity:
             wanted += math.ceil(self._round.rate * WAITING_S)
         if self._proved > 1:
             wanted = max(wanted, self._proved + 1)
-        return min(wanted, self.most)
+        return min(wanted, self._most)
 
     def _is_stale(self, now: float) -> bool:
         age_s = now - self._alone_at
-        return self._answers > STALE_AFTER and age_s > max(STALE_S, STALE_TIMES * self._alone.mean_s)
+        before_this_round = self._answers - self._round.count - self._limit
+        return before_this_round > STALE_AFTER and age_s > max(STALE_S, STALE_TIMES * self._alone.mean_s)
 
     def _calibrate(self) -> None:
         self._calibrated_before = True
         self._calibrating = True
         self._calibrated_s = 0.0
         self._set_limit(self._limit)
+
+    def _calibrate_afresh(self) -> None:
+        self._alone = ServiceTimes(ALONE_KEPT)
+        self._calibrate()
 
     def _set_limit(self, limit: int) -> None:
         self._limit = limit
