@@ -6,12 +6,12 @@ law: with `n` requests at the server at a time that take `r` seconds each, where
 work of `n * a / r` requests alone. Of a server that takes one after the other, that is 1, and a little more where the
 way there takes a part of `a`; of one with four threads 4. As long as it keeps pace with `n`, twice as many are tried.
 
-Means are compared, not extremes: service times may vary. `a` is measured where requests are too few to meet. Under load
-the server is emptied for that now and then, and when it seems to have fallen behind: either its work became longer, or
-its threads fewer. A server whose threads share one processor gains nothing from several at once, and counts as one that
-takes one after the other.
+Service times may vary, so means are compared, and only what is sure of them counts: where they vary much the law says
+little. Then answers out of order prove how many were in work at one moment (`request_overlap.py`), and one more than
+that may be there, unless that many gain nothing, as their threads share one processor (`overlap_gain.py`).
 
-Apart from that, answers out of order prove that several were in work at one moment, as requests are taken in order.
+`a` is measured where requests are too few to meet. Where no overlap tells more, the server is emptied for that now and
+then, and when it seems to have fallen behind: either its work became longer, or its threads fewer.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LONG_S = 0.1
 """... unless requests take longer than this alone: then the server idles for a few per cent of its time at most, and
 order is worth more."""
 KEEPS_PACE = 0.4
-"""With no more than so many requests waiting at the server as it seems, more at once are tried: twice as many until it
+"""With no more than so many requests waiting at the server for sure, more at once are tried: twice as many until it
 falls behind for the first time, then one more."""
 ROUNDING = 0.25
 """Of a server that works on one at once, the law gives a little more by chance."""
@@ -49,7 +49,7 @@ ALONE_KEPT = 8
 SURER = 4
 """Rounds that are waited for if that may show that the limit is right."""
 LEAST_ALONE = 4
-"""Fewer may not show how much they vary."""
+"""So many are measured once it matters how much they vary."""
 SURE = 2.0
 """Standard errors by which a mean may be wrong."""
 USUAL_WEIGHT = 0.125
@@ -221,8 +221,7 @@ class ServerCapacity:
             surer = self._round.count < SURER * self._least_round
             if surer and wanted < min(self._limit, self._wanted(min(self._round.rate * self._alone.mean_s, out))):
                 return
-            few = self._alone.count < LEAST_ALONE and self._wanted(self._round.rate * self._alone.mean_s) > wanted
-            if few:
+            if self._alone.count < LEAST_ALONE and self._wanted(self._round.rate * self._alone.mean_s) > wanted:
                 self._calibrate()
             elif wanted < self._limit and self._needs_times and self._is_stale(now):
                 self._calibrate_afresh()
@@ -243,10 +242,9 @@ class ServerCapacity:
 
     def _at_least(self) -> float:
         """How many requests alone the server surely does the work of at once."""
-        variation = self._alone.variation
-        if self._alone.count < LEAST_ALONE:
-            variation = max(variation, self._round.variation)
-        error = math.sqrt(variation / self._alone.count + self._round.variation / self._round.count)
+        either = max(self._alone.variation, self._round.variation)  # a few answers may not show how much they vary
+        alone = self._alone.variation if self._alone.count >= LEAST_ALONE else either
+        error = math.sqrt(alone / self._alone.count + either / self._round.count)
         return self._round.rate * self._alone.mean_s * math.exp(-SURE * error)
 
     @property
