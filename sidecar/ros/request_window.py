@@ -3,7 +3,8 @@
 A ROS server made with the default profile keeps the last 10 requests it has not taken yet; the 11th pushes the first
 one out without a trace. How many lie there cannot be asked, but follows from the answers: the requests of one client
 are taken in order, so an answer tells that its request and all earlier ones have left the queue. At most SAFE_SIZE
-later ones are let through, or two more than the server was seen to work on at one moment; the rest wait here. From
+later ones are let through; the rest wait here. An earlier one that is not answered yet is in work, and takes no room in
+the queue. From
 the silence of a server nothing is concluded: it may need a minute for each. Only what nobody waits for any more counts
 no longer once it is the oldest: it is what would be pushed out first.
 
@@ -93,8 +94,7 @@ class RequestWindow(Generic[T]):
     def size(self) -> int:
         """How many requests the server may have that it was not seen to have taken."""
         wanted = self._capacity.limit - self._capacity.overtaken
-        after_silences = min(wanted + self._silences, SAFE_SIZE)
-        return max(1, wanted, after_silences)
+        return max(1, min(wanted + self._silences, SAFE_SIZE))
 
     def add(self, request: T, priority: Priority, deadline: float, now: float) -> None:
         """Let a request wait for its turn."""
