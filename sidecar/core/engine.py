@@ -22,7 +22,7 @@ from sidecar.core.events import (
     RequestId,
     WithdrawService,
 )
-from sidecar.core.inbound import Decoding, Inbound
+from sidecar.core.inbound import Inbound
 from sidecar.core.link_events import (
     Attend,
     FinishedLost,
@@ -31,7 +31,6 @@ from sidecar.core.link_events import (
     LinkCommand,
     LinkEvent,
     MessageAbandoned,
-    MessageDecoded,
     MessageFinished,
     MessageForgotten,
     PathChanged,
@@ -62,6 +61,7 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, NodeName, Peer, ServiceMapping, ServiceName, ServiceOffer, SessionId
     from sidecar.core.budgets import Budget
+    from sidecar.core.decoding import Decoding
     from sidecar.core.session import OwnSession
 
 SWEEP_EVERY_S = 1.0
@@ -130,9 +130,14 @@ class Engine:
         self._events.clear()
         return events
 
-    def take_decodings(self) -> list[Decoding]:
-        """Return messages to compute outside any lock; what their `run` returns comes back as an event."""
-        return self._inbound.take_decodings()
+    def next_decoding(self) -> Decoding | None:
+        """Return the message of which a slice is to be computed next, outside any lock."""
+        return self._inbound.next_decoding()
+
+    @property
+    def decodings(self) -> int:
+        """How many messages are to be decoded."""
+        return self._inbound.decodings
 
     def _to_link(self, command: PathCommand) -> None:
         self._commands.append((command.path.interface, command))
@@ -293,9 +298,6 @@ class Engine:
                 if self._is_current(path, session):
                     for content, ends_at in self._inbound.add(path, session, fragments, now):
                         self._on_message(path, content, ends_at, now)
-            case MessageDecoded(path, session, content, ends_at):
-                if self._is_current(path, session):
-                    self._on_message(path, content, ends_at, now)
             case MessageAbandoned(peer, session, number):
                 if self.peers.session(peer) == session:
                     self._inbound.abandon(peer, number)
@@ -326,6 +328,20 @@ class Engine:
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
                     self._on_peer_closed(peer, now)
+        self._after_news(now)
+
+    def on_decoded(self, decoding: Decoding, now: float) -> None:
+        """A message is computed (`decoding.run_slice` says when)."""
+        arrived = self._inbound.take_decoded(decoding)
+        if arrived is not None:
+            self._on_message(decoding.path, *arrived, now)
+            self._after_news(now)
+
+    def on_decoding_failed(self, decoding: Decoding) -> None:
+        """A message can not be computed."""
+        self._inbound.forgo_decoding(decoding)
+
+    def _after_news(self, now: float) -> None:
         if self._outbox.take_made_room():
             self._use_room(now)
         self._count_in_flight()
