@@ -100,7 +100,15 @@ class Engine:
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
         self._measurements = Measurements(self.stats.dropped)
         self._serving = Serving(
-            ServingParts(self._rules, self.routes, self._outbox, self.stats, self._events.append, self.peers.may_call)
+            ServingParts(
+                self._rules,
+                self.routes,
+                self._outbox,
+                self.stats,
+                self._events.append,
+                self.peers.may_call,
+                self._backlog,
+            )
         )
         self._requests = RequestTable(
             RequestParts(
@@ -477,7 +485,7 @@ class Engine:
         self._backlog.begin_turn(now)
         self._backlog.run(now, leave=SLICE // 2)  # deadlines must not wait until all is done
         self._requests.handle_timer(now)
-        self._serving.handle_timer(now, self._backlog)
+        self._serving.handle_timer(now)
         self._backlog.run(now)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
