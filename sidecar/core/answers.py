@@ -26,6 +26,7 @@ from sidecar.core.path_id import PathState
 from sidecar.core.priority import Priority
 from sidecar.core.room import Lane
 from sidecar.core.shares import Shares
+from sidecar.core.timers import first_of
 from sidecar.core.waiting_line import WaitingLine
 
 if TYPE_CHECKING:
@@ -372,9 +373,7 @@ class Answers:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
-        while self._timers and self._timers[0][1] not in self._answers:
-            heapq.heappop(self._timers)
-        return self._timers[0][0] if self._timers else None
+        return first_of(self._timers, self._answers)
 
     def handle_timer(self, now: float) -> None:
         """Give up what is of no use any more, and say so of answers of which nothing has left."""

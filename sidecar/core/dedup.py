@@ -28,7 +28,8 @@ from sidecar.core.events import (
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.rules import MAX_LIFETIME_S
-from sidecar.core.shares import Shares
+from sidecar.core.shares import FORGOTTEN_AT_ONCE, Shares
+from sidecar.core.timers import first_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -314,9 +315,7 @@ class ExecutionTable:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
-        while self._timers and self._timers[0][1] not in self._running:
-            heapq.heappop(self._timers)
-        return self._timers[0][0] if self._timers else None
+        return first_of(self._timers, self._running)
 
     def handle_timer(self, now: float, backlog: Backlog) -> tuple[list[AbandonExecution], list[Reply]]:
         """Give up executions that took too long; they may have run, so their ids stay.
@@ -382,8 +381,10 @@ class ExecutionTable:
             self._stats.dropped["cached_answer_evicted"] += 1
 
     def _forget_old(self, now: float) -> None:
-        """Drop ids that no copy can ask for any more."""
-        while self._forget_at and self._forget_at[0][0] <= now:
+        """Drop ids that no copy can ask for any more: those of a burst, the rest the next times."""
+        for _ in range(FORGOTTEN_AT_ONCE):
+            if not self._forget_at or self._forget_at[0][0] > now:
+                return
             request_id = heapq.heappop(self._forget_at)[1]
             self._finished_shares.give_back(self._finished.pop(request_id).robot)
             self._uncache(request_id)

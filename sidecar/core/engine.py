@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.attention import Attention
-from sidecar.core.backlog import SLICE, Backlog, Step
+from sidecar.core.backlog import SLICE, Backlog, Step, rest
 from sidecar.core.events import (
     ApplicationEvent,
     ExecutionId,
@@ -222,9 +222,9 @@ class Engine:
             self._backlog.add_steps(self._outbox.on_interface_gone(interface), now)
             for path in paths:
                 self._requests.on_path_changed(path, PathState.DOWN, now)
-            for peer in {path.peer for path in paths}:
-                if not self.routes.reaches(peer):
-                    self._drop_if_unlisted(peer, now)
+            dark = dict.fromkeys(path.peer for path in paths if not self.routes.reaches(path.peer))
+            dropped = [peer for peer in dark if self.peers.drop_if_unlisted(peer)]
+            self._end_sessions(dropped, now)
         self._update_offers(now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
 
@@ -331,7 +331,8 @@ class Engine:
                 pass  # of a peer that left, or an interface that went, a moment ago
             case PeerRestarted():
                 if self.peers.restarted(event, now):
-                    self._end_session(event.peer, now)
+                    self._forget_session(event.peer, now)
+                    self._follow_gone((event.peer,), now)
                     self._commands.append((None, SetPeers(self.peers.for_links())))
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
@@ -415,8 +416,7 @@ class Engine:
     def _drop_if_unlisted(self, name: NodeName, now: float) -> None:
         """The last path to a peer died, and it may have been kept for its paths only."""
         if self.peers.drop_if_unlisted(name):
-            self._follow_offers(now)
-            self._end_session(name, now, may_return=True)
+            self._end_sessions((name,), now)
             self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def _on_peer_closed(self, name: NodeName, now: float) -> None:
@@ -435,9 +435,13 @@ class Engine:
         self._requests.on_peer_gone(name, now)
         self._drop_if_unlisted(name, now)
 
-    def _end_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
-        self._forget_session(name, now, may_return=may_return)
-        self._follow_gone((name,), now)
+    def _end_sessions(self, silent: Collection[NodeName], now: float) -> None:
+        """These are no peers any more, as nothing is heard of them; they may come back."""
+        if silent:
+            self._follow_offers(now)
+        for name in silent:
+            self._forget_session(name, now, may_return=True)
+        self._follow_gone(silent, now)
 
     def _forget_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
         """`may_return`: it was only silent for long, and may be back with the same session, for its answers."""
@@ -500,8 +504,4 @@ class Engine:
         self._count_in_flight()
 
 
-def _rest(_now: float) -> None:
-    """Takes a step's time from the turn."""
-
-
-_REST: tuple[Step, ...] = (_rest,) * 5
+_REST: tuple[Step, ...] = (rest,) * 5

