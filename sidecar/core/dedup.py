@@ -55,6 +55,8 @@ REMEMBER_LIFETIMES = 2.0
 """An id is remembered for this many of its request's lifetimes after the answer ..."""
 MIN_REMEMBER_S = 60.0
 """... but at least this long: what a datagram may spend in the queues of the network."""
+SAY_WITHIN_S = 0.5
+"""An execution whose patience is over counts as lost when the application has not said what became of it."""
 
 TIMER_SLACK = 1024
 """Timers of answered requests that may lie around before they are swept out."""
@@ -102,6 +104,8 @@ class _Execution:
     processing_s: float = 0.0
     refusal: tuple[RejectReason, str] | None = None
     cancelled: bool = False
+    given_up: bool = False
+    """Its patience is over: whoever knows whether the local server got it is asked."""
 
     @property
     def ends(self) -> float:
@@ -271,8 +275,9 @@ class ExecutionTable:
         else:
             for waiter in execution.waiters:
                 self._remember_refused(waiter, execution.request_id, reason, text, execution.expires, now)
-        result = "cancelled" if reason is RejectReason.CANCELLED else "refused"
-        self._stats.executions[execution.service, result] += 1
+        if not execution.given_up:
+            result = "cancelled" if reason is RejectReason.CANCELLED else "refused"
+            self._stats.executions[execution.service, result] += 1
         execution.refusal = (reason, text)
         return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
 
@@ -318,10 +323,11 @@ class ExecutionTable:
         return first_of(self._timers, self._running)
 
     def handle_timer(self, now: float, backlog: Backlog) -> tuple[list[AbandonExecution], list[Reply]]:
-        """Give up executions that took too long; they may have run, so their ids stay.
+        """Give up executions that took too long.
 
-        Returns them, and what those robots are told that still wait. Also forgets what no copy can ask for any more,
-        so that answers do not stay in memory when the traffic ends.
+        Returns them, and what those robots are told that still wait and of which the application has not said within
+        SAY_WITHIN_S whether the local server got it: it may have run, so its id stays. Also forgets what no copy can
+        ask for any more, so that answers do not stay in memory when the traffic ends.
         """
         self._forget_old(now)
         abandoned = []
@@ -334,12 +340,19 @@ class ExecutionTable:
             if execution.ends > now:
                 heapq.heappush(self._timers, (execution.ends, execution_id))
                 continue
+            awaited = bool(execution.waiters) and execution.expires > now
+            if not execution.given_up:
+                self._stats.executions[execution.service, "abandoned"] += 1
+                abandoned.append(AbandonExecution(execution_id, awaited))
+                if awaited:
+                    execution.given_up = True
+                    execution.patience_ends = now + SAY_WITHIN_S
+                    heapq.heappush(self._timers, (execution.ends, execution_id))
+                    continue
             self._finish(execution_id)
             self._remember(execution, now)
             execution.refusal = (RejectReason.SERVER_LOST, "the server gave no answer in time")
-            self._stats.executions[execution.service, "abandoned"] += 1
-            abandoned.append(AbandonExecution(execution_id))
-            if execution.expires > now:
+            if awaited:
                 replies += [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
         return abandoned, replies
 

@@ -12,12 +12,13 @@ from sidecar.core.dedup import (
     MAX_RUNNING,
     MAX_WAITERS,
     MIN_REMEMBER_S,
+    SAY_WITHIN_S,
     TIMER_SLACK,
     ExecutionTable,
     Reply,
     Waiter,
 )
-from sidecar.core.events import CancelExecution, ExecuteRequest, ExecutionId, RejectReason
+from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest, ExecutionId, RejectReason
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
 from sidecar.core.rules import MAX_LIFETIME_S
 from sidecar.core.shares import FORGOTTEN_AT_ONCE
@@ -314,7 +315,24 @@ def test_a_server_is_given_up_before_the_robot_gives_up_and_the_robot_is_told() 
     assert isinstance(outcome, ExecuteRequest)
     assert outcome.expires_s == 3.0
     assert executions.handle_timer(3.9, Backlog()) == ([], [])
-    (abandoned,), (reply,) = executions.handle_timer(4.0, Backlog())
-    assert abandoned.execution == outcome.execution
+    assert executions.handle_timer(4.0, Backlog()) == ([AbandonExecution(outcome.execution, awaited=True)], [])
+    assert executions.next_timer() == 4.0 + SAY_WITHIN_S
+    nothing, (reply,) = executions.handle_timer(4.0 + SAY_WITHIN_S, Backlog())
+    assert nothing == [], "it was told before"
     assert isinstance(reply.message, RejectionMessage)
     assert reply.message.reason is RejectReason.SERVER_LOST
+    assert executions._stats.executions[ECHO, "abandoned"] == 1
+
+
+@pytest.mark.audit("dp-10")
+def test_what_its_server_never_got_may_run_elsewhere_when_its_patience_is_over() -> None:
+    executions = table()
+    outcome = executions.on_request(ROBOT, request(lifetime_s=20.0), 1.0, patience_s=3.0)
+    assert isinstance(outcome, ExecuteRequest)
+    executions.handle_timer(4.0, Backlog())
+    (reply,) = executions.refuse(outcome.execution, RejectReason.OVERLOADED, "no room at the server", 4.1)
+    assert isinstance(reply.message, RejectionMessage)
+    assert reply.message.reason.certainly_not_run
+    assert executions.running == 0
+    assert executions.handle_timer(5.0, Backlog()) == ([], [])
+    assert executions._stats.executions[ECHO, "refused"] == 0, "it was counted as abandoned"
