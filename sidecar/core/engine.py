@@ -48,7 +48,7 @@ from sidecar.core.messages import CancelMessage, RequestMessage, ResponseMessage
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.peers import Peers
+from sidecar.core.peers import MAX_PEERS, Peers
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
@@ -89,6 +89,8 @@ class Engine:
         self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
         self._events: list[ApplicationEvent] = []
         self._interfaces: set[InterfaceName] = set()
+        self._away: dict[NodeName, SessionId] = {}
+        """Cloud: robots that are no peers any more, as nothing was heard of them, and that may be back."""
         self._carried: Mapping[ServiceName, bool | None] = {}
         self._sweep_at = now + SWEEP_EVERY_S
         self._attention = Attention(now)
@@ -223,8 +225,7 @@ class Engine:
             for path in paths:
                 self._requests.on_path_changed(path, PathState.DOWN, now)
             dark = dict.fromkeys(path.peer for path in paths if not self.routes.reaches(path.peer))
-            dropped = [peer for peer in dark if self.peers.drop_if_unlisted(peer)]
-            self._end_sessions(dropped, now)
+            self._drop_unlisted(dark, now)
         self._update_offers(now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
 
@@ -242,9 +243,18 @@ class Engine:
         ended = [name for name, session in before.items() if self.peers.session(name) != session]
         for name in ended:
             over = name in self.peers or name in left or name in self.peers.refused
-            self._forget_session(name, now, may_return=not over)
+            self._forget_session(name, now, may_return=None if over else before[name])
         self._follow_gone(ended, now)
+        self._end_away(left, now)
         return None
+
+    def _end_away(self, left: Collection[NodeName], now: float) -> None:
+        """Of the peers that might have come back, some are here again, and others never will be."""
+        for name, session in list(self._away.items()):
+            if self.peers.session(name) == session:
+                del self._away[name]
+            elif name in self.peers or name in left or name in self.peers.refused:
+                self._forget_session(name, now)
 
     def _follow_offers(self, now: float) -> None:
         """Other peers than before are known, or they may offer other services."""
@@ -405,7 +415,7 @@ class Engine:
             if self._requests.unanswered:  # they wait: the other paths may be back as well, and share them
                 self._seek(frozenset((path.peer,)))
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
-            self._drop_if_unlisted(path.peer, now)
+            self._drop_unlisted((path.peer,), now)
         if self.routes.reaches(path.peer) is not reached:
             self._update_offers(now)
         self._requests.on_path_changed(path, state, now)
@@ -413,11 +423,20 @@ class Engine:
     def _knows(self, path: PathId) -> bool:
         return path.peer in self.peers and path.interface in self._interfaces
 
-    def _drop_if_unlisted(self, name: NodeName, now: float) -> None:
-        """The last path to a peer died, and it may have been kept for its paths only."""
-        if self.peers.drop_if_unlisted(name):
-            self._end_sessions((name,), now)
-            self._commands.append((None, SetPeers(self.peers.for_links())))
+    def _drop_unlisted(self, dark: Iterable[NodeName], now: float) -> None:
+        """The last path to each of these peers died, and it may have been kept for its paths only."""
+        dropped: dict[NodeName, SessionId | None] = {}
+        for name in dark:
+            session = self.peers.session(name)
+            if self.peers.drop_if_unlisted(name):
+                dropped[name] = session
+        if not dropped:
+            return
+        self._follow_offers(now)
+        for name, session in dropped.items():
+            self._forget_session(name, now, may_return=session)
+        self._follow_gone(dropped, now)
+        self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def _on_peer_closed(self, name: NodeName, now: float) -> None:
         """It said goodbye: nothing new goes there; the control plane will say the same."""
@@ -433,21 +452,19 @@ class Engine:
         )
         self._update_offers(now)
         self._requests.on_peer_gone(name, now)
-        self._drop_if_unlisted(name, now)
+        self._drop_unlisted((name,), now)
 
-    def _end_sessions(self, silent: Collection[NodeName], now: float) -> None:
-        """These are no peers any more, as nothing is heard of them; they may come back."""
-        if silent:
-            self._follow_offers(now)
-        for name in silent:
-            self._forget_session(name, now, may_return=True)
-        self._follow_gone(silent, now)
-
-    def _forget_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
-        """`may_return`: it was only silent for long, and may be back with the same session, for its answers."""
-        called_off = [] if may_return else self._serving.on_session_over(name)
-        let_go = [*self._outbox.drop_peer(name), *self._serving.on_robot_gone(name)]
-        self._backlog.add_steps(called_off + let_go, now)
+    def _forget_session(self, name: NodeName, now: float, *, may_return: SessionId | None = None) -> None:
+        """`may_return`: it was only silent for long, and may be back with this session, for its answers."""
+        if may_return is not None and self._config.role is Role.CLOUD:
+            self._away[name] = may_return
+            if len(self._away) > MAX_PEERS:
+                self._forget_session(next(iter(self._away)), now)
+        else:
+            self._away.pop(name, None)
+            called_off = self._serving.on_session_over(name)
+            let_go = [*self._outbox.drop_peer(name), *self._serving.on_robot_gone(name)]
+            self._backlog.add_steps(called_off + let_go, now)
         self._inbound.forget_peer(name)
         self.routes.forget_peer(name)
 
