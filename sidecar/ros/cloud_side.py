@@ -147,6 +147,11 @@ class CloudSide:
         runner.abandon(execution)
         self._stats.abandoned[runner.name] += 1
         self._stats.pending = len(self._executions)
+        if event.awaited and execution.number is None:
+            why = "its time here was over before the server had room for it"
+            self._data_plane.refuse(execution.id, RejectReason.OVERLOADED, why)
+        elif event.awaited:
+            self._data_plane.refuse(execution.id, RejectReason.SERVER_LOST, "the server gave no answer in time")
 
     def _cancel(self, event: CancelExecution) -> None:
         """The robot has its answer: what its server has not got yet needs not run."""
