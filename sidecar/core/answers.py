@@ -13,6 +13,7 @@ from __future__ import annotations
 import heapq
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain, count, islice
 from typing import TYPE_CHECKING
 
@@ -25,10 +26,11 @@ from sidecar.core.path_id import PathState
 from sidecar.core.priority import Priority
 from sidecar.core.room import Lane
 from sidecar.core.shares import Shares
+from sidecar.core.timers import first_of
 from sidecar.core.waiting_line import WaitingLine
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Iterable, Iterator
 
     from protos.model import NodeName
     from sidecar.core.backlog import Backlog, Step
@@ -108,17 +110,20 @@ class _Lines:
 class Answers:
     """All answers on their way."""
 
-    def __init__(self, rules: Rules, routes: Routes, outbox: Outbox, stats: EngineStats) -> None:
+    def __init__(self, rules: Rules, routes: Routes, outbox: Outbox, stats: EngineStats, backlog: Backlog) -> None:
         self._rules = rules
         self._routes = routes
         self._outbox = outbox
         self._stats = stats
+        self._backlog = backlog
         self._answers: dict[int, _Answer] = {}
         self._of: dict[NodeName, dict[RequestId, list[_Answer]]] = {}
         self._got: dict[NodeName, dict[int, None]] = {}
         """Answers that the robot has got, and that wait for further copies only."""
         self._lines: OrderedDict[NodeName, tuple[_Lines, ...]] = OrderedDict()
         """Of robots with answers that wait, the one whose turn is longest ago first."""
+        self._going: dict[NodeName, None] = {}
+        """Robots whose lines may have something to send."""
         self._number_shares = Shares(MAX_ANSWERS)
         self._byte_shares = Shares(MAX_ANSWER_BYTES)
         self._timers: list[tuple[float, int]] = []
@@ -143,8 +148,10 @@ class Answers:
         """Send these as soon as there is room."""
         for reply in replies:
             self._take(reply, now)
-        for robot in dict.fromkeys(reply.waiter.path.peer for reply in replies):
-            self._use_room(robot, now)
+        for reply in replies:
+            # As many as came: these, or others that wait for longer. Who has no room has none for a second one.
+            self._send_next(reply.waiter.path.peer, now)
+        self._let_go((reply.waiter.path.peer for reply in replies), now)
 
     def _take(self, reply: Reply, now: float) -> None:
         copy, path = reply.waiter.copy, reply.waiter.path
@@ -220,30 +227,57 @@ class Answers:
                     self._got.setdefault(robot, {})[answer.number] = None
                 elif answer.sent:
                     self._remove(answer)
-        robots.update(dict.fromkeys(islice(self._lines, ROBOTS_AT_ONCE)))
-        for robot in robots:
-            self._use_room(robot, now)
+        for robot in list(islice(self._lines, ROBOTS_AT_ONCE)):
+            robots[robot] = None
+            self._lines.move_to_end(robot)
+        self._let_go(robots, now)
 
-    def _use_room(self, robot: NodeName, now: float) -> None:
-        lines = self._lines.get(robot)
-        if lines is None:
-            return
-        self._lines.move_to_end(robot)
-        for line in lines:
-            while (number := line.firsts.first(now)) is not None:
-                answer = self._answers[number]
-                if not self._outbox.has_room(robot, answer.size):
-                    break
-                line.firsts.went(number)
-                self._send(answer, self._best_copy(answer))
-                self._line_up_copies(answer, answer.waiting)
-            while not len(line.firsts) and (key := line.copies.first(now)) is not None:
-                answer = self._answers[key[0]]
-                if not self._outbox.has_room(robot, answer.size):
-                    break
-                line.copies.went(key)
-                self._send(answer, key[1])
+    def _let_go(self, robots: Iterable[NodeName], now: float) -> None:
+        """Send what waits for these robots and has room now, as much of it at once as the turn has room for."""
+        self._going.update((robot, None) for robot in robots if self._next(robot, now) is not None)
+        if self._going:
+            self._backlog.add(self._steps, now, "answers")
+
+    def _steps(self) -> Iterator[Step]:
+        """Send one answer at a time, of each robot in turn."""
+        while self._going:
+            robot = next(iter(self._going))
+            del self._going[robot]
+            yield partial(self._go, robot)
+
+    def _go(self, robot: NodeName, now: float) -> None:
+        if self._send_next(robot, now):
+            self._going[robot] = None
+
+    def _next(self, robot: NodeName, now: float) -> tuple[_Answer, int | None] | None:
+        """Return the answer that is next and has room, and the copy to which it goes; None as copy: not sent yet."""
+        for line in self._lines.get(robot, ()):
+            if (number := line.firsts.first(now)) is not None:
+                answer, copy = self._answers[number], None
+            elif (key := line.copies.first(now)) is not None:
+                answer, copy = self._answers[key[0]], key[1]
+            else:
+                continue
+            if self._outbox.has_room(robot, answer.size):
+                return answer, copy
+        return None
+
+    def _send_next(self, robot: NodeName, now: float) -> bool:
+        """Send one message of what waits; returns whether there was one to send, and room for it."""
+        found = self._next(robot, now)
+        if found is None:
+            return False
+        answer, copy = found
+        line = self._lines_of(answer)
+        if copy is None:
+            line.firsts.went(answer.number)
+            self._send(answer, self._best_copy(answer))
+            self._line_up_copies(answer, answer.waiting)
+        else:
+            line.copies.went((answer.number, copy))
+            self._send(answer, copy)
         self._forget_lines(robot)
+        return True
 
     def _best_copy(self, answer: _Answer) -> int:
         """Return the copy to which a large answer goes first: by a path that is up and has the least to carry."""
@@ -339,13 +373,11 @@ class Answers:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
-        while self._timers and self._timers[0][1] not in self._answers:
-            heapq.heappop(self._timers)
-        return self._timers[0][0] if self._timers else None
+        return first_of(self._timers, self._answers)
 
-    def handle_timer(self, now: float, backlog: Backlog) -> None:
+    def handle_timer(self, now: float) -> None:
         """Give up what is of no use any more, and say so of answers of which nothing has left."""
-        while self._timers and self._timers[0][0] <= now and backlog.allows(now):
+        while self._timers and self._timers[0][0] <= now and self._backlog.allows(now):
             answer = self._answers.get(heapq.heappop(self._timers)[1])
             if answer is not None:
                 self._judge(answer, now)

@@ -35,6 +35,10 @@ def in_groups(act: Callable[[Target], None], targets: Iterable[Target]) -> list[
     return [partial(do, first) for first in range(0, len(found), GROUP)]
 
 
+def rest(_now: float) -> None:
+    """Take a step's time from the turn: what makes the steps looks at many things itself."""
+
+
 class Backlog:
     """Jobs, each of many steps; the oldest first."""
 

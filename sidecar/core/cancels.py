@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from sidecar.core.shares import Shares
+from sidecar.core.shares import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
     from protos.model import NodeName
@@ -48,10 +48,10 @@ class EarlyCancels:
         """Whether this robot called the request off."""
         self._forget_old(now)
         known = self._ids.get(request_id)
-        return known is not None and known[0] == robot
+        return known is not None and known[0] == robot and known[1] > now
 
     def _forget_old(self, now: float) -> None:
-        while self._ids:
+        for _ in range(min(FORGOTTEN_AT_ONCE, len(self._ids))):
             request_id, (robot, forget_at) = next(iter(self._ids.items()))
             if forget_at > now:
                 return

@@ -28,7 +28,8 @@ from sidecar.core.events import (
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.rules import MAX_LIFETIME_S
-from sidecar.core.shares import Shares
+from sidecar.core.shares import FORGOTTEN_AT_ONCE, Shares
+from sidecar.core.timers import first_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -54,6 +55,8 @@ REMEMBER_LIFETIMES = 2.0
 """An id is remembered for this many of its request's lifetimes after the answer ..."""
 MIN_REMEMBER_S = 60.0
 """... but at least this long: what a datagram may spend in the queues of the network."""
+SAY_WITHIN_S = 0.5
+"""An execution whose patience is over counts as lost when the application has not said what became of it."""
 
 TIMER_SLACK = 1024
 """Timers of answered requests that may lie around before they are swept out."""
@@ -101,6 +104,8 @@ class _Execution:
     processing_s: float = 0.0
     refusal: tuple[RejectReason, str] | None = None
     cancelled: bool = False
+    given_up: bool = False
+    """Its patience is over: whoever knows whether the local server got it is asked."""
 
     @property
     def ends(self) -> float:
@@ -270,8 +275,9 @@ class ExecutionTable:
         else:
             for waiter in execution.waiters:
                 self._remember_refused(waiter, execution.request_id, reason, text, execution.expires, now)
-        result = "cancelled" if reason is RejectReason.CANCELLED else "refused"
-        self._stats.executions[execution.service, result] += 1
+        if not execution.given_up:
+            result = "cancelled" if reason is RejectReason.CANCELLED else "refused"
+            self._stats.executions[execution.service, result] += 1
         execution.refusal = (reason, text)
         return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
 
@@ -314,15 +320,14 @@ class ExecutionTable:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
-        while self._timers and self._timers[0][1] not in self._running:
-            heapq.heappop(self._timers)
-        return self._timers[0][0] if self._timers else None
+        return first_of(self._timers, self._running)
 
     def handle_timer(self, now: float, backlog: Backlog) -> tuple[list[AbandonExecution], list[Reply]]:
-        """Give up executions that took too long; they may have run, so their ids stay.
+        """Give up executions that took too long.
 
-        Returns them, and what those robots are told that still wait. Also forgets what no copy can ask for any more,
-        so that answers do not stay in memory when the traffic ends.
+        Returns them, and what those robots are told that still wait and of which the application has not said within
+        SAY_WITHIN_S whether the local server got it: it may have run, so its id stays. Also forgets what no copy can
+        ask for any more, so that answers do not stay in memory when the traffic ends.
         """
         self._forget_old(now)
         abandoned = []
@@ -335,12 +340,19 @@ class ExecutionTable:
             if execution.ends > now:
                 heapq.heappush(self._timers, (execution.ends, execution_id))
                 continue
+            awaited = bool(execution.waiters) and execution.expires > now
+            if not execution.given_up:
+                self._stats.executions[execution.service, "abandoned"] += 1
+                abandoned.append(AbandonExecution(execution_id, awaited))
+                if awaited:
+                    execution.given_up = True
+                    execution.patience_ends = now + SAY_WITHIN_S
+                    heapq.heappush(self._timers, (execution.ends, execution_id))
+                    continue
             self._finish(execution_id)
             self._remember(execution, now)
             execution.refusal = (RejectReason.SERVER_LOST, "the server gave no answer in time")
-            self._stats.executions[execution.service, "abandoned"] += 1
-            abandoned.append(AbandonExecution(execution_id))
-            if execution.expires > now:
+            if awaited:
                 replies += [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
         return abandoned, replies
 
@@ -382,8 +394,10 @@ class ExecutionTable:
             self._stats.dropped["cached_answer_evicted"] += 1
 
     def _forget_old(self, now: float) -> None:
-        """Drop ids that no copy can ask for any more."""
-        while self._forget_at and self._forget_at[0][0] <= now:
+        """Drop ids that no copy can ask for any more: those of a burst, the rest the next times."""
+        for _ in range(FORGOTTEN_AT_ONCE):
+            if not self._forget_at or self._forget_at[0][0] > now:
+                return
             request_id = heapq.heappop(self._forget_at)[1]
             self._finished_shares.give_back(self._finished.pop(request_id).robot)
             self._uncache(request_id)

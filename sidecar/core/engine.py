@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from protos.model import MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.attention import Attention
-from sidecar.core.backlog import SLICE, Backlog, Step
+from sidecar.core.backlog import SLICE, Backlog, Step, rest
 from sidecar.core.events import (
     ApplicationEvent,
     ExecutionId,
@@ -22,7 +22,7 @@ from sidecar.core.events import (
     RequestId,
     WithdrawService,
 )
-from sidecar.core.inbound import Decoding, Inbound
+from sidecar.core.inbound import Inbound
 from sidecar.core.link_events import (
     Attend,
     FinishedLost,
@@ -31,7 +31,6 @@ from sidecar.core.link_events import (
     LinkCommand,
     LinkEvent,
     MessageAbandoned,
-    MessageDecoded,
     MessageFinished,
     MessageForgotten,
     PathChanged,
@@ -49,7 +48,7 @@ from sidecar.core.messages import CancelMessage, RequestMessage, ResponseMessage
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.peers import Peers
+from sidecar.core.peers import MAX_PEERS, Peers
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
@@ -62,6 +61,7 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, NodeName, Peer, ServiceMapping, ServiceName, ServiceOffer, SessionId
     from sidecar.core.budgets import Budget
+    from sidecar.core.decoding import Decoding
     from sidecar.core.session import OwnSession
 
 SWEEP_EVERY_S = 1.0
@@ -89,6 +89,8 @@ class Engine:
         self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
         self._events: list[ApplicationEvent] = []
         self._interfaces: set[InterfaceName] = set()
+        self._away: dict[NodeName, SessionId] = {}
+        """Cloud: robots that are no peers any more, as nothing was heard of them, and that may be back."""
         self._carried: Mapping[ServiceName, bool | None] = {}
         self._sweep_at = now + SWEEP_EVERY_S
         self._attention = Attention(now)
@@ -100,7 +102,15 @@ class Engine:
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
         self._measurements = Measurements(self.stats.dropped)
         self._serving = Serving(
-            ServingParts(self._rules, self.routes, self._outbox, self.stats, self._events.append, self.peers.may_call)
+            ServingParts(
+                self._rules,
+                self.routes,
+                self._outbox,
+                self.stats,
+                self._events.append,
+                self.peers.may_call,
+                self._backlog,
+            )
         )
         self._requests = RequestTable(
             RequestParts(
@@ -130,9 +140,14 @@ class Engine:
         self._events.clear()
         return events
 
-    def take_decodings(self) -> list[Decoding]:
-        """Return messages to compute outside any lock; what their `run` returns comes back as an event."""
-        return self._inbound.take_decodings()
+    def next_decoding(self) -> Decoding | None:
+        """Return the message of which a slice is to be computed next, outside any lock."""
+        return self._inbound.next_decoding()
+
+    @property
+    def decodings(self) -> int:
+        """How many messages are to be decoded."""
+        return self._inbound.decodings
 
     def _to_link(self, command: PathCommand) -> None:
         self._commands.append((command.path.interface, command))
@@ -209,9 +224,8 @@ class Engine:
             self._backlog.add_steps(self._outbox.on_interface_gone(interface), now)
             for path in paths:
                 self._requests.on_path_changed(path, PathState.DOWN, now)
-            for peer in {path.peer for path in paths}:
-                if not self.routes.reaches(peer):
-                    self._drop_if_unlisted(peer, now)
+            dark = dict.fromkeys(path.peer for path in paths if not self.routes.reaches(path.peer))
+            self._drop_unlisted(dark, now)
         self._update_offers(now)
         self._commands.append((None, SetPeers(self.peers.for_links())))
 
@@ -229,9 +243,18 @@ class Engine:
         ended = [name for name, session in before.items() if self.peers.session(name) != session]
         for name in ended:
             over = name in self.peers or name in left or name in self.peers.refused
-            self._forget_session(name, now, may_return=not over)
+            self._forget_session(name, now, may_return=None if over else before[name])
         self._follow_gone(ended, now)
+        self._end_away(left, now)
         return None
+
+    def _end_away(self, left: Collection[NodeName], now: float) -> None:
+        """Of the peers that might have come back, some are here again, and others never will be."""
+        for name, session in list(self._away.items()):
+            if self.peers.session(name) == session:
+                del self._away[name]
+            elif name in self.peers or name in left or name in self.peers.refused:
+                self._forget_session(name, now)
 
     def _follow_offers(self, now: float) -> None:
         """Other peers than before are known, or they may offer other services."""
@@ -293,9 +316,6 @@ class Engine:
                 if self._is_current(path, session):
                     for content, ends_at in self._inbound.add(path, session, fragments, now):
                         self._on_message(path, content, ends_at, now)
-            case MessageDecoded(path, session, content, ends_at):
-                if self._is_current(path, session):
-                    self._on_message(path, content, ends_at, now)
             case MessageAbandoned(peer, session, number):
                 if self.peers.session(peer) == session:
                     self._inbound.abandon(peer, number)
@@ -321,11 +341,26 @@ class Engine:
                 pass  # of a peer that left, or an interface that went, a moment ago
             case PeerRestarted():
                 if self.peers.restarted(event, now):
-                    self._end_session(event.peer, now)
+                    self._forget_session(event.peer, now)
+                    self._follow_gone((event.peer,), now)
                     self._commands.append((None, SetPeers(self.peers.for_links())))
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
                     self._on_peer_closed(peer, now)
+        self._after_news(now)
+
+    def on_decoded(self, decoding: Decoding, now: float) -> None:
+        """A message is computed (`decoding.run_slice` says when)."""
+        arrived = self._inbound.take_decoded(decoding)
+        if arrived is not None:
+            self._on_message(decoding.path, *arrived, now)
+            self._after_news(now)
+
+    def on_decoding_failed(self, decoding: Decoding) -> None:
+        """A message can not be computed."""
+        self._inbound.forgo_decoding(decoding)
+
+    def _after_news(self, now: float) -> None:
         if self._outbox.take_made_room():
             self._use_room(now)
         self._count_in_flight()
@@ -380,7 +415,7 @@ class Engine:
             if self._requests.unanswered:  # they wait: the other paths may be back as well, and share them
                 self._seek(frozenset((path.peer,)))
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
-            self._drop_if_unlisted(path.peer, now)
+            self._drop_unlisted((path.peer,), now)
         if self.routes.reaches(path.peer) is not reached:
             self._update_offers(now)
         self._requests.on_path_changed(path, state, now)
@@ -388,12 +423,20 @@ class Engine:
     def _knows(self, path: PathId) -> bool:
         return path.peer in self.peers and path.interface in self._interfaces
 
-    def _drop_if_unlisted(self, name: NodeName, now: float) -> None:
-        """The last path to a peer died, and it may have been kept for its paths only."""
-        if self.peers.drop_if_unlisted(name):
-            self._follow_offers(now)
-            self._end_session(name, now, may_return=True)
-            self._commands.append((None, SetPeers(self.peers.for_links())))
+    def _drop_unlisted(self, dark: Iterable[NodeName], now: float) -> None:
+        """The last path to each of these peers died, and it may have been kept for its paths only."""
+        dropped: dict[NodeName, SessionId | None] = {}
+        for name in dark:
+            session = self.peers.session(name)
+            if self.peers.drop_if_unlisted(name):
+                dropped[name] = session
+        if not dropped:
+            return
+        self._follow_offers(now)
+        for name, session in dropped.items():
+            self._forget_session(name, now, may_return=session)
+        self._follow_gone(dropped, now)
+        self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def _on_peer_closed(self, name: NodeName, now: float) -> None:
         """It said goodbye: nothing new goes there; the control plane will say the same."""
@@ -409,17 +452,19 @@ class Engine:
         )
         self._update_offers(now)
         self._requests.on_peer_gone(name, now)
-        self._drop_if_unlisted(name, now)
+        self._drop_unlisted((name,), now)
 
-    def _end_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
-        self._forget_session(name, now, may_return=may_return)
-        self._follow_gone((name,), now)
-
-    def _forget_session(self, name: NodeName, now: float, *, may_return: bool = False) -> None:
-        """`may_return`: it was only silent for long, and may be back with the same session, for its answers."""
-        called_off = [] if may_return else self._serving.on_session_over(name)
-        let_go = [*self._outbox.drop_peer(name), *self._serving.on_robot_gone(name)]
-        self._backlog.add_steps(called_off + let_go, now)
+    def _forget_session(self, name: NodeName, now: float, *, may_return: SessionId | None = None) -> None:
+        """`may_return`: it was only silent for long, and may be back with this session, for its answers."""
+        if may_return is not None and self._config.role is Role.CLOUD:
+            self._away[name] = may_return
+            if len(self._away) > MAX_PEERS:
+                self._forget_session(next(iter(self._away)), now)
+        else:
+            self._away.pop(name, None)
+            called_off = self._serving.on_session_over(name)
+            let_go = [*self._outbox.drop_peer(name), *self._serving.on_robot_gone(name)]
+            self._backlog.add_steps(called_off + let_go, now)
         self._inbound.forget_peer(name)
         self.routes.forget_peer(name)
 
@@ -461,7 +506,7 @@ class Engine:
         self._backlog.begin_turn(now)
         self._backlog.run(now, leave=SLICE // 2)  # deadlines must not wait until all is done
         self._requests.handle_timer(now)
-        self._serving.handle_timer(now, self._backlog)
+        self._serving.handle_timer(now)
         self._backlog.run(now)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S
@@ -476,8 +521,4 @@ class Engine:
         self._count_in_flight()
 
 
-def _rest(_now: float) -> None:
-    """Takes a step's time from the turn."""
-
-
-_REST: tuple[Step, ...] = (_rest,) * 5
+_REST: tuple[Step, ...] = (rest,) * 5

@@ -134,9 +134,11 @@ class ExecuteRequest:
 
 @dataclass(frozen=True, slots=True)
 class AbandonExecution:
-    """Nobody waits for this execution any more: forget it."""
+    """The local server took too long with this execution, or nobody waits for it any more: forget it."""
 
     execution: ExecutionId
+    awaited: bool = False
+    """A robot waits still: refuse it, for a reason that says whether the local server got it."""
 
 
 @dataclass(frozen=True, slots=True)

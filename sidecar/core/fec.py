@@ -22,6 +22,9 @@ MAX_BLOCK = 128
 """Source symbols of one block. Large blocks need fewer repair symbols for the same protection, but each costs time in
 proportion to the block; with as many repair symbols again the field of 256 is full."""
 
+SYMBOL_COST = 512
+"""What it takes to hand one symbol to the codec, as so many multiplications of a byte."""
+
 
 class _Codec(Protocol):
     def encode(self, blocks: Sequence[object], numbers: Sequence[int]) -> list[bytes]: ...
@@ -52,23 +55,33 @@ def encode(sources: Sequence[bytes | bytearray | memoryview], row: int) -> bytes
 
 
 def decode(
-    sources: Sequence[bytes | bytearray | memoryview | None], repairs: dict[int, bytes]
+    sources: Sequence[bytes | memoryview | None], repairs: dict[int, bytes], first: int, last: int
 ) -> list[tuple[int, bytes]]:
-    """Return the missing (None) source symbols of a block with their places.
+    """Return the bytes from `first` to `last` of the missing (None) source symbols of a block, with their places.
 
     `repairs` holds at least as many as are missing, by row (0 <= row < len(sources)); all symbols are equally long.
     """
     size = len(sources)
-    blocks: list[object] = list(sources)
+    blocks: list[object] = [None if source is None else source[first:last] for source in sources]
     numbers = list(range(size))
     rows = iter(repairs.items())
     missing = [place for place, source in enumerate(sources) if source is None]
     for place in missing:
         # zfec wants every source symbol in its own place, and never ends when a number comes twice.
-        row, blocks[place] = next(rows)
+        row, repair = next(rows)
+        blocks[place] = repair[first:last]
         numbers[place] = size + row
     decoded = _decoder(size).decode(tuple(blocks), tuple(numbers))
     return [(place, decoded[place]) for place in missing]
+
+
+def decoding_cost(size: int, missing: int) -> tuple[int, int]:
+    """What it takes to decode a block of `size` source symbols, in multiplications of a byte (0.8 ns).
+
+    Returns what one call of `decode` takes, and what each column of bytes takes besides.
+    """
+    # It inverts the rows of what is missing, and looks at each symbol. Measured with 1 to 128 symbols missing of 128.
+    return missing * missing * size + size * SYMBOL_COST, missing * size
 
 
 # At most MAX_BLOCK entries each; a table of 128 rows costs half a millisecond to make and 32 kB to keep. The codecs

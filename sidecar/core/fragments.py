@@ -192,6 +192,10 @@ class Reassembler:
         if number not in self._over:
             self._remember(number, Fate.ABANDONED)
 
+    def forgo(self, number: int) -> None:
+        """A message that was finished has no room to be decoded: what still comes of it is answered FORGOTTEN."""
+        self._over[number] = Fate.FORGOTTEN
+
     def expire(self, now: float) -> None:
         """Drop messages that got no symbol for MAX_AGE_S."""
         while self._partials and next(iter(self._partials.values())).touched_at + MAX_AGE_S <= now:

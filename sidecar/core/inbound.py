@@ -1,13 +1,13 @@
-"""Messages on their way in: one reassembler for each peer, and the decoding that is left to the driver."""
+"""Messages on their way in: one reassembler for each peer, and what is to be decoded."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+from sidecar.core.decoding import Decoding, DecodingLine
 from sidecar.core.fragments import OVER_REMEMBERED, Fate, Reassembler
 from sidecar.core.frame import BASE_SYMBOL_BYTES
-from sidecar.core.link_events import MessageDecoded, SendFinished, SendForgotten
+from sidecar.core.link_events import SendFinished, SendForgotten
 from sidecar.core.partial import Partial
 
 if TYPE_CHECKING:
@@ -18,19 +18,6 @@ if TYPE_CHECKING:
     from sidecar.core.link_events import PathCommand
     from sidecar.core.path_id import PathId
     from sidecar.core.stats import EngineStats
-
-
-@dataclass(frozen=True, slots=True)
-class Decoding:
-    """A message to compute from its symbols: work for whoever drives the engine, while nothing is locked."""
-
-    path: PathId
-    session: SessionId
-    partial: Partial
-
-    def run(self) -> MessageDecoded:
-        """Compute it, in up to some milliseconds; the result is an event for the engine."""
-        return MessageDecoded(self.path, self.session, self.partial.decode(), self.partial.ends_at)
 
 
 class Arrived(NamedTuple):
@@ -49,7 +36,7 @@ class Inbound:
         self._stats = stats
         self._answers = answers
         self._reassemblers: dict[NodeName, Reassembler] = {}
-        self._decodings: list[Decoding] = []
+        self._line = DecodingLine()
         self._untold: dict[NodeName, dict[int, None]] = {}
         """Finished messages whose peer could not be told for want of a path, oldest first."""
 
@@ -63,10 +50,16 @@ class Inbound:
             if fate is Fate.FORGOTTEN:
                 self._command(SendForgotten(path, number))
                 continue
+            if isinstance(content, Partial) and not self._line.fits(path.peer, content):
+                # Its sender sends it again, as another message.
+                self._stats.dropped["decoding_full"] += 1
+                reassembler.forgo(number)
+                self._command(SendForgotten(path, number))
+                continue
             # Also when it is still to be decoded: nothing that might come could help.
             self._command(SendFinished(path, number, at_once=not (self._answers and _is_small(content))))
             if isinstance(content, Partial):
-                self._decodings.append(Decoding(path, session, content))
+                self._line.add(Decoding(path, session, content))
             elif content is not None:
                 whole.append(Arrived(content, ends_at))
         return whole
@@ -91,10 +84,25 @@ class Inbound:
         for number in self._untold.pop(path.peer, ()):
             self._command(SendFinished(path, number))
 
-    def take_decodings(self) -> list[Decoding]:
-        """Return the messages to be decoded."""
-        decodings, self._decodings = self._decodings, []
-        return decodings
+    def next_decoding(self) -> Decoding | None:
+        """Return the message of which a slice is to be computed next."""
+        return self._line.next()
+
+    @property
+    def decodings(self) -> int:
+        """How many messages are to be decoded."""
+        return len(self._line)
+
+    def forgo_decoding(self, decoding: Decoding) -> None:
+        """It can not be computed."""
+        if self._line.done(decoding):
+            self._stats.dropped["decoding_failed"] += 1
+
+    def take_decoded(self, decoding: Decoding) -> Arrived | None:
+        """It is computed; returns the message, unless its session is over."""
+        if not self._line.done(decoding):
+            return None
+        return Arrived(decoding.partial.whole(), decoding.partial.ends_at)
 
     def abandon(self, peer: NodeName, number: int) -> None:
         """The peer does not send the rest of this message."""
@@ -105,6 +113,7 @@ class Inbound:
     def forget_peer(self, peer: NodeName) -> None:
         """The peer's session is over."""
         self._reassemblers.pop(peer, None)
+        self._stats.dropped["fragment_of_old_session"] += self._line.forget_peer(peer)
         self._untold.pop(peer, None)
 
     def expire(self, now: float) -> None:

@@ -202,17 +202,6 @@ class MessageFinished:
 
 
 @dataclass(frozen=True, slots=True)
-class MessageDecoded:
-    """A message was computed from its symbols (`inbound.py`): the driver's answer, not a link's."""
-
-    path: PathId
-    session: SessionId
-    content: memoryview
-    ends_at: float
-    """When it is of no use any more."""
-
-
-@dataclass(frozen=True, slots=True)
 class MessageAbandoned:
     """The peer does not send the rest of its message."""
 
@@ -286,7 +275,6 @@ LinkEvent = (
     | MessageFinished
     | MessageAbandoned
     | MessageForgotten
-    | MessageDecoded
     | PathChanged
     | PathMtuChanged
     | PathMeasured

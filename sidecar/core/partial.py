@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import mmap
+from typing import TYPE_CHECKING
 
 from sidecar.core import fec
 from sidecar.core.frame import symbol_count
 from sidecar.core.timers import NEVER
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 LAZY_BYTES = 1024 * 1024
 """From this size on, a buffer's pages are claimed as they are written: announcing 16 MiB must cost nothing."""
+
+SLICE_OPERATIONS = 4_000_000
+"""What is computed in one go, in multiplications of a byte: some 3 ms. The largest block takes most of that to find out
+how (`fec.decoding_cost`), for each slice again."""
 
 
 class Partial:
@@ -88,25 +96,38 @@ class Partial:
         return self.have[block :: self._blocks].count(0)
 
     def whole(self) -> memoryview:
-        """Return the message; nothing is missing."""
+        """Return the message; nothing is missing, or it is decoded."""
         return memoryview(self.buffer)
 
-    def decode(self) -> memoryview:
-        """Compute what is missing and return the message. Takes up to some milliseconds: not for under a lock.
+    def decode(self) -> Iterator[None]:
+        """Compute what is missing, a slice at each step; then the message is `whole`. Not for under a lock.
 
-        Symbols of a dishonest sender give a message of garbage.
+        A slice is SLICE_OPERATIONS at most, some milliseconds: some blocks, or some columns of one (any byte of a
+        symbol depends on the same byte of the others alone). Symbols of a dishonest sender give a message of garbage.
         """
         buffer, symbol = memoryview(self.buffer), self.symbol
+        left = SLICE_OPERATIONS
         for block, rows in self._rows.items():
-            if not self._missing_in(block):
+            missing = self._missing_in(block)
+            if not missing:
                 continue
             indices = range(block, self.count, self._blocks)
             sources = [self._padded(buffer, index) if self.have[index] else None for index in indices]
-            for place, data in fec.decode(sources, rows):
-                start = indices[place] * symbol
-                length = min(symbol, self.total - start)
-                buffer[start : start + length] = data[:length]
-        return buffer
+            fixed, of_a_column = fec.decoding_cost(len(indices), missing)
+            first = 0
+            while first < symbol:
+                columns = min(symbol - first, (left - fixed) // of_a_column)
+                if columns < symbol - first and left < SLICE_OPERATIONS:
+                    yield
+                    left = SLICE_OPERATIONS
+                    continue
+                last = first + columns
+                for place, data in fec.decode(sources, rows, first, last):
+                    start = indices[place] * symbol
+                    end = min(start + last, self.total)
+                    buffer[start + first : end] = data[: max(0, end - start - first)]
+                left -= fixed + columns * of_a_column
+                first = last
 
     def _padded(self, buffer: memoryview, index: int) -> bytes | memoryview:
         start = index * self.symbol

@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.shares import Shares
+from sidecar.core.shares import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
     from protos.model import NodeName
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 MAX_REFUSED_COPIES = 65_536
 """Copies remembered; one robot may fill half: 500 refused copies a second for a minute. What is not remembered may run
 if it comes once more, and somewhere else besides."""
-FORGOTTEN_AT_ONCE = 128
-"""Copies forgotten in one call: less than a millisecond."""
 
 
 class RefusedCopy(NamedTuple):

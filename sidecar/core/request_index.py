@@ -27,7 +27,7 @@ class RequestIndex:
         self._by_path: dict[PathId, dict[RequestId, Request]] = {}
         self._by_server: dict[NodeName, dict[tuple[RequestId, int], tuple[Request, Copy]]] = {}
 
-    def __contains__(self, request_id: RequestId) -> bool:
+    def __contains__(self, request_id: object) -> bool:
         return request_id in self._by_id
 
     def __len__(self) -> int:
@@ -79,6 +79,10 @@ class RequestIndex:
     def paths(self) -> list[PathId]:
         """Return the paths over which copies were sent."""
         return list(self._by_path)
+
+    def uses(self, path: PathId) -> bool:
+        """Whether a copy was sent over this path, of a request in flight."""
+        return path in self._by_path
 
     def over(self, path: PathId) -> list[Request]:
         """Return the requests of which a copy was sent over this path."""

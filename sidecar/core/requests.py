@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
 from protos.model import Assignment
+from sidecar.core.backlog import GROUP, rest
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
@@ -37,6 +38,7 @@ from sidecar.core.messages import (
 from sidecar.core.no_room import NoRoom
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.redundancy_mode import RedundancyMode
+from sidecar.core.timers import first_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
@@ -56,6 +58,8 @@ MAX_RETRY_S = 2.0
 minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
 """Payloads of requests until the last copy of each has ended, also while they wait for a path or for room."""
+TIMER_SLACK = 1024
+"""Timers that may come up beyond twice those left by the last sweep, before those of what is over are swept out."""
 
 
 class RequestTable:
@@ -66,6 +70,7 @@ class RequestTable:
         self._requests = parts.in_flight
         self._backlog = parts.backlog
         self._timers: list[tuple[float, RequestId]] = []
+        self._most_timers = TIMER_SLACK
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
         self._no_room = NoRoom(self._dispatching, parts.routes)
@@ -94,7 +99,7 @@ class RequestTable:
         self._requests.add(request)
         self.unanswered += 1
         self._held_bytes += request.held
-        heapq.heappush(self._timers, (request.deadline_at, request_id))
+        self._arm(request.deadline_at, request_id)
         request.dark = self._parts.routes.dark(self._parts.offers.servers(service))
         self._dispatch(request, now)
         if request in self._no_room:
@@ -168,7 +173,14 @@ class RequestTable:
 
     def _look_at(self, request: Request, when: float | None) -> None:
         if when is not None:
-            heapq.heappush(self._timers, (when, request.id))
+            self._arm(when, request.id)
+
+    def _arm(self, at: float, request_id: RequestId) -> None:
+        heapq.heappush(self._timers, (at, request_id))
+        if len(self._timers) > self._most_timers:
+            self._timers = [timer for timer in self._timers if timer[1] in self._requests]
+            heapq.heapify(self._timers)
+            self._most_timers = 2 * len(self._timers) + TIMER_SLACK
 
     # -- the peers ------------------------------------------------------------------------------------------------
 
@@ -306,11 +318,10 @@ class RequestTable:
             self._backlog.add(self._in_trouble, now, "in trouble")
             self.on_room(now)
             return
-        self._backlog.add(partial(self._look_after_path, path), now, path)
+        if self._requests.uses(path):
+            self._backlog.add(partial(self._look_after_path, path), now, path)
         if state is PathState.DOWN and not self._parts.routes.reaches(path.peer):
-            for service in self._requests.services():
-                if not self._parts.routes.reaches_any(self._parts.offers.servers(service)):
-                    self._backlog.add(partial(self._unreachable, service), now, ("unreachable", service))
+            self._backlog.add(self._unreachable, now, "unreachable")
 
     def _look_after_path(self, path: PathId) -> Iterator[Step]:
         return self._each(self._look_after, self._requests.over(path))
@@ -326,8 +337,13 @@ class RequestTable:
             if self._parts.routes.state(path) is not PathState.UP:
                 yield from self._each(self._look_after, self._requests.over(path))
 
-    def _unreachable(self, service: ServiceName) -> Iterator[Step]:
-        return self._each(self._notice_unreachable, self._requests.of(service))
+    def _unreachable(self) -> Iterator[Step]:
+        """Look at all services, some at each step: a server out of reach may have been the last of any."""
+        for number, service in enumerate(self._requests.services()):
+            if number % GROUP == 0:
+                yield rest
+            if not self._parts.routes.reaches_any(self._parts.offers.servers(service)):
+                yield from self._each(self._notice_unreachable, self._requests.of(service))
 
     def _look_after(self, request: Request, now: float) -> None:
         """A path of this request changed: its copies on others than those that are up are not relied on."""
@@ -391,9 +407,7 @@ class RequestTable:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
-        while self._timers and self._timers[0][1] not in self._requests:
-            heapq.heappop(self._timers)
-        return self._timers[0][0] if self._timers else None
+        return first_of(self._timers, self._requests)
 
     def handle_timer(self, now: float) -> None:
         """Deadlines and lifetimes that are over, as many as the turn has room for."""
@@ -411,7 +425,7 @@ class RequestTable:
             if now < request.deadline_at:
                 self._look_at(request, self._dispatching.look_again(request, now))
                 continue
-            heapq.heappush(self._timers, (request.expires_at, request_id))
+            self._arm(request.expires_at, request_id)
             self._measure(request, now)
             if request.done:
                 self._settle(request, now)

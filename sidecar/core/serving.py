@@ -38,6 +38,7 @@ class ServingParts:
     emit: Callable[[ApplicationEvent], None]
     may_call: Callable[[NodeName, ServiceName], bool]
     """Whether the access policy lets a robot call a service here."""
+    backlog: Backlog
 
 
 class Serving:
@@ -49,7 +50,7 @@ class Serving:
         self._draining = False
         self._forbidden = ForbiddenCalls()
         self.executions = ExecutionTable(parts.stats)
-        self.answers = Answers(parts.rules, parts.routes, parts.outbox, parts.stats)
+        self.answers = Answers(parts.rules, parts.routes, parts.outbox, parts.stats, parts.backlog)
 
     @property
     def running(self) -> int:
@@ -147,10 +148,10 @@ class Serving:
         timers = (self.executions.next_timer(), self.answers.next_timer())
         return min((timer for timer in timers if timer is not None), default=None)
 
-    def handle_timer(self, now: float, backlog: Backlog) -> None:
+    def handle_timer(self, now: float) -> None:
         """Give up what took too long to run, or to be sent, as much of it as the turn has room for."""
-        abandoned, replies = self.executions.handle_timer(now, backlog)
+        abandoned, replies = self.executions.handle_timer(now, self._parts.backlog)
         for event in abandoned:
             self._parts.emit(event)
         self.answers.send(replies, now)
-        self.answers.handle_timer(now, backlog)
+        self.answers.handle_timer(now)

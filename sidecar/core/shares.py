@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from protos.model import NodeName
 
+FORGOTTEN_AT_ONCE = 128
+"""Old entries that a table forgets in one call, the rest in the next ones: less than a millisecond after any burst."""
+
 
 class Shares:
     """What each peer holds of `capacity` units.

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.link_events import CheckPaths, ResetPaths, SendClose, SetCredential
+from sidecar.net.decoder import Decoder
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
@@ -38,8 +39,8 @@ if TYPE_CHECKING:
         ServiceUse,
         SessionId,
     )
+    from sidecar.core.decoding import Decoding
     from sidecar.core.events import ExecutionId, RejectReason, RequestId
-    from sidecar.core.inbound import Decoding
     from sidecar.core.link_events import LinkEvent
     from sidecar.core.path_id import PathState
     from sidecar.core.session import OwnSession
@@ -55,6 +56,8 @@ EVENTS_A_TURN = 32
 YIELD_S = 100e-6
 """Between two turns of one thread, for whoever waits for the lock: the lock goes to who asks first, and a thread that
 must be woken for it is too late."""
+STOP_S = 2.0
+"""For each of our threads to end."""
 ERROR_PAUSE_S = 0.1
 """After an internal error, which may repeat itself at every turn."""
 
@@ -84,6 +87,7 @@ class ThreadedDataPlane:
         self._lock = threading.RLock()  # the application may call us from within its `handle`
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
+        self._decoder = Decoder(self)
         self._watchdog = Watchdog(self._clock())
         self._told_paths = self._engine.routes.best
         self._stopping = False
@@ -95,8 +99,9 @@ class ThreadedDataPlane:
     # -- life -----------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start the timer; interfaces come by `set_links`."""
+        """Start the timer and the decoder; interfaces come by `set_links`."""
         self._timer_thread.start()
+        self._decoder.start()
 
     def set_links(self, links: dict[InterfaceName, InterfaceThread]) -> None:
         """Use these interfaces from now on; starting and stopping their threads is the caller's."""
@@ -125,7 +130,7 @@ class ThreadedDataPlane:
             return self._engine.busy
 
     def stop(self) -> None:
-        """Say goodbye to the peers and end the timer; the caller stops the links after it."""
+        """Say goodbye to the peers, end the timer and the decoder; the caller stops the links after it."""
         with self._lock:
             links = list(self._links.values())
         for link in links:
@@ -134,7 +139,8 @@ class ThreadedDataPlane:
         self._stopping = True
         with self._lock:
             self._timer.arm(0.0)
-        self._timer_thread.join(2.0)
+        self._timer_thread.join(STOP_S)
+        self._decoder.stop(STOP_S)
 
     # -- sidecar.ports.DataPlane ----------------------------------------------------------------------------------
 
@@ -306,24 +312,41 @@ class ThreadedDataPlane:
     def on_link_events(self, events: list[LinkEvent]) -> None:
         """Take what a link saw."""
         engine = self._engine
-        while events:
-            decodings: list[Decoding] = []
-            for first in range(0, len(events), EVENTS_A_TURN):
-                if first:
-                    time.sleep(YIELD_S)
-                now = self._clock()
-                with self._lock:
-                    for event in events[first : first + EVENTS_A_TURN]:
-                        engine.on_link_event(event, now)
-                    decodings += engine.take_decodings()
-                    woken = self._queue_outputs()
-                self._wake(woken)
-            # On this link's thread, with nothing locked.
-            events = [decoding.run() for decoding in decodings]
+        for first in range(0, len(events), EVENTS_A_TURN):
+            if first:
+                time.sleep(YIELD_S)
+            now = self._clock()
+            with self._lock:
+                for event in events[first : first + EVENTS_A_TURN]:
+                    engine.on_link_event(event, now)
+                to_decode = engine.decodings
+                woken = self._queue_outputs()
+            self._wake(woken)
+            if to_decode:
+                self._decoder.wake()
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
         """Take what STUN found."""
         self._hooks.stun(interface, event)
+
+    # -- DecodingOwner --------------------------------------------------------------------------------------------
+
+    def next_decoding(self) -> Decoding | None:
+        """Return the message of which a slice is to be computed next."""
+        with self._lock:
+            return self._engine.next_decoding()
+
+    def on_decoded(self, decoding: Decoding) -> None:
+        """A message is computed."""
+        with self._lock:
+            self._engine.on_decoded(decoding, self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+
+    def on_decoding_failed(self, decoding: Decoding) -> None:
+        """A message can not be computed."""
+        with self._lock:
+            self._engine.on_decoding_failed(decoding)
 
     # -- under the lock -------------------------------------------------------------------------------------------
 

@@ -147,6 +147,11 @@ class CloudSide:
         runner.abandon(execution)
         self._stats.abandoned[runner.name] += 1
         self._stats.pending = len(self._executions)
+        if event.awaited and execution.number is None:
+            why = "its time here was over before the server had room for it"
+            self._data_plane.refuse(execution.id, RejectReason.OVERLOADED, why)
+        elif event.awaited:
+            self._data_plane.refuse(execution.id, RejectReason.SERVER_LOST, "the server gave no answer in time")
 
     def _cancel(self, event: CancelExecution) -> None:
         """The robot has its answer: what its server has not got yet needs not run."""
@@ -247,7 +252,13 @@ class CloudSide:
             return
         try:
             runner = ServiceRunner(
-                self._loop.node, name, load_service_type(type_name), self._answered, self._stray, self._unsent
+                self._loop.node,
+                name,
+                load_service_type(type_name),
+                self._answered,
+                self._stray,
+                self._unsent,
+                self._is_alive_since,
             )
         except RosBridgeError as error:
             if name not in self._missing_types:
@@ -304,6 +315,13 @@ class CloudSide:
     def _is_dead(self, endpoint: bytes) -> bool:
         return self._processes.has_ended(endpoint) or self._roll_call.is_silent(endpoint)
 
+    def _is_alive_since(self, runner: ServiceRunner, since: float) -> bool:
+        """Whether its end would have been noticed, or it was heard since then."""
+        return all(
+            self._processes.watches(endpoint) or self._roll_call.has_heard(endpoint, since)
+            for endpoint in runner.server.endpoints
+        )
+
     def _is_watched(self, runner: ServiceRunner) -> bool:
         return all(self._processes.watches(endpoint) for endpoint in runner.server.endpoints)
 
@@ -357,6 +375,7 @@ class CloudSide:
             if self._roll_call.turn(self._endpoints_to_ask(now), now):
                 self._notice_silence()
             self._check_at = now + (POLL_S if self._roll_call.under_way else CHECK_EVERY_S)
+            self._paced |= self._at_work  # who was heard may get more than it answers
         for runner in tuple(self._paced):
             due = runner.window.next_due()
             if due is None:

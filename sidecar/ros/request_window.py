@@ -3,14 +3,15 @@
 A ROS server made with the default profile keeps the last 10 requests it has not taken yet; the 11th pushes the first
 one out without a trace. How many lie there cannot be asked, but follows from the answers: the requests of one client
 are taken in order, so an answer tells that its request and all earlier ones have left the queue. At most SAFE_SIZE
-later ones are let through, or two more than the server was seen to work on at one moment; the rest wait here. From
-the silence of a server nothing is concluded: it may need a minute for each. Only what nobody waits for any more counts
-no longer once it is the oldest: it is what would be pushed out first.
+later ones are let through; the rest wait here. An earlier one that is not answered yet is in work, and takes no room in
+the queue. From the silence of a server nothing is concluded: it may need a minute for each. Only what nobody waits for
+any more counts no longer once it is the oldest: it is what would be pushed out first.
 
 That is the most. As no request can be called back from a server's queue, where nothing more urgent overtakes it, only
 as many are let through as the server needs to be busy (`server_capacity.py`): one or two, if it takes one after the
 other. An answer may be lost, though, so after a silence one more is let through, and then another, each time after
-twice as long.
+twice as long, provided that the server has shown a sign of life meanwhile: what goes to a dead one may have run there,
+and if that may happen only once, it is lost.
 
 What is late already when its turn comes, or would be when the server has done it, must not keep the server from what is
 not: after an outage a backlog comes first and what the robot asks now right behind it. So only one late request at a
@@ -26,7 +27,7 @@ from sidecar.ros.request_queue import RequestQueue
 from sidecar.ros.server_capacity import FIRST_LIMIT, SAFE_SIZE, ServerCapacity
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterator
+    from collections.abc import Callable, Hashable, Iterator
 
     from sidecar.core.priority import Priority
 
@@ -45,10 +46,15 @@ way here, and one at a time would only make it worse."""
 T = TypeVar("T", bound="Hashable")
 
 
+def _lives(_since: float) -> bool:
+    return True
+
+
 class RequestWindow(Generic[T]):
     """Which requests may go to the server now. The caller sends what `release` yields and reports `sent`."""
 
     __slots__ = (
+        "_alive_since",
         "_capacity",
         "_freed",
         "_given_up",
@@ -63,7 +69,9 @@ class RequestWindow(Generic[T]):
         "_waiting",
     )
 
-    def __init__(self, first: int = FIRST_LIMIT) -> None:
+    def __init__(self, first: int = FIRST_LIMIT, alive_since: Callable[[float], bool] = _lives) -> None:
+        """`alive_since`: whether the server has shown a sign of life since then (s), other than an answer."""
+        self._alive_since = alive_since
         self._capacity = ServerCapacity(first)
         self._waiting: RequestQueue[T] = RequestQueue()
         self._unseen: deque[int] = deque()
@@ -93,8 +101,7 @@ class RequestWindow(Generic[T]):
     def size(self) -> int:
         """How many requests the server may have that it was not seen to have taken."""
         wanted = self._capacity.limit - self._capacity.overtaken
-        after_silences = min(wanted + self._silences, SAFE_SIZE)
-        return max(1, wanted, after_silences)
+        return max(1, min(wanted + self._silences, SAFE_SIZE))
 
     def add(self, request: T, priority: Priority, deadline: float, now: float) -> None:
         """Let a request wait for its turn."""
@@ -180,8 +187,8 @@ class RequestWindow(Generic[T]):
         return min(self._next_late_at, self._only_late_since + LATE_ONLY_S)
 
     def _silent_at(self) -> float | None:
-        """When one more may go although the window is full; None: never, or it is open."""
-        if not self.size <= len(self._unseen) < SAFE_SIZE:
+        """When one more may go although the window is full; None: never, or it is open, or the server may be dead."""
+        if not self.size <= len(self._unseen) < SAFE_SIZE or not self._alive_since(self._progress_at):
             return None
         if self._capacity.usual_s:
             patience_s = max(SHORT_STALL_S, STALL_TIMES * self._capacity.usual_s) * 2.0**self._silences

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import math
 from typing import TYPE_CHECKING, Any
 
 from sidecar.ros.dds_id import PARTICIPANT_BYTES, participant_of
@@ -47,11 +48,17 @@ class RollCall:
         self._next_at = 0.0
         self._missed: dict[bytes, int] = {}
         """Calls in a row that a participant did not answer."""
+        self._heard_at: dict[bytes, float] = {}
+        """When a participant answered last."""
         self._usable = True
 
     def is_silent(self, endpoint: bytes) -> bool:
         """Whether its participant answered none of the last calls."""
         return self._missed.get(participant_of(endpoint), 0) >= CALLS_MISSED
+
+    def has_heard(self, endpoint: bytes, since: float) -> bool:
+        """Whether its participant answered a call since then, or can not be asked at all."""
+        return not self._usable or self._heard_at.get(participant_of(endpoint), -math.inf) >= since
 
     @property
     def under_way(self) -> bool:
@@ -62,7 +69,7 @@ class RollCall:
         """Ask those behind `endpoints`, if it is time, and hear who answers; True when `is_silent` changed."""
         if self._topic is None:
             return self._call({participant_of(endpoint) for endpoint in endpoints}, now)
-        changed = self._hear(self._topic)
+        changed = self._hear(self._topic, now)
         if self._asked and now < self._ends_at:
             return changed
         for participant in self._asked:
@@ -77,6 +84,7 @@ class RollCall:
         """Forget all others: the graph shows them no more."""
         wanted = {participant_of(endpoint) for endpoint in endpoints}
         self._missed = {participant: missed for participant, missed in self._missed.items() if participant in wanted}
+        self._heard_at = {participant: at for participant, at in self._heard_at.items() if participant in wanted}
 
     def close(self) -> None:
         """Ask nobody any more."""
@@ -99,7 +107,7 @@ class RollCall:
         self._ends_at = now + CALL_S
         return False
 
-    def _hear(self, topic: LatchedTopic) -> bool:
+    def _hear(self, topic: LatchedTopic, now: float) -> bool:
         changed = False
         for _ in range(TAKEN_AT_ONCE):
             said = topic.take()
@@ -107,7 +115,9 @@ class RollCall:
                 break
             # The message begins with the participant's id.
             participant = said[_CDR_HEADER_BYTES : _CDR_HEADER_BYTES + PARTICIPANT_BYTES]
-            self._asked.discard(participant)
+            if participant in self._asked:
+                self._asked.remove(participant)
+                self._heard_at[participant] = now
             changed |= self._missed.pop(participant, 0) >= CALLS_MISSED
         return changed
 

@@ -6,19 +6,22 @@ law: with `n` requests at the server at a time that take `r` seconds each, where
 work of `n * a / r` requests alone. Of a server that takes one after the other, that is 1, and a little more where the
 way there takes a part of `a`; of one with four threads 4. As long as it keeps pace with `n`, twice as many are tried.
 
-Means are compared, not extremes: service times may vary. `a` is measured where requests are too few to meet. Under load
-the server is emptied for that now and then, and when it seems to have fallen behind: either its work became longer, or
-its threads fewer. A server whose threads share one processor gains nothing from several at once, and counts as one that
-takes one after the other.
+Service times may vary, so means are compared, and only what is sure of them counts: where they vary much the law says
+little. Then answers out of order prove how many were in work at one moment (`request_overlap.py`), and one more than
+that may be there, unless that many gain nothing, as their threads share one processor (`overlap_gain.py`).
 
-Apart from that, answers out of order prove that several were in work at one moment, as requests are taken in order.
+`a` is measured where requests are too few to meet. Where no overlap tells more, the server is emptied for that now and
+then, and when it seems to have fallen behind: either its work became longer, or its threads fewer.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
+
+from sidecar.ros.overlap_gain import OverlapGain
+from sidecar.ros.request_overlap import RequestOverlap
+from sidecar.ros.service_times import ServiceTimes
 
 FIRST_LIMIT = 2
 """One in work and one that is there when that is done."""
@@ -35,14 +38,20 @@ LONG_S = 0.1
 """... unless requests take longer than this alone: then the server idles for a few per cent of its time at most, and
 order is worth more."""
 KEEPS_PACE = 0.4
-"""With no more than so many requests waiting at the server as it seems, more at once are tried: twice as many until it
+"""With no more than so many requests waiting at the server for sure, more at once are tried: twice as many until it
 falls behind for the first time, then one more."""
 ROUNDING = 0.25
 """Of a server that works on one at once, the law gives a little more by chance."""
 LEAST_ROUND = 4
 """Answers by which the limit is judged, or as many as the limit. Once it fell behind, twice as many of either."""
-ALONE_WEIGHT = 0.25
-"""Of the newest request that was alone, in their mean."""
+ALONE_KEPT = 8
+"""Requests that were alone have at least one part of so many in their mean."""
+SURER = 4
+"""Rounds that are waited for if that may show that the limit is right."""
+LEAST_ALONE = 4
+"""So many are measured once it matters how much they vary."""
+SURE = 2.0
+"""Standard errors by which a mean may be wrong."""
 USUAL_WEIGHT = 0.125
 """Of the newest answer, in the mean of what all take."""
 ALONE_FOR_S = 0.02
@@ -56,8 +65,6 @@ FIRST_ROUNDS, MOST_ROUNDS = 8, 64
 That costs a few per cent of the work of a server with many threads, nothing of one that takes one after the other."""
 FIRST_TRY_AFTER, LAST_TRY_AFTER = 4, 64
 """Answers to single requests after which two at once are tried again; they double each time."""
-REMEMBERED = 64
-"""Answers that are looked at for overlaps, and requests whose times are known: twice MOST_AT_ONCE."""
 
 
 @dataclass(slots=True)
@@ -73,45 +80,44 @@ class ServerCapacity:
     """What is known of one server. Request numbers ascend; times are seconds."""
 
     __slots__ = (
+        "_alone",
         "_alone_at",
         "_answers",
+        "_by_times",
+        "_calibrated_before",
         "_calibrated_s",
         "_calibrating",
-        "_events",
         "_fell_behind",
-        "_highest",
-        "_in_work",
+        "_gain",
         "_limit",
         "_only",
-        "_overtaken",
+        "_overlap",
         "_round",
-        "_round_out",
-        "_round_s",
         "_rounds",
         "_sent",
         "_singles",
         "_try_after",
-        "alone_s",
-        "overlap",
         "usual_s",
     )
 
     def __init__(self, first: int = FIRST_LIMIT) -> None:
         self._limit = first
-        self.alone_s = 0.0
-        """What a request alone takes, the hop included; 0: not known yet."""
+        self._alone = ServiceTimes(ALONE_KEPT)
+        """What a request alone takes, the hop included."""
         self.usual_s = 0.0
         """What one takes as things are, the wait in the server's queue included; 0: not known yet."""
-        self.overlap = 1
-        """The most requests that were in work at one moment of late, as answers out of order prove."""
+        self._overlap = RequestOverlap()
+        self._gain = OverlapGain()
+        self._by_times = False
+        """The limit rests on what requests take, as overlaps prove less."""
         self._fell_behind = False
         self._calibrating = True
         self._calibrated_s = 0.0
+        self._calibrated_before = False
         self._alone_at = 0.0
         self._answers = 0
         """Since a request was alone for the last time."""
-        self._round = self._round_out = 0
-        self._round_s = 0.0
+        self._round = ServiceTimes()
         self._rounds = FIRST_ROUNDS
         self._singles = 0
         """Answers since the limit is 1."""
@@ -119,40 +125,46 @@ class ServerCapacity:
         self._sent: dict[int, _Sent] = {}
         self._only: int | None = None
         """The request that is alone at the server."""
-        self._highest = -1
-        self._events = 0
-        self._in_work: deque[int] = deque(maxlen=REMEMBERED)
-        """For each of the last answers, how many requests are known to have been in work just before it."""
-        self._overtaken: dict[int, int] = {}
-        """Unanswered requests with a lower number than one that is answered, by the answer that first told."""
 
     @property
     def limit(self) -> int:
         """How many requests the server should have at once, the overtaken among them."""
-        return 1 if self._calibrating else min(self._limit, self.most)
+        return 1 if self._calibrating else self._gain.at_once or self._limit
 
     @property
-    def most(self) -> int:
-        """How many it can have without the risk that one is pushed out, also when it is busy with something else."""
-        return min(max(SAFE_SIZE, self.overlap + FIRST_LIMIT), MOST_AT_ONCE)
+    def _most(self) -> int:
+        """How many are of use: besides those that were overtaken, no more go than a queue surely holds."""
+        return min(self.overlap - 1 + SAFE_SIZE, MOST_AT_ONCE)
+
+    @property
+    def overlap(self) -> int:
+        """The most requests that were in work at one moment of late, as answers out of order prove."""
+        return self._overlap.most
 
     @property
     def overtaken(self) -> int:
-        """Requests that are in work although later ones are answered; of a server that works on one at once, lost."""
-        return min(len(self._overtaken), self.overlap - 1)
+        """Requests that are in work although later ones are answered."""
+        return self._overlap.overtaken
+
+    @property
+    def _proved(self) -> int:
+        """How many it works on at once at least."""
+        return self._gain.of_use(self.overlap)
 
     def given_up(self, number: int) -> None:
         """Nobody waits for this request any more."""
         self._sent.pop(number, None)
-        self._overtaken.pop(number, None)
+        self._overlap.given_up(number)
 
     def sent(self, number: int, unseen: int, now: float) -> None:
         """A request was sent; with it the server has so many that it was not seen to have taken."""
         if self._only is not None and self._only in self._sent:
             self._sent[self._only].alone = False
         self._only = number if unseen == 1 else None
-        self._sent[number] = _Sent(now, unseen + self.overtaken, alone=unseen == 1)
-        if len(self._sent) > REMEMBERED:
+        out = unseen + self.overtaken
+        self._sent[number] = _Sent(now, out, alone=unseen == 1)
+        self._gain.sent(out, now)
+        if len(self._sent) > 2 * MOST_AT_ONCE:
             del self._sent[next(iter(self._sent))]
 
     def answered(self, number: int, now: float) -> None:
@@ -160,27 +172,34 @@ class ServerCapacity:
         sent = self._sent.pop(number, None)
         if sent is None:
             return
-        self._note_order(number)
+        self._overlap.answered(number, self._sent)
         took_s = max(now - sent.at, 1e-6)
         self.usual_s += (took_s - self.usual_s) * (USUAL_WEIGHT if self.usual_s else 1.0)
         self._answers += 1
+        in_trial = self._gain.at_once > 0
+        if not self._calibrating:
+            self._gain.answered(took_s, sent.out, self.overlap, now)
         if sent.alone:
             self._was_alone(took_s, now)
-        elif sent.out > 1 and not self._calibrating:
-            self._round += 1
-            self._round_out += sent.out
-            self._round_s += took_s
-            if self._round >= max(LEAST_ROUND, self._limit) * (2 if self._fell_behind else 1):
+        elif sent.out > 1 and not self._calibrating and not in_trial:
+            self._round.add(took_s, sent.out)
+            if self._round.count >= self._least_round:
                 self._judge(now)
+        if 1 < self._proved >= self._limit < self._most:
+            self._set_limit(self._proved + 1)
+
+    @property
+    def _least_round(self) -> int:
+        return max(LEAST_ROUND, self._limit) * (2 if self._fell_behind else 1)
 
     def _was_alone(self, took_s: float, now: float) -> None:
-        before = self.alone_s or took_s
-        self.alone_s = before + (took_s - before) * ALONE_WEIGHT
+        self._alone.add(took_s)
         self._alone_at = now
         self._answers = 0
         if self._calibrating:
             self._calibrated_s += took_s
-            self._calibrating = self._calibrated_s < ALONE_FOR_S
+            few = self._calibrated_before and self._alone.count < LEAST_ALONE
+            self._calibrating = few or self._calibrated_s < ALONE_FOR_S
             return
         if self._limit == 1:
             self._singles += 1
@@ -190,67 +209,74 @@ class ServerCapacity:
 
     def _judge(self, now: float) -> None:
         """Set the limit by the last round of requests that were not alone."""
-        out = self._round_out / self._round
-        at_once = self._round_out * self.alone_s / self._round_s
+        out = self._round.out
+        at_least = self._at_least()
+        at_once = min(max(at_least, self._proved), out)
+        self._by_times = at_least > self._proved
         if out - at_once > KEEPS_PACE:
             self._fell_behind = True
             wanted = self._wanted(at_once)
             if out <= self._limit - 1:
                 wanted = max(wanted, min(math.ceil(out), self._limit))  # more were never there: little is known
-            if wanted < self._limit and self._is_stale(now):
+            surer = self._round.count < SURER * self._least_round
+            if surer and wanted < min(self._limit, self._wanted(min(self._round.rate * self._alone.mean_s, out))):
+                return
+            if self._alone.count < LEAST_ALONE and self._wanted(self._round.rate * self._alone.mean_s) > wanted:
                 self._calibrate()
+            elif wanted < self._limit and self._needs_times and self._is_stale(now):
+                self._calibrate_afresh()
             else:
                 self._set_limit(wanted)
+        elif at_least > out + KEEPS_PACE and self._is_stale(now):
+            self._calibrate_afresh()  # more than were there: what a request alone takes became less
         elif out > self._limit - 1:
             more = self._limit + 1 if self._fell_behind else 2 * self._limit
-            self._set_limit(min(more, self.most))
+            self._set_limit(min(more, self._most))
         else:
             self._set_limit(self._limit)
+        if not self._needs_times:
+            return
         if now - self._alone_at >= ALONE_AGAIN_S and self._answers >= self._rounds * self._limit:
             self._rounds = min(2 * self._rounds, MOST_ROUNDS)
             self._calibrate()
 
+    def _at_least(self) -> float:
+        """How many requests alone the server surely does the work of at once."""
+        either = max(self._alone.variation, self._round.variation)  # a few answers may not show how much they vary
+        alone = self._alone.variation if self._alone.count >= LEAST_ALONE else either
+        error = math.sqrt(alone / self._alone.count + either / self._round.count)
+        return self._round.rate * self._alone.mean_s * math.exp(-SURE * error)
+
+    @property
+    def _needs_times(self) -> bool:
+        """Whether it makes a difference what a request alone takes."""
+        return self._by_times or self._proved == 1
+
     def _wanted(self, at_once: float) -> int:
         """How many to have at a server that does the work of so many requests at once."""
         wanted = max(1, math.ceil(at_once - ROUNDING))
-        if self.alone_s < LONG_S:
-            wanted += math.ceil(at_once * WAITING_S / self.alone_s)
-        if 1 < self.overlap <= 2 * at_once:
-            wanted = max(wanted, self.overlap + 1)
-        return min(wanted, self.most)
+        if at_once < self._round.rate * LONG_S:
+            wanted += math.ceil(self._round.rate * WAITING_S)
+        if self._proved > 1:
+            wanted = max(wanted, self._proved + 1)
+        return min(wanted, self._most)
 
     def _is_stale(self, now: float) -> bool:
         age_s = now - self._alone_at
-        return self._answers > STALE_AFTER and age_s > max(STALE_S, STALE_TIMES * self.alone_s)
+        before_this_round = self._answers - self._round.count - self._limit
+        return before_this_round > STALE_AFTER and age_s > max(STALE_S, STALE_TIMES * self._alone.mean_s)
 
     def _calibrate(self) -> None:
+        self._calibrated_before = True
         self._calibrating = True
         self._calibrated_s = 0.0
         self._set_limit(self._limit)
 
+    def _calibrate_afresh(self) -> None:
+        self._alone = ServiceTimes(ALONE_KEPT)
+        self._calibrate()
+
     def _set_limit(self, limit: int) -> None:
         self._limit = limit
         self._singles = 0
-        self._round = self._round_out = 0
-        self._round_s = 0.0
-
-    # -- overlaps -------------------------------------------------------------------------------------------------
-
-    def _note_order(self, number: int) -> None:
-        """Count what was in work together: a request is from when it is overtaken until it is answered."""
-        event = self._events
-        self._events += 1
-        self._in_work.append(1)
-        since = self._overtaken.pop(number, None)
-        if since is not None:
-            oldest = self._events - len(self._in_work)
-            for index in range(max(since - oldest, 0), len(self._in_work) - 1):
-                self._in_work[index] += 1
-        elif number > self._highest:
-            self._highest = number
-            for earlier in self._sent:
-                if earlier < number:
-                    self._overtaken.setdefault(earlier, event)
-        self.overlap = max(self._in_work)
-        while self._overtaken and next(iter(self._overtaken.values())) < self._events - REMEMBERED:
-            del self._overtaken[next(iter(self._overtaken))]
+        self._round = ServiceTimes()

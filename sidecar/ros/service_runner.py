@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from sidecar.ros.errors import RosBridgeError
@@ -44,15 +45,18 @@ class ServiceRunner:
         on_answer: Callable[[ServiceRunner, Execution, bytes, float], None],
         on_stray_answer: Callable[[ServiceRunner], None],
         on_unsent: Callable[[ServiceRunner, Execution, str], None],
+        alive_since: Callable[[ServiceRunner, float], bool],
     ) -> None:
+        """`alive_since`: whether the server has shown a sign of life since then, other than an answer."""
         self.name = name
         self.type = service_type
         self._on_answer = on_answer
         self._on_stray_answer = on_stray_answer
         self._on_unsent = on_unsent
+        self._alive_since = partial(alive_since, self)
         self._at_server: dict[int, Execution] = {}
         """By rmw's sequence number."""
-        self.window: RequestWindow[Execution] = RequestWindow()
+        self.window: RequestWindow[Execution] = RequestWindow(alive_since=self._alive_since)
         self._server = LocalServer(node, name, service_type)
         self._heard_at = 0.0
         """When the server answered last, or got something to do while it had nothing."""
@@ -130,7 +134,7 @@ class ServiceRunner:
     def take_back_unsent(self) -> list[Execution]:
         """Forget what waits, which certainly has not run; what is at the server may still be answered."""
         unsent = self.window.take_all()
-        self.window = RequestWindow()
+        self.window = RequestWindow(alive_since=self._alive_since)
         return unsent
 
     def close(self) -> None:

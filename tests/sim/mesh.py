@@ -316,9 +316,10 @@ class Mesh:
                 while (event := link.next_event()) is not None:
                     busy = True
                     engine.on_link_event(event, now)
-            for decoding in engine.take_decodings():
+            while (decoding := engine.next_decoding()) is not None:
                 busy = True
-                engine.on_link_event(decoding.run(), now)
+                if decoding.run_slice():
+                    engine.on_decoded(decoding, now)
             for application_event in engine.take_events():
                 busy = True
                 self._application(node, application_event)

@@ -55,6 +55,8 @@ class SerialServer:
                     self._forget(execution)
                     if isinstance(event, CancelExecution):
                         self.node.engine.refuse(execution, RejectReason.CANCELLED, "called off", now)
+                    elif event.awaited:
+                        self.node.engine.refuse(execution, RejectReason.OVERLOADED, "its time here is over", now)
         self._release()
 
     def _release(self) -> None:

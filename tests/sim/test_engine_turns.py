@@ -114,6 +114,9 @@ class World:
         self.mesh.pump(self.robot)
         self.mesh.run(0.5)
 
+    def lose_all_interfaces(self) -> None:
+        self.robot.engine.set_interfaces([], self.mesh.now)
+
     def remove_clouds(self) -> None:
         self.mesh.version += 1
         gone = tuple(RemovedPeer(cloud.name, RemovalReason.LEFT) for cloud in self.clouds)
@@ -132,6 +135,14 @@ def test_no_event_keeps_the_engine_busy_for_long(calls: Calls, redundancy: Redun
     failed = [event for event in world.robot.events if isinstance(event, RequestFailed)]
     assert len(failed) == REQUESTS, "each is told of its end"
     assert world.robot.engine.stats.in_flight == 0
+
+
+def test_losing_all_interfaces_does_not_keep_the_engine_busy_for_long(calls: Calls) -> None:
+    """Every path goes, and with each of them services might have lost their last server."""
+    world = World(calls, RedundancyMode.REPLICATE)
+    calls.most = 0
+    world.lose_all_interfaces()
+    assert calls.most <= MAX_CALLS, f"{calls.most} calls in one {calls.where}"
 
 
 def happenings(world: World) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
@@ -21,8 +21,8 @@ HZ = 10
 class World:
     """A robot with one interface and one server, whose answers are short."""
 
-    def __init__(self, rate: float, delay_s: float, **rules: object) -> None:
-        self.mesh = Mesh(1)
+    def __init__(self, rate: float, delay_s: float, *, seed: int = 1, **rules: object) -> None:
+        self.mesh = Mesh(seed)
         self.robot: Node = self.mesh.robot("wlan0", rules=(rule(**rules),))
         cloud = self.mesh.cloud("cloud-a")
         self.mesh.push_views()
@@ -144,15 +144,25 @@ def test_losing_all_that_is_in_flight_does_not_stall_the_path() -> None:
 
 
 def test_a_route_that_gets_longer_for_a_while_and_a_radio_that_loses_some_are_no_congestion() -> None:
-    """The ceiling of one run is chance: by eight seeds it was 55 kB to none at all. The median of five tells."""
-    windows = sorted(lossy_radio(seed) for seed in range(1, 6))
-    assert windows[len(windows) // 2] > 100_000
+    """One run is chance: of sixty, each with other losses, one in ten has an answer after more than 0.24 s."""
+    runs = [lossy_radio(seed) for seed in range(1, 8)]
+    worst = sorted(run.worst_s for run in runs)
+    assert worst[len(runs) // 2] < 0.25
+    ceilings = sorted(run.ceiling for run in runs)
+    assert ceilings[len(runs) // 2] > 100_000
 
 
-def lossy_radio(seed: int) -> float:
-    """Ask for 15 s over a route whose length changes; returns the window's ceiling (bytes) at the end."""
+class LossyRun(NamedTuple):
+    worst_s: float
+    """Until the latest answer came."""
+    ceiling: float
+    """Of the window at the end (bytes)."""
+
+
+def lossy_radio(seed: int) -> LossyRun:
+    """Ask for 15 s over a route whose length changes, and which loses what the seed says."""
     size, usual_s = 120_000, 0.025
-    world = World(20 * MBIT, usual_s, deadline_s=1.0)
+    world = World(20 * MBIT, usual_s, seed=seed, deadline_s=1.0)
     rng = random.Random(seed)
     world.request(size, 2.0)
     later = []
@@ -160,13 +170,12 @@ def lossy_radio(seed: int) -> float:
         for wire in (world.up, world.down):
             wire.delay_s, wire.loss = usual_s * rng.uniform(0.8, 1.6), 0.003
         later += world.request(size, 1.0, hz=5)
-    window = world.control.ceiling.bytes
+    ceiling = world.control.ceiling.bytes
     world.mesh.run(2.0)
     elapsed = sorted(world.elapsed(later))
     assert len(elapsed) == len(later)
     assert elapsed[len(elapsed) // 2] < 0.15
-    assert elapsed[-1] < 0.7
-    return float("inf") if window is None else window
+    return LossyRun(elapsed[-1], float("inf") if ceiling is None else ceiling)
 
 
 @pytest.mark.audit("dp-13")

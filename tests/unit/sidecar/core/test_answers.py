@@ -9,7 +9,7 @@ import pytest
 from protos.model import NodeName
 from sidecar.core import answers as answers_module
 from sidecar.core.answers import Answers
-from sidecar.core.backlog import Backlog
+from sidecar.core.backlog import SLICE, Backlog
 from sidecar.core.dedup import Reply, Waiter
 from sidecar.core.events import RejectReason
 from sidecar.core.link_events import LinkCommand, Send
@@ -39,9 +39,10 @@ class Cloud:
 
     def __init__(self) -> None:
         self.routes, self.stats = Routes(), EngineStats()
+        self.backlog = Backlog()
         self.commands: list[LinkCommand] = []
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
-        self.answers = Answers(Rules((rule(),)), self.routes, self.outbox, self.stats)
+        self.answers = Answers(Rules((rule(),)), self.routes, self.outbox, self.stats, self.backlog)
         for each in (WLAN, WWAN):
             self.routes.set_state(each, PathState.UP)
 
@@ -166,10 +167,10 @@ def test_what_has_not_begun_to_leave_is_given_up_before_its_time_is_over(begun: 
         message.begun = begun
     assert cloud.answers.next_timer() == 9.0
     cloud.sent()
-    cloud.answers.handle_timer(9.0, Backlog())
+    cloud.answers.handle_timer(9.0)
     told = [] if begun else [(1, 0, WLAN), (1, 1, WWAN)]
     assert cloud.sent() == told
-    cloud.answers.handle_timer(10.0, Backlog())
+    cloud.answers.handle_timer(10.0)
     assert len(cloud.answers) == 0
     assert cloud.stats.dropped["answer_unsent"] == (not begun)
 
@@ -183,3 +184,37 @@ def test_a_rejection_does_not_stand_for_an_answer_that_comes_later() -> None:
     assert cloud.sent() == [(1, 0, WLAN), (1, 1, WWAN)]
     cloud.answers.drop(ROBOT, request_id(1))
     assert len(cloud.answers) == len(cloud.outbox) == 0
+
+
+@pytest.mark.audit("dp-10")
+def test_a_turn_sends_no_more_than_a_slice_of_what_got_room() -> None:
+    """A large answer ends and thousands of small ones fit in its place: each is as much work as any other."""
+    cloud = Cloud()
+    cloud.answer(0, SMALL_ROOM_BYTES // 70)
+    for number in range(1, 70):
+        cloud.answer(number, SMALL_ROOM_BYTES // 70)
+    small = range(1000, 1150)
+    for number in small:
+        cloud.answer(number, 1300)
+    assert len(cloud.sent()) < 70 + len(small)
+    waiting = cloud.answers.unsent([ROBOT])
+    assert waiting > 2 * SLICE
+    cloud.backlog.begin_turn(1.0)
+    for number in range(5):
+        cloud.finish(number)
+    assert len(cloud.sent()) == SLICE
+    now = 1.0
+    while cloud.backlog.next_timer() is not None:
+        now += 0.001
+        cloud.backlog.begin_turn(now)
+        cloud.backlog.run(now)
+        assert len(cloud.sent()) <= SLICE
+    assert cloud.answers.unsent([ROBOT]) == 0
+
+
+@pytest.mark.audit("dp-10")
+def test_an_answer_that_has_room_waits_for_no_backlog() -> None:
+    cloud = Cloud()
+    cloud.backlog.add_steps([lambda _: None] * 100, 0.0)
+    cloud.answer(1, 1300)
+    assert cloud.sent() == [(1, 0, WLAN)]

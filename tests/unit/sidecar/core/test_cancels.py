@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import pytest
+
 from protos.model import NodeName
 from sidecar.core.cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
+from sidecar.core.shares import FORGOTTEN_AT_ONCE
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import request_id
 
@@ -31,4 +34,18 @@ def test_one_robot_fills_half_and_another_still_has_room() -> None:
     cancels.add(OTHER, request_id(MAX_EARLY_CANCELS), 1.0)
     assert cancels.holds(OTHER, request_id(MAX_EARLY_CANCELS), 1.0)
     cancels.add(ROBOT, request_id(MAX_EARLY_CANCELS + 1), 1.0 + REMEMBER_CANCEL_S)
-    assert len(cancels) == 1, "what is forgotten makes room"
+    assert cancels.holds(ROBOT, request_id(MAX_EARLY_CANCELS + 1), 1.0 + REMEMBER_CANCEL_S), (
+        "what is forgotten makes room"
+    )
+
+
+@pytest.mark.audit("dp-10")
+def test_a_burst_is_not_forgotten_in_one_call_and_holds_no_longer() -> None:
+    cancels = EarlyCancels(EngineStats())
+    for number in range(1000):
+        cancels.add(ROBOT, request_id(number), 1.0)
+    before = len(cancels)
+    while len(cancels):
+        assert not cancels.holds(ROBOT, request_id(999), 1.0 + REMEMBER_CANCEL_S)
+        assert 0 < before - len(cancels) <= FORGOTTEN_AT_ONCE
+        before = len(cancels)

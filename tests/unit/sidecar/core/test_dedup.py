@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from protos.model import NodeName, ServiceName
@@ -10,14 +12,16 @@ from sidecar.core.dedup import (
     MAX_RUNNING,
     MAX_WAITERS,
     MIN_REMEMBER_S,
+    SAY_WITHIN_S,
     TIMER_SLACK,
     ExecutionTable,
     Reply,
     Waiter,
 )
-from sidecar.core.events import CancelExecution, ExecuteRequest, ExecutionId, RejectReason
+from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest, ExecutionId, RejectReason
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
 from sidecar.core.rules import MAX_LIFETIME_S
+from sidecar.core.shares import FORGOTTEN_AT_ONCE
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, path, request
 
@@ -273,7 +277,22 @@ def test_what_is_over_leaves_no_timers_behind() -> None:
         executions.refuse(execution, RejectReason.BAD_PAYLOAD, "", 1.0)
     assert len(executions._timers) <= TIMER_SLACK + 1
     assert not executions._forget_at
-    assert executions.next_timer() is None
+    while executions.next_timer() is not None:
+        pass
+
+
+@pytest.mark.audit("dp-10")
+def test_what_many_requests_leave_is_not_forgotten_in_one_call() -> None:
+    executions = table()
+    for number in range(1000):
+        executions.complete(run(executions, request(number)).execution, b"answer", 0.0, 1.0)
+    now = 1.0 + MIN_REMEMBER_S
+    left = [len(executions._finished)]
+    while left[-1]:
+        executions.handle_timer(now, Backlog())
+        left.append(len(executions._finished))
+    assert max(before - after for before, after in pairwise(left)) <= FORGOTTEN_AT_ONCE
+    assert not executions._cached
 
 
 def test_unknown_services_make_no_counters() -> None:
@@ -296,7 +315,24 @@ def test_a_server_is_given_up_before_the_robot_gives_up_and_the_robot_is_told() 
     assert isinstance(outcome, ExecuteRequest)
     assert outcome.expires_s == 3.0
     assert executions.handle_timer(3.9, Backlog()) == ([], [])
-    (abandoned,), (reply,) = executions.handle_timer(4.0, Backlog())
-    assert abandoned.execution == outcome.execution
+    assert executions.handle_timer(4.0, Backlog()) == ([AbandonExecution(outcome.execution, awaited=True)], [])
+    assert executions.next_timer() == 4.0 + SAY_WITHIN_S
+    nothing, (reply,) = executions.handle_timer(4.0 + SAY_WITHIN_S, Backlog())
+    assert nothing == [], "it was told before"
     assert isinstance(reply.message, RejectionMessage)
     assert reply.message.reason is RejectReason.SERVER_LOST
+    assert executions._stats.executions[ECHO, "abandoned"] == 1
+
+
+@pytest.mark.audit("dp-10")
+def test_what_its_server_never_got_may_run_elsewhere_when_its_patience_is_over() -> None:
+    executions = table()
+    outcome = executions.on_request(ROBOT, request(lifetime_s=20.0), 1.0, patience_s=3.0)
+    assert isinstance(outcome, ExecuteRequest)
+    executions.handle_timer(4.0, Backlog())
+    (reply,) = executions.refuse(outcome.execution, RejectReason.OVERLOADED, "no room at the server", 4.1)
+    assert isinstance(reply.message, RejectionMessage)
+    assert reply.message.reason.certainly_not_run
+    assert executions.running == 0
+    assert executions.handle_timer(5.0, Backlog()) == ([], [])
+    assert executions._stats.executions[ECHO, "refused"] == 0, "it was counted as abandoned"

@@ -24,7 +24,7 @@ def test_every_block_size_survives_losing_as_much_as_it_has_repairs(size: int) -
     lost = rng.sample(range(size), rng.randint(1, size))
     rows = rng.sample(range(size), len(lost))
     received = [None if place in lost else source for place, source in enumerate(sources)]
-    decoded = fec.decode(received, {row: fec.encode(sources, row) for row in rows})
+    decoded = fec.decode(received, {row: fec.encode(sources, row) for row in rows}, 0, SYMBOL)
     assert decoded == [(place, sources[place]) for place in sorted(lost)]
 
 
@@ -33,12 +33,12 @@ def test_every_block_size_survives_losing_as_much_as_it_has_repairs(size: int) -
 def test_all_source_symbols_may_be_lost(size: int, seed: int) -> None:
     rng = random.Random(seed)
     sources = symbols(rng, size)
-    decoded = fec.decode([None] * size, {row: fec.encode(sources, row) for row in range(size)})
+    decoded = fec.decode([None] * size, {row: fec.encode(sources, row) for row in range(size)}, 0, SYMBOL)
     assert [symbol for _, symbol in decoded] == sources
 
 
 def test_nothing_lost_needs_no_repair() -> None:
-    assert fec.decode([b"ab", b"cd"], {}) == []
+    assert fec.decode([b"ab", b"cd"], {}, 0, 2) == []
 
 
 def test_the_repair_of_a_lone_symbol_is_its_copy() -> None:
@@ -62,6 +62,6 @@ def test_blocks_share_the_symbols_evenly_and_fit_the_field(count: int) -> None:
 def test_garbage_decodes_to_garbage_without_an_error() -> None:
     rng = random.Random(1)
     sources = symbols(rng, 5)
-    decoded = fec.decode([None, *sources[1:]], {3: rng.randbytes(SYMBOL)})
+    decoded = fec.decode([None, *sources[1:]], {3: rng.randbytes(SYMBOL)}, 0, SYMBOL)
     assert len(decoded) == 1
     assert decoded[0][1] != sources[0]

@@ -3,6 +3,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from protos.model import NodeName, ServiceName, ServiceOffer
+from sidecar.core.backlog import Backlog
 from sidecar.core.events import ApplicationEvent, CallsForbidden, ExecuteRequest, RejectReason
 from sidecar.core.forbidden import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
 from sidecar.core.link_events import PathCommand, Send
@@ -42,6 +43,7 @@ class Cloud:
                 self.stats,
                 self.events.append,
                 lambda robot, service: (robot, service) in self.permits,
+                Backlog(),
             )
         )
         self.serving.set_offers([ServiceOffer(ECHO, TYPE), ServiceOffer(SECRET, TYPE)])

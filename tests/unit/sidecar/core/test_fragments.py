@@ -45,7 +45,11 @@ def coded(number: int, data: bytes, repairs: int, symbol: int = SYMBOL) -> list[
 def contents(results: list[Reassembled]) -> list[bytes]:
     """The messages that were completed, decoded where they have to be."""
     found = [result.content for result in results if result.content is not None]
-    return [bytes(content.decode() if isinstance(content, Partial) else content) for content in found]
+    for content in found:
+        if isinstance(content, Partial):
+            for _ in content.decode():
+                pass
+    return [bytes(content.whole() if isinstance(content, Partial) else content) for content in found]
 
 
 @pytest.fixture

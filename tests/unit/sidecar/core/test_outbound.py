@@ -57,7 +57,7 @@ def test_repair_symbols_belong_to_the_blocks_in_turn(count: int) -> None:
         bytes(outbound.symbol_data(index)).ljust(outbound.symbol, b"\0") for index in range(block, count, blocks)
     ]
     repair = bytes(outbound.symbol_data(count + block))
-    assert fec.decode([*sources[:-1], None], {0: repair}) == [(len(sources) - 1, sources[-1])]
+    assert fec.decode([*sources[:-1], None], {0: repair}, 0, outbound.symbol) == [(len(sources) - 1, sources[-1])]
 
 
 def test_a_repair_symbol_is_no_longer_than_the_message() -> None:

@@ -6,7 +6,8 @@ import pytest
 
 from protos.model import NodeName
 from sidecar.core.events import RejectReason, RequestId
-from sidecar.core.refused_copies import FORGOTTEN_AT_ONCE, RefusedCopies, RefusedCopy
+from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
+from sidecar.core.shares import FORGOTTEN_AT_ONCE
 from sidecar.core.stats import EngineStats
 
 ROBOT = NodeName("robot")

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import pytest
 
 from sidecar.core import requests as requests_module
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, Encoded
 from sidecar.core.priority import Priority
-from tests.unit.sidecar.core.builders import ECHO
+from tests.unit.sidecar.core.builders import ECHO, A, B
 from tests.unit.sidecar.core.request_table import WLAN_A, WWAN_B, Table
-
-if TYPE_CHECKING:
-    import pytest
 
 
 def test_what_cannot_be_sent_is_rejected_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,3 +57,17 @@ def test_a_full_outbox_towards_one_server_sends_to_the_other_only_and_two_full_o
     table.outbox.drop(next(iter(table.outbox._messages.values())))
     table.table.on_room(0.5)
     assert table.sent() == [WLAN_A]
+
+
+@pytest.mark.audit("dp-10")
+def test_requests_that_are_over_leave_few_timers_behind() -> None:
+    """One that is stuck is due before all of them, so that none comes up."""
+    table = Table()
+    table.submit(1)
+    for number in range(2, 10 * requests_module.TIMER_SLACK):
+        table.submit(number, now=0.5)
+        for copy, server in enumerate((A, B)):
+            table.respond(server, copy, number, now=0.5)
+        table.cancelled()
+    assert len(table.table._requests) == 1
+    assert len(table.table._timers) <= requests_module.TIMER_SLACK + 8

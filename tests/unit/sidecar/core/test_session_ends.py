@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from protos.model import PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
-from sidecar.core.events import CancelExecution, ResponseArrived, WithdrawService
-from sidecar.core.link_events import PeerClosed, PeerRestarted, SetPeers
+from sidecar.core.events import CancelExecution, ExecutionId, ResponseArrived, WithdrawService
+from sidecar.core.link_events import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
 from sidecar.core.messages import ResponseMessage
 from sidecar.core.offers import WITHDRAW_AFTER_S
 from sidecar.core.path_id import PathState
@@ -81,3 +81,43 @@ def test_a_peer_kept_only_for_its_paths_goes_with_the_last_interface() -> None:
     sidecar.engine.set_interfaces((), 1.0)
     assert A not in sidecar.engine.peers
     assert SetPeers(()) in sidecar.take()[0]
+
+
+def answers_under_way(sidecar: Sidecar) -> int:
+    return sidecar.engine._outbox.messages_to(ROBOT)
+
+
+@pytest.fixture
+def silent() -> Sidecar:
+    """A cloud whose robot was answered, fell silent, and is not in the control plane's view any more."""
+    sidecar = busy_cloud()
+    sidecar.engine.complete(ExecutionId(0), b"answer", 0.01, 0.5)
+    assert answers_under_way(sidecar) == 1
+    sidecar.change(PathState.DOWN)
+    (answer,) = sidecar.engine._outbox._messages.values()
+    sidecar.engine.on_link_event(FragmentsLost(answer.path, answer, (0,)), 0.9)
+    sidecar.view(version=2)
+    assert ROBOT not in sidecar.engine.peers
+    return sidecar
+
+
+@pytest.mark.audit("dp-10")
+def test_answers_under_way_wait_for_a_robot_that_is_back_with_its_session(silent: Sidecar) -> None:
+    assert answers_under_way(silent) == 1
+    silent.view(peer(ROBOT), version=3)
+    assert answers_under_way(silent) == 1
+    silent.take()
+    silent.change(PathState.UP, 2.0)
+    assert [command.indices for command in silent.take()[0] if isinstance(command, Resend)] == [(0,)]
+
+
+@pytest.mark.audit("dp-10")
+@pytest.mark.parametrize("how", ["restarted", "left"])
+def test_they_go_when_that_session_is_over(silent: Sidecar, how: str) -> None:
+    if how == "restarted":
+        silent.view(peer(ROBOT, session=2, incarnation=2), version=3)
+    else:
+        removed = (RemovedPeer(ROBOT, RemovalReason.LEFT),)
+        assert silent.engine.apply_peers(PeerSet(Version(3), 1, (), removed), 1.0) is None
+    assert answers_under_way(silent) == 0
+    assert not silent.engine._away

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import random
 
-from sidecar.core.timers import SLACK, Timers
+import pytest
+
+from sidecar.core.timers import SKIPPED_AT_ONCE, SLACK, Timers, first_of
 
 
 def test_the_earliest_comes_first_and_a_new_time_replaces_the_old() -> None:
@@ -52,3 +54,14 @@ def test_behaves_as_a_dictionary_of_times() -> None:
             while (fired := timers.pop_due(now)) is not None:
                 assert model.pop(fired) <= now
             assert all(left > now for left in model.values())
+
+
+@pytest.mark.audit("dp-10")
+def test_a_look_drops_some_of_what_is_over() -> None:
+    heap = [(float(number), number) for number in range(1000)]
+    live = {999}
+    looks = [first_of(heap, live) for _ in range(1 + 999 // SKIPPED_AT_ONCE)]
+    assert looks[0] == SKIPPED_AT_ONCE
+    assert looks[-1] == 999.0
+    live.clear()
+    assert first_of(heap, live) is None

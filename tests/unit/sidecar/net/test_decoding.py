@@ -1,4 +1,4 @@
-"""Decoding repair symbols is the driver's, outside the engine's lock."""
+"""Decoding repair symbols has a thread of its own, outside the engine's lock."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import random
 import threading
 from typing import TYPE_CHECKING
 
+import pytest
+
 from protos.model import InterfaceName, PeerSet, Role, ServiceOffer, SessionId, Version
+from sidecar.core.decoding import Decoding
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest
 from sidecar.core.frame import Fragment
@@ -16,13 +19,15 @@ from sidecar.core.outbound import OutboundMessage
 from sidecar.core.partial import Partial
 from sidecar.core.priority import Priority
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from sidecar.net.decoder import Decoder
 from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import ECHO, TYPE, path, peer, request_id, rule
 
 if TYPE_CHECKING:
-    import pytest
-
     from sidecar.core.events import ApplicationEvent
+
+PATIENCE_S = 20.0
+"""For a loaded machine; nothing here takes long."""
 
 
 class Application:
@@ -30,12 +35,15 @@ class Application:
 
     def __init__(self) -> None:
         self.events: list[ApplicationEvent] = []
+        self.told = threading.Event()
 
     def handle(self, event: ApplicationEvent) -> None:
         self.events.append(event)
+        self.told.set()
 
 
-def test_messages_are_decoded_while_nothing_is_locked(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.audit("dp-10")
+def test_messages_are_decoded_on_no_interfaces_thread_while_nothing_is_locked(monkeypatch: pytest.MonkeyPatch) -> None:
     application = Application()
     hooks = DataPlaneHooks(application, lambda _interface, _event: None, lambda: None, lambda: None, lambda _: None)
     plane = ThreadedDataPlane(EngineConfig(Role.CLOUD, (rule(),)), session_of("me", Role.CLOUD, 9), hooks)
@@ -50,8 +58,9 @@ def test_messages_are_decoded_while_nothing_is_locked(monkeypatch: pytest.Monkey
         for index in range(1, message.symbols)
     ]
 
-    decode = Partial.decode
+    run_slice = Decoding.run_slice
     locked: list[bool] = []
+    threads: list[str] = []
 
     def ask() -> None:
         free = plane._lock.acquire(blocking=False)
@@ -59,15 +68,60 @@ def test_messages_are_decoded_while_nothing_is_locked(monkeypatch: pytest.Monkey
         if free:
             plane._lock.release()
 
-    def watched(partial: Partial) -> memoryview:
+    def watched(decoding: Decoding) -> bool:
+        threads.append(threading.current_thread().name)
         asking = threading.Thread(target=ask)
         asking.start()
         asking.join()
-        return decode(partial)
+        return run_slice(decoding)
 
-    monkeypatch.setattr(Partial, "decode", watched)
-    plane.on_link_events([FragmentsReceived(over, SessionId(1), fragments)])
+    monkeypatch.setattr(Decoding, "run_slice", watched)
+    plane.start()
+    try:
+        plane.on_link_events([FragmentsReceived(over, SessionId(1), fragments)])
+        assert application.told.wait(PATIENCE_S)
+    finally:
+        plane.stop()
     assert locked == [False]
+    assert threads == ["plr-decoder"]
     (event,) = application.events
     assert isinstance(event, ExecuteRequest)
     assert event.payload == payload
+
+
+class Owner:
+    """Has these to decode; the first fails."""
+
+    def __init__(self, decodings: list[Decoding]) -> None:
+        self.left = decodings
+        self.decoded: list[Decoding] = []
+        self.failed: list[Decoding] = []
+        self.over = threading.Event()
+
+    def next_decoding(self) -> Decoding | None:
+        return self.left[0] if self.left else None
+
+    def on_decoded(self, decoding: Decoding) -> None:
+        self.decoded.append(self.left.pop(0))
+        self.over.set()
+
+    def on_decoding_failed(self, decoding: Decoding) -> None:
+        self.failed.append(self.left.pop(0))
+
+
+def test_an_internal_error_costs_one_message(caplog: pytest.LogCaptureFixture) -> None:
+    over = path(InterfaceName("eth0"), "robot")
+    bad, good = (Decoding(over, SessionId(1), Partial(number, 600, 300, 0.0)) for number in (1, 2))
+    del bad.partial.have
+    bad.partial.add_repair(0, memoryview(bytes(300)))
+    owner = Owner([bad, good])
+    decoder = Decoder(owner)
+    decoder.start()
+    decoder.wake()
+    try:
+        assert owner.over.wait(PATIENCE_S)
+    finally:
+        decoder.stop(PATIENCE_S)
+    assert owner.failed == [bad]
+    assert owner.decoded == [good]
+    assert "internal error" in caplog.text

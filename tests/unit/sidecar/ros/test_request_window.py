@@ -264,3 +264,19 @@ def test_after_an_outage_what_is_asked_now_does_not_wait_for_the_backlog(seed: i
             working = queue.popleft()
             ends = now + 0.02
     assert stale <= set(done)
+
+
+@pytest.mark.audit("dp-15")
+def test_a_server_that_may_be_dead_gets_no_more_than_it_has(numbers: deque[int]) -> None:
+    """What goes to a dead server may have run: if that may happen only once, it is lost."""
+    heard_at = -1.0
+    window: RequestWindow[int] = RequestWindow(alive_since=lambda since: heard_at >= since)
+    fill(window, 20)
+    assert release(window, 0.0, numbers) == [1]
+    assert window.next_due() is None
+    assert release(window, 100 * STALL_S, numbers) == []
+    heard_at = 200 * STALL_S
+    assert window.next_due() is not None
+    assert release(window, heard_at + 0.1, numbers) == [2]
+    assert window.next_due() is None, "it must be heard once more for each"
+    assert release(window, 300 * STALL_S, numbers) == []

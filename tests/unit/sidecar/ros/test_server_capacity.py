@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sidecar.core.priority import Priority
+from sidecar.ros.request_overlap import LOST_AFTER, REMEMBERED
 from sidecar.ros.request_window import RequestWindow
-from sidecar.ros.server_capacity import MOST_AT_ONCE, REMEMBERED, SAFE_SIZE, ServerCapacity
+from sidecar.ros.server_capacity import MOST_AT_ONCE, SAFE_SIZE, ServerCapacity
 from tests.unit.sidecar.ros.server_model import ModelServer, always, varying
 
 if TYPE_CHECKING:
@@ -199,8 +200,8 @@ def test_what_is_never_answered_is_not_held() -> None:
         capacity.sent(number, 1, float(number))
         capacity.sent(number + 1, 2, float(number))
         capacity.answered(number + 1, number + 0.5)
-    assert len(capacity._sent) <= REMEMBERED
-    assert len(capacity._overtaken) <= REMEMBERED + 1
+    assert len(capacity._sent) <= 2 * MOST_AT_ONCE
+    assert len(capacity._overlap._overtaken) <= LOST_AFTER + 1
     assert capacity.overlap == 1
 
 
