@@ -34,8 +34,14 @@ RANDOM = 0.6
 POLICED = 0.25
 """... and not if it is at most this; between these, the rate found is too high, and a lower one is tried. A path that
 loses a share at random passes for policed once in 400 trials (Poisson, three or fewer of twelve)."""
+IN_VAIN = 3
+"""A policer whose losses go on below so many rates, one lower than the other, with bursts that any bucket holds, is
+none: a radio that is silent for 50 ms now and then loses much before a trial, and nothing in it. Each such rate would
+be lower, without an end."""
 TRY_AGAIN_S = 20.0
-"""After losses that were at random, a trial only after this time, or when twice as much is lost."""
+"""After losses that were at random, a trial only after this time, or when twice as much is lost ..."""
+MAX_TRY_AGAIN_S = 640.0
+"""... and after rates tried in vain, after twice the time of before, up to this."""
 MARGIN = 0.97
 """Of the token rate is used: what was lost before refills the bucket, and the measurement is good for a few percent."""
 GROWTH = 0.03 / 8
@@ -91,6 +97,7 @@ class Policer:
         "_dry",
         "_fates",
         "_found_share",
+        "_in_vain",
         "_overrun_at",
         "_paused",
         "_random",
@@ -101,6 +108,7 @@ class Policer:
         "_token_rate",
         "_trains",
         "_tried_share",
+        "_try_again_s",
         "_usual",
         "burst",
         "was_found",
@@ -123,6 +131,9 @@ class Policer:
         self._random = 0.0
         self._rejected_at = float("-inf")
         """What was lost at random, and when a trial showed that."""
+        self._try_again_s = TRY_AGAIN_S
+        self._in_vain = 0
+        """Lower rates tried one after the other, with the least bursts, since one held."""
         self._overrun_at: float | None = None
         """When looking for more met the policer again; its rate is measured then."""
         self._asked_s = 0.0
@@ -231,6 +242,8 @@ class Policer:
             if below and self._gain > 1:
                 self._usual = self._fates.share
                 self._fates = _Fates(now)
+                self._in_vain = 0
+                self._try_again_s = TRY_AGAIN_S
             elif self._gain > FORGET:
                 self._token_rate = 0.0
 
@@ -238,7 +251,7 @@ class Policer:
 
     def _is_suspect(self, now: float) -> bool:
         least = KNOWN_LOSS if self._token_rate else SUSPECT_LOSS
-        if now - self._rejected_at < TRY_AGAIN_S:
+        if now - self._rejected_at < self._try_again_s:
             least = max(least, 2 * self._random)
         return self._fates.lost >= SUSPECT_BYTES and self._fates.share >= least
 
@@ -249,11 +262,25 @@ class Policer:
             if not known or now - self._fates.since < CHANGE_ROUNDS * self._rtt_s:
                 return False
             measured = known if self.burst > LEAST_BURST else CUT * known
+        if known and self.burst <= SMALL_BURST:
+            self._in_vain += 1
+            if self._in_vain > IN_VAIN:
+                self._give_up(now)
+                return False
         self.burst = max(self.burst / 2, LEAST_BURST) if known else BURST_S * measured
         self._tried_share = self._fates.share
         self._before = known
         self._set(measured, sent_at, now)
         return True
+
+    def _give_up(self, now: float) -> None:
+        """The losses are not a policer's: they go on, whatever the rate."""
+        self._random, self._rejected_at = self._fates.share, now
+        self._try_again_s = min(2 * self._try_again_s, MAX_TRY_AGAIN_S)
+        self._token_rate = 0.0
+        self._in_vain = 0
+        self._fates = _Fates(now)
+        self._span = None
 
     def _judge(self, tried_share: float, now: float) -> None:
         share = self._fates.share

@@ -146,6 +146,31 @@ def test_loss_at_random_is_no_policer(rate: float, rtt_s: float, loss: float, se
     assert (flow.delivered - before) / seconds > 0.88 * (1 - loss) * rate * MBIT
 
 
+class Fading(Bottleneck):
+    """A radio that is silent for `gap_s` of each second, from `since` on."""
+
+    gap_s = 0.05
+    since = 0.31
+
+    def carry(self, size: int, arrived: Callable[[], None]) -> None:
+        self.loss = 1.0 if (self.now + self.since) % 1.0 < self.gap_s else 0.0
+        super().carry(size, arrived)
+
+
+@pytest.mark.audit("dp-9")
+@pytest.mark.parametrize(("rate", "rtt_s", "gap_s"), [(20.0, 0.04, 0.05), (20.0, 0.04, 0.03), (20.0, 0.1, 0.1)])
+def test_a_radio_that_is_silent_for_moments_is_no_policer(rate: float, rtt_s: float, gap_s: float) -> None:
+    """Much is lost before a trial and nothing in it; each rate tried after that was lower, without an end."""
+    net = Fading(rate * MBIT, rtt_s, rate * MBIT)
+    net.gap_s = gap_s
+    flow = OurFlow(net)
+    net.at(0.01, flow.watch)
+    net.run(10.0)
+    before = flow.delivered
+    net.run(25.0)
+    assert (flow.delivered - before) / 15.0 > 0.7 * (1 - gap_s) * rate * MBIT
+
+
 def policed(mesh: Mesh, source: str, rate: float, bucket: float) -> Callable[[], int]:
     """Police what this interface sends; returns what tells how many datagrams were dropped."""
     tokens, filled_at, dropped = bucket, mesh.now, 0
