@@ -19,6 +19,11 @@ KNOWN_LOSS = 0.02
 """Losing this share (the loss threshold of draft-ietf-ccwg-bbr) below its rate is, where one is known."""
 SUSPECT_BYTES = 12 * DATAGRAM_BYTES
 """Fewer losses tell no share."""
+SUSPECT_RUNS = 3
+RUNS_S, RUNS_ROUNDS = 0.75, 4.0
+"""So many losses with something between them that arrived, within this time or as many round trips. What exceeds a
+bucket is dropped now and then, for as long as too much is sent; a radio that fades for a moment loses everything,
+once."""
 MEMORY_BYTES = 400 * DATAGRAM_BYTES
 """Over how much the share is measured while no policer is known."""
 SPAN_BYTES = 10 * DATAGRAM_BYTES
@@ -98,12 +103,14 @@ class Policer:
         "_fates",
         "_found_share",
         "_in_vain",
+        "_lost_at",
         "_overrun_at",
         "_paused",
         "_random",
         "_rejected_at",
         "_round_at",
         "_rtt_s",
+        "_runs",
         "_span",
         "_token_rate",
         "_trains",
@@ -134,6 +141,10 @@ class Policer:
         self._try_again_s = TRY_AGAIN_S
         self._in_vain = 0
         """Lower rates tried one after the other, with the least bursts, since one held."""
+        self._lost_at = float("-inf")
+        """When the newest that was lost left."""
+        self._runs: deque[float] = deque(maxlen=SUSPECT_RUNS)
+        """When the first of each of the last losses left that have something between them that arrived."""
         self._overrun_at: float | None = None
         """When looking for more met the policer again; its rate is measured then."""
         self._asked_s = 0.0
@@ -196,6 +207,7 @@ class Policer:
         trial = self._tried_share is not None
         if trial or not queued:  # a loss that the lower rate did not prevent is one, whatever it met
             self._fates.note(size, sent_at, lost=True)
+            self._note_run(sent_at)
         if queued:
             self._span = None
             return False
@@ -253,7 +265,18 @@ class Policer:
         least = KNOWN_LOSS if self._token_rate else SUSPECT_LOSS
         if now - self._rejected_at < self._try_again_s:
             least = max(least, 2 * self._random)
-        return self._fates.lost >= SUSPECT_BYTES and self._fates.share >= least
+        fates = self._fates
+        return fates.lost >= SUSPECT_BYTES and fates.share >= least and self._go_on()
+
+    def _go_on(self) -> bool:
+        """Whether losses are not of one moment."""
+        runs = self._runs
+        return len(runs) == SUSPECT_RUNS and runs[-1] - runs[0] <= max(RUNS_S, RUNS_ROUNDS * self._rtt_s)
+
+    def _note_run(self, sent_at: float) -> None:
+        if self._delivered_by(sent_at) > self._delivered_by(self._lost_at):
+            self._runs.append(sent_at)
+        self._lost_at = max(self._lost_at, sent_at)
 
     def _try(self, measured: float | None, sent_at: float, now: float) -> bool:
         """Send no faster than what arrived, and see whether the losses end."""
