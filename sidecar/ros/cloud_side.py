@@ -316,10 +316,12 @@ class CloudSide:
         return self._processes.has_ended(endpoint) or self._roll_call.is_silent(endpoint)
 
     def _is_alive_since(self, runner: ServiceRunner, since: float) -> bool:
-        """Whether its end would have been noticed, or it was heard since then."""
-        return all(
+        """Whether one of its servers lives: the end would have been noticed, or it was heard since then."""
+        endpoints = runner.server.endpoints
+        return not endpoints or any(
             self._processes.watches(endpoint) or self._roll_call.has_heard(endpoint, since)
-            for endpoint in runner.server.endpoints
+            for endpoint in endpoints
+            if not self._processes.has_ended(endpoint)
         )
 
     def _is_watched(self, runner: ServiceRunner) -> bool:
