@@ -145,6 +145,7 @@ class CloudSide:
             return
         runner, execution = known
         runner.abandon(execution)
+        self._paced.add(runner)  # there may be room now, for those that wait
         self._stats.abandoned[runner.name] += 1
         self._stats.pending = len(self._executions)
         if event.awaited and execution.number is None:
