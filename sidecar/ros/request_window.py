@@ -197,5 +197,8 @@ class RequestWindow(Generic[T]):
         return self._progress_at + patience_s
 
     def _late_may_go(self, now: float) -> bool:
-        only_late = self._only_late_since is not None and now - self._only_late_since >= LATE_ONLY_S
-        return self._late_number is None or now >= self._next_late_at or only_late
+        if self._late_number is None or now >= self._next_late_at:
+            return True
+        if len(self._unseen) + self._capacity.overtaken <= self._capacity.proved > 1:
+            return True  # a thread is idle or will be soon; one more than are proved, so that further threads show
+        return self._only_late_since is not None and now - self._only_late_since >= LATE_ONLY_S

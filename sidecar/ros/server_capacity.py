@@ -147,7 +147,7 @@ class ServerCapacity:
         return self._overlap.overtaken
 
     @property
-    def _proved(self) -> int:
+    def proved(self) -> int:
         """How many it works on at once at least."""
         return self._gain.of_use(self.overlap)
 
@@ -185,8 +185,8 @@ class ServerCapacity:
             self._round.add(took_s, sent.out)
             if self._round.count >= self._least_round:
                 self._judge(now)
-        if 1 < self._proved >= self._limit < self._most:
-            self._set_limit(self._proved + 1)
+        if 1 < self.proved >= self._limit < self._most:
+            self._set_limit(self.proved + 1)
 
     @property
     def _least_round(self) -> int:
@@ -211,8 +211,8 @@ class ServerCapacity:
         """Set the limit by the last round of requests that were not alone."""
         out = self._round.out
         at_least = self._at_least()
-        at_once = min(max(at_least, self._proved), out)
-        self._by_times = at_least > self._proved
+        at_once = min(max(at_least, self.proved), out)
+        self._by_times = at_least > self.proved
         if out - at_once > KEEPS_PACE:
             self._fell_behind = True
             wanted = self._wanted(at_once)
@@ -250,15 +250,15 @@ class ServerCapacity:
     @property
     def _needs_times(self) -> bool:
         """Whether it makes a difference what a request alone takes."""
-        return self._by_times or self._proved == 1
+        return self._by_times or self.proved == 1
 
     def _wanted(self, at_once: float) -> int:
         """How many to have at a server that does the work of so many requests at once."""
         wanted = max(1, math.ceil(at_once - ROUNDING))
         if at_once < self._round.rate * LONG_S:
             wanted += math.ceil(self._round.rate * WAITING_S)
-        if self._proved > 1:
-            wanted = max(wanted, self._proved + 1)
+        if self.proved > 1:
+            wanted = max(wanted, self.proved + 1)
         return min(wanted, self._most)
 
     def _is_stale(self, now: float) -> bool:

@@ -280,3 +280,16 @@ def test_a_server_that_may_be_dead_gets_no_more_than_it_has(numbers: deque[int])
     assert release(window, heard_at + 0.1, numbers) == [2]
     assert window.next_due() is None, "it must be heard once more for each"
     assert release(window, 300 * STALL_S, numbers) == []
+
+
+@pytest.mark.audit("dp-4")
+def test_late_requests_use_the_threads_that_the_server_is_seen_to_have(numbers: deque[int]) -> None:
+    """However often something fresh comes: else a server of many threads works on one late request at a time."""
+    window = of_size(8)
+    fill(window, 5, now=0.0)
+    assert release(window, 0.0, numbers) == [1, 2, 3, 4, 5]
+    for number in (5, 4, 3, 2, 1):  # overtaken by the fifth: all were in work at once
+        window.answered(number, 0.1)
+    fill(window, 50, deadline=0.2, now=1.0)
+    fill(window, 1, now=1.0)
+    assert len(release(window, 1.0, numbers)) >= 5
