@@ -199,7 +199,8 @@ class ControlClient:
 
     async def _woken_within(self, delay_s: float) -> None:
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._wake.wait(), max(delay_s, 0.0))
+            async with asyncio.timeout(max(delay_s, 0.0)):
+                await self._wake.wait()
 
     async def _one_stream(self) -> None:
         """Open a stream, serve it until it ends, and note why it did."""

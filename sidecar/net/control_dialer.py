@@ -380,7 +380,8 @@ class ControlLine:
             now = time.monotonic()
             due = watch.next_timer(now)
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self.wake.wait(), None if due is None else max(due - now, 0.0))
+                async with asyncio.timeout(None if due is None else max(due - now, 0.0)):
+                    await self.wake.wait()
         self._dialer.stats.connections_left[leave.cause] += 1
         if leave.cause == SILENT and self.way is not None:
             self._dialer.ways.fell_silent(self.way, watch.over, time.monotonic())

@@ -133,7 +133,8 @@ def test_coturns_client_learns_its_address_from_our_server(family: int) -> None:
             stderr=asyncio.subprocess.STDOUT,
         )
         try:
-            output, _ = await asyncio.wait_for(process.communicate(), PATIENCE_S)
+            async with asyncio.timeout(PATIENCE_S):
+                output, _ = await process.communicate()
         finally:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()

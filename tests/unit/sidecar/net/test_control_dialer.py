@@ -150,6 +150,22 @@ def test_bytes_pass_both_ways_over_the_best_way(monkeypatch: pytest.MonkeyPatch)
     run(test, monkeypatch)
 
 
+@pytest.mark.parametrize("turns", range(6))
+def test_news_of_the_network_does_not_keep_a_line_that_is_over(turns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the loop's turn in which the line ends after the news: a wait that has just come true must not swallow
+    its cancellation, or the sidecar stays without a control stream."""
+
+    async def test(echo: Echo) -> None:
+        async with connected(make()) as (line, end):
+            await says(end, b"x")
+            await asyncio.sleep(0.05)
+            line.wake.set()
+            for _ in range(turns):
+                await asyncio.sleep(0)
+
+    run(test, monkeypatch)
+
+
 def test_a_refused_way_gives_way_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     async def test(echo: Echo) -> None:
         echo.refuse = lambda way: OSError(errno.ENETUNREACH, "no") if way.interface == WLAN else None
