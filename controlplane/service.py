@@ -168,7 +168,11 @@ class ControlPlaneService:
             message = await mailbox.get()
             if isinstance(message, CloseReason):
                 raise _StreamEndError(_CLOSE_CODES[message], message.value)
-            await context.write(control_message_to_proto(message))
+            try:
+                await context.write(control_message_to_proto(message))
+            except grpc.aio.InternalError as error:
+                # The connection broke under the message: so gRPC says it to whoever writes.
+                raise _StreamEndError(None, "the connection broke") from error
 
 
 def _parse(data: bytes) -> SidecarMessage:
