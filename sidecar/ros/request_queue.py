@@ -1,7 +1,9 @@
 """Cloud: requests that wait for a local server, in the order in which they should run.
 
 What is more urgent goes first; then what can still make its deadline before what is late already; then the earlier
-deadline. The late are served last, not dropped: their robots still want the answers, until they expire.
+deadline. The late are served last, not dropped: their robots still want the answers, until they expire. Those that will
+expire before they are answered come after all others: at a server that is overloaded for long, the oldest always are
+such, and it would work for nobody.
 """
 
 from __future__ import annotations
@@ -24,10 +26,16 @@ T = TypeVar("T", bound="Hashable")
 
 @dataclass(slots=True)
 class _Class(Generic[T]):
-    """Waiting requests of one priority: heaps of (deadline, order of arrival, request)."""
+    """Waiting requests of one priority: heaps of (deadline, order of arrival, request, when it expires)."""
 
-    fresh: list[tuple[float, int, T]] = field(default_factory=list)
-    late: list[tuple[float, int, T]] = field(default_factory=list)
+    fresh: list[tuple[float, int, T, float]] = field(default_factory=list)
+    late: list[tuple[float, int, T, float]] = field(default_factory=list)
+    hopeless: list[tuple[float, int, T, float]] = field(default_factory=list)
+    """By when they expire, the last first, in place of the deadline."""
+
+    def heaps(self) -> tuple[list[tuple[float, int, T, float]], ...]:
+        """Return all, the first to serve first."""
+        return self.fresh, self.late, self.hopeless
 
 
 class RequestQueue(Generic[T]):
@@ -47,50 +55,60 @@ class RequestQueue(Generic[T]):
     def __contains__(self, request: T) -> bool:
         return request in self._waiting
 
-    def add(self, request: T, priority: Priority, deadline: float) -> None:
-        """Let a request wait."""
+    def add(self, request: T, priority: Priority, deadline: float, expires: float) -> None:
+        """Let a request wait, until `remove` at the latest."""
         self._waiting[request] = None
-        heapq.heappush(self._classes[priority].fresh, (deadline, next(self._order), request))
+        heapq.heappush(self._classes[priority].fresh, (deadline, next(self._order), request, expires))
 
     def remove(self, request: T) -> None:
         """It is not wanted any more."""
         del self._waiting[request]
-        held = sum(len(waiting.fresh) + len(waiting.late) for waiting in self._classes.values())
+        held = sum(len(heap) for waiting in self._classes.values() for heap in waiting.heaps())
         if held > 2 * len(self._waiting) + REMOVED_SLACK:
             for waiting in self._classes.values():
-                waiting.fresh = self._without_removed(waiting.fresh)
-                waiting.late = self._without_removed(waiting.late)
+                for heap in waiting.heaps():
+                    heap[:] = [entry for entry in heap if entry[2] in self._waiting]
+                    heapq.heapify(heap)
 
-    def take(self, now: float, *, late_too: bool) -> tuple[T, bool] | None:
-        """Return the request whose turn it is and whether it is late; None if there is none of those wanted."""
+    def take(self, now: float, hopeless_by: float, *, late_too: bool) -> tuple[T, bool] | None:
+        """Return the request whose turn it is and whether it is late; None if there is none of those wanted.
+
+        What expires until `hopeless_by` comes after all others, whatever their priority.
+        """
         for waiting in self._classes.values():
-            self._sort_out(waiting, now)
+            self._sort_out(waiting, now, hopeless_by)
             heap = waiting.fresh or (waiting.late if late_too else None)
             if heap:
-                request = heapq.heappop(heap)[2]
-                del self._waiting[request]
-                return request, heap is waiting.late
+                return self._pop(heap), heap is waiting.late
+        if late_too:
+            for waiting in self._classes.values():
+                if waiting.hopeless:
+                    return self._pop(waiting.hopeless), True
         return None
 
-    def _sort_out(self, waiting: _Class[T], now: float) -> None:
-        """Bring to the top of both heaps what may be taken."""
+    def _pop(self, heap: list[tuple[float, int, T, float]]) -> T:
+        request = heapq.heappop(heap)[2]
+        del self._waiting[request]
+        return request
+
+    def _sort_out(self, waiting: _Class[T], now: float, hopeless_by: float) -> None:
+        """Bring to the top of the heaps what may be taken."""
         while waiting.fresh and (waiting.fresh[0][0] <= now or waiting.fresh[0][2] not in self._waiting):
             entry = heapq.heappop(waiting.fresh)
             if entry[2] in self._waiting:
                 heapq.heappush(waiting.late, entry)
-        while waiting.late and waiting.late[0][2] not in self._waiting:
-            heapq.heappop(waiting.late)
+        while waiting.late and (waiting.late[0][3] <= hopeless_by or waiting.late[0][2] not in self._waiting):
+            _, order, request, expires = heapq.heappop(waiting.late)
+            if request in self._waiting:
+                heapq.heappush(waiting.hopeless, (-expires, order, request, expires))
+        while waiting.hopeless and waiting.hopeless[0][2] not in self._waiting:
+            heapq.heappop(waiting.hopeless)
 
     def take_all(self) -> list[T]:
         """Return all of them, in order of arrival, and let none wait any more."""
         requests = list(self._waiting)
         self._waiting.clear()
         for waiting in self._classes.values():
-            waiting.fresh.clear()
-            waiting.late.clear()
+            for heap in waiting.heaps():
+                heap.clear()
         return requests
-
-    def _without_removed(self, heap: list[tuple[float, int, T]]) -> list[tuple[float, int, T]]:
-        kept = [entry for entry in heap if entry[2] in self._waiting]
-        heapq.heapify(kept)
-        return kept

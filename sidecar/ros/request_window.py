@@ -43,6 +43,9 @@ LATE_ONLY_S = 2.0
 """When nothing but late requests came for so long, they may fill the window: then the deadline is shorter than the
 way here, and one at a time would only make it worse."""
 
+HOPELESS_TIMES = 1.5
+"""What expires within so many times what requests usually take is served last: it would be answered to nobody."""
+
 T = TypeVar("T", bound="Hashable")
 
 
@@ -59,6 +62,7 @@ class RequestWindow(Generic[T]):
         "_freed",
         "_given_up",
         "_highest_answered",
+        "_last_sent",
         "_late_number",
         "_late_released",
         "_next_late_at",
@@ -79,6 +83,7 @@ class RequestWindow(Generic[T]):
         self._given_up: set[int] = set()
         """Those of them that nobody waits for any more."""
         self._highest_answered = -1
+        self._last_sent = -1
         self._progress_at = 0.0
         self._silences = 0
         """How often one more was let through since the last answer."""
@@ -103,9 +108,9 @@ class RequestWindow(Generic[T]):
         wanted = self._capacity.limit - self._capacity.overtaken
         return max(1, min(wanted + self._silences, SAFE_SIZE))
 
-    def add(self, request: T, priority: Priority, deadline: float, now: float) -> None:
-        """Let a request wait for its turn."""
-        self._waiting.add(request, priority, deadline)
+    def add(self, request: T, priority: Priority, deadline: float, expires: float, now: float) -> None:
+        """Let a request wait for its turn; the caller removes it when it `expires`."""
+        self._waiting.add(request, priority, deadline, expires)
         if deadline > now + self._capacity.usual_s:
             self._only_late_since = None
         elif self._only_late_since is None:
@@ -131,7 +136,8 @@ class RequestWindow(Generic[T]):
             self._progress_at = now
             self._silences += 1
         while len(self._unseen) < self.size:
-            found = self._waiting.take(now + self._capacity.usual_s, late_too=self._late_may_go(now))
+            usual_s = self._capacity.usual_s
+            found = self._waiting.take(now + usual_s, now + HOPELESS_TIMES * usual_s, late_too=self._late_may_go(now))
             if found is None:
                 return
             request, self._late_released = found
@@ -141,6 +147,7 @@ class RequestWindow(Generic[T]):
         """rmw gave `number` to the request just sent; numbers ascend."""
         if not self._unseen:
             self._progress_at = now
+        self._last_sent = number
         self._unseen.append(number)
         self._capacity.sent(number, len(self._unseen), now)
         if self._late_released:
@@ -148,7 +155,9 @@ class RequestWindow(Generic[T]):
             self._next_late_at = now + STALL_S
 
     def answered(self, number: int, now: float) -> None:
-        """The server answered request `number`."""
+        """The server answered request `number`; an answer to what it was never sent tells nothing."""
+        if number > self._last_sent:
+            return
         self._progress_at = now
         self._silences = 0
         self._capacity.answered(number, now)

@@ -83,7 +83,7 @@ class ServiceRunner:
 
     def add(self, execution: Execution, now: float) -> bool:
         """Send `execution` now, or as soon as the server has room; return False when it has to wait."""
-        self.window.add(execution, execution.priority, execution.deadline_at, now)
+        self.window.add(execution, execution.priority, execution.deadline_at, execution.expires_at, now)
         self.release(now)
         return not self.window.holds(execution)
 
@@ -129,13 +129,13 @@ class ServiceRunner:
         """Forget everything; return (executions that may have run, executions that certainly have not)."""
         sent = list(self._at_server.values())
         self._at_server.clear()
-        return sent, self.take_back_unsent()
+        unsent = self.take_back_unsent()
+        self.window = RequestWindow(alive_since=self._alive_since)
+        return sent, unsent
 
     def take_back_unsent(self) -> list[Execution]:
         """Forget what waits, which certainly has not run; what is at the server may still be answered."""
-        unsent = self.window.take_all()
-        self.window = RequestWindow(alive_since=self._alive_since)
-        return unsent
+        return self.window.take_all()
 
     def close(self) -> None:
         """Destroy the client."""

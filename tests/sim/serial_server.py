@@ -48,7 +48,7 @@ class SerialServer:
             case ExecuteRequest():
                 self.requests[event.execution] = event
                 self.expires_at[event.execution] = now + event.expires_s
-                self.window.add(event.execution, event.priority, now + event.deadline_s, now)
+                self.window.add(event.execution, event.priority, now + event.deadline_s, now + event.expires_s, now)
             case CancelExecution(execution) | AbandonExecution(execution):
                 if self.window.holds(execution):
                     self.window.remove(execution)

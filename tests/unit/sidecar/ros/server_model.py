@@ -36,6 +36,8 @@ class ModelServer:
     most_queued: int = 0
     answered: dict[int, float] = field(default_factory=dict)
     """When each request's answer was back."""
+    expired: set[int] = field(default_factory=set)
+    """Requests that nobody waited for any more before their answer was back."""
     answers: bool = True
     """Whether what it has done is answered."""
 
@@ -47,12 +49,17 @@ class ModelServer:
         self._requests = count()
         self._queue: deque[tuple[int, int]] = deque()
         self._working = 0
+        self._number_of: dict[int, int] = {}
 
-    def ask(self, requests: int, *, deadline_s: float = 1e9, priority: Priority = Priority.NORMAL) -> list[int]:
+    def ask(
+        self, requests: int, *, deadline_s: float = 1e9, lifetime_s: float = 1e9, priority: Priority = Priority.NORMAL
+    ) -> list[int]:
         """Let so many requests come at once; return them."""
         new = [next(self._requests) for _ in range(requests)]
         for request in new:
-            self.window.add(request, priority, self.now + deadline_s, self.now)
+            self.window.add(request, priority, self.now + deadline_s, self.now + lifetime_s, self.now)
+            if lifetime_s < 1e9:
+                self._at(lifetime_s, lambda request=request: self._expire(request))  # type: ignore[misc]
         self._release()
         return new
 
@@ -86,6 +93,7 @@ class ModelServer:
         for request in self.window.release(self.now):
             number = next(self._numbers)
             self.window.sent(number, self.now)
+            self._number_of[request] = number
             self._at(self.hop_s / 2, lambda number=number, request=request: self._arrive(number, request))  # type: ignore[misc]
 
     def _arrive(self, number: int, request: int) -> None:
@@ -107,6 +115,16 @@ class ModelServer:
         if self.answers:
             self._at(self.hop_s / 2, lambda: self._answer(number, request))
         self._work()
+
+    def _expire(self, request: int) -> None:
+        if request in self.answered:
+            return
+        self.expired.add(request)
+        if self.window.holds(request):
+            self.window.remove(request)
+        else:
+            self.window.given_up(self._number_of[request])
+        self._release()
 
     def _answer(self, number: int, request: int) -> None:
         self.answered[request] = self.now

@@ -9,7 +9,10 @@ from unittest.mock import Mock
 import pytest
 
 from sidecar.core.events import AbandonExecution, ExecutionId
+from sidecar.core.priority import Priority
 from sidecar.ros.cloud_side import CloudSide
+from sidecar.ros.request_window import RequestWindow
+from sidecar.ros.service_runner import ServiceRunner
 from sidecar.ros.stats import BridgeStats
 
 
@@ -47,3 +50,27 @@ def test_what_is_given_up_makes_room_for_those_that_wait(side: Any) -> None:
     side._executions[execution] = (runner, SimpleNamespace(id=execution, number=1))
     side._abandon(AbandonExecution(execution, awaited=False))
     assert side._paced == {runner}
+
+
+@pytest.mark.audit("dp-15")
+def test_what_lies_at_a_server_that_stood_still_counts_when_it_goes_on() -> None:
+    """Its queue holds ten: what it was handed before its silence is still in there."""
+    runner: Any = ServiceRunner.__new__(ServiceRunner)
+    runner._at_server = {}
+    runner._alive_since = lambda _since: False
+    runner.window = RequestWindow(alive_since=runner._alive_since)
+
+    def ask(requests: range) -> list[int]:
+        for request in requests:
+            runner.window.add(request, Priority.NORMAL, 1e9, 1e9, 0.0)
+        sent = []
+        for request in runner.window.release(0.0):
+            runner.window.sent(request, 0.0)
+            sent.append(request)
+        return sent
+
+    assert ask(range(5)) == [0]
+    assert runner.take_back_unsent() == [1, 2, 3, 4]
+    assert ask(range(5, 9)) == []
+    assert runner.take_back() == ([], [5, 6, 7, 8])
+    assert ask(range(9, 12)) == [9]  # another server: nothing lies there

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections import deque
 from itertools import count
@@ -19,7 +20,7 @@ def fill(window: RequestWindow[int], requests: int, *, deadline: float = 1e9, no
     """Let so many requests wait; return them."""
     new = [next(_items) for _ in range(requests)]
     for request in new:
-        window.add(request, Priority.NORMAL, deadline, now)
+        window.add(request, Priority.NORMAL, deadline, math.inf, now)
     return new
 
 
@@ -293,3 +294,16 @@ def test_late_requests_use_the_threads_that_the_server_is_seen_to_have(numbers: 
     fill(window, 50, deadline=0.2, now=1.0)
     fill(window, 1, now=1.0)
     assert len(release(window, 1.0, numbers)) >= 5
+
+
+def test_an_answer_to_what_was_never_sent_tells_nothing(numbers: deque[int]) -> None:
+    window = of_size(2)
+    fill(window, 10)
+    assert release(window, 0.0, numbers) == [1, 2]
+    window.answered(99, 0.01)
+    assert release(window, 0.01, numbers) == []
+    window.answered(1, 0.02)
+    window.answered(2, 0.02)
+    assert release(window, 0.02, numbers) == [3, 4]
+    window.answered(3, 0.03)
+    assert release(window, 0.03, numbers) == [5]
