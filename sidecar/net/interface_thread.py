@@ -18,6 +18,7 @@ from sidecar.core.path_id import PathState
 from sidecar.net.batch_socket import RECEIVE_CALLS, BatchSocket
 from sidecar.net.path_log import PathLog
 from sidecar.net.sources import Sources
+from sidecar.net.thread_state import is_in_a_call
 from sidecar.net.waiter import Waiter
 
 if TYPE_CHECKING:
@@ -120,6 +121,10 @@ class InterfaceThread:
         """Return for how long (s) the thread has not waited for anything; 0 while it does."""
         began = self._turn_began
         return 0.0 if began is None else now - began
+
+    def is_in_a_call(self) -> bool:
+        """Whether it waits for the kernel: neither for a processor, nor for the interpreter, nor for a lock."""
+        return is_in_a_call(self._thread.native_id)
 
     # Runs on the thread ------------------------------------------------------------------------------------------
 

@@ -42,7 +42,12 @@ class Watchdog:
         if slept > HUNG_AFTER_S:
             return None  # we did not get to run either: the machine stalled, not a driver
         before = self._hung
-        self._hung = {thread for thread in threads if thread.in_turn_for(now) > HUNG_AFTER_S}
+        # On a busy machine a thread may not get to run for as long; that is no driver's fault, and ends by itself.
+        self._hung = {
+            thread
+            for thread in threads
+            if thread.in_turn_for(now) > HUNG_AFTER_S and (thread in before or thread.is_in_a_call())
+        }
         changes = Changes(
             [thread for thread in threads if thread in self._hung and thread not in before],
             [thread for thread in threads if thread in before and thread not in self._hung],

@@ -13,9 +13,13 @@ class FakeThread:
 
     def __init__(self) -> None:
         self.began: float | None = None
+        self.in_a_call = True
 
     def in_turn_for(self, now: float) -> float:
         return 0.0 if self.began is None else now - self.began
+
+    def is_in_a_call(self) -> bool:
+        return self.in_a_call
 
 
 class Fixture:
@@ -74,3 +78,16 @@ def test_a_thread_that_was_taken_away_is_forgotten() -> None:
     del world.fakes[1]
     assert world.look_until(102.0) == []
     assert not world.dog.hangs(gone)
+
+
+def test_a_thread_that_does_not_get_to_run_blames_no_driver() -> None:
+    world = Fixture()
+    world.fakes[0].began = world.now
+    world.fakes[0].in_a_call = False
+    assert world.look_until(105.0) == []
+    world.fakes[0].in_a_call = True
+    assert world.look_until(106.0) == [Changes([world.threads[0]], [])]
+    world.fakes[0].in_a_call = False  # back from the driver, and it waits for the interpreter
+    assert world.look_until(107.0) == []
+    world.fakes[0].began = None
+    assert world.look_until(108.0) == [Changes([], [world.threads[0]])]
