@@ -78,6 +78,7 @@ def churn(console: Console, folder: Path, length_s: float, seed: int) -> report.
         runner.postponed_s,
         runner.watch.lives,
         runner.watch.growths(length_s, SAMPLE_EVERY_S),
+        runner.machine.loads,
         failures,
     )
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from bench.churn.machine import Load
     from bench.churn.runner import Done
     from bench.churn.samples import Growth, Life
 
@@ -35,6 +36,7 @@ class Outcome:
     postponed_s: dict[str, float]
     lives: list[Life]
     growths: list[Growth]
+    loads: list[Load]
     failures: list[str] = field(default_factory=list)
 
     def verdicts(self) -> list[str]:
@@ -71,6 +73,7 @@ def write_json(path: Path, outcome: Outcome) -> None:
         "postponed_s": outcome.postponed_s,
         "recovery_s": recovery(outcome.done),
         "growth": [{**asdict(growth), "grows": growth.grows} for growth in outcome.growths],
+        "machine": [asdict(load) for load in outcome.loads],
         "lives": [asdict(life) for life in outcome.lives],
         "timeline": [asdict(entry) for entry in outcome.done],
     }
@@ -82,6 +85,7 @@ def show(console: Console, outcome: Outcome) -> None:
     console.print(_requests(outcome))
     console.print(_recovery(outcome))
     console.print(_processes(outcome))
+    console.print(_machine(outcome.loads))
     verdicts = outcome.verdicts()
     for verdict in verdicts:
         console.print(f"[red]failed: {verdict}[/red]")
@@ -112,6 +116,18 @@ def _recovery(outcome: Outcome) -> Table:
     for kind, times in recovery(outcome.done).items():
         table.add_row(kind, str(len(times)), f"{times[len(times) // 2]:.1f}", f"{times[-1]:.1f}")
     return table
+
+
+def _machine(loads: list[Load]) -> str:
+    """One line, as whoever shares the machine may be the reason for what is late."""
+    if not loads:
+        return "nothing is known of the machine"
+    parts = [("busy", [load.busy for load in loads]), ("stolen", [load.stolen for load in loads])]
+    waiting = [load.waiting for load in loads if load.waiting is not None]
+    if waiting:
+        parts.append(("somebody waits for one", waiting))
+    shares = (f"{name} {sum(each) / len(each):.0%}, at worst {max(each):.0%}" for name, each in parts)
+    return f"processors: {'; '.join(shares)}"
 
 
 def _processes(outcome: Outcome) -> Table:

@@ -8,6 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from bench.churn.machine import Machine
 from bench.churn.samples import Watch
 from bench.churn.schedule import CALM_END_S, PATHS, SERVERS, SPARED_FROM, Lane, Trouble, ends_a_judged_process, others
 
@@ -53,6 +54,7 @@ class Runner:
         self.done: list[Done] = []
         self.failures: list[str] = []
         self.watch = Watch()
+        self.machine = Machine()
         self._hands = hands
         self._length_s = length_s
         self._say = say
@@ -62,6 +64,7 @@ class Runner:
         """By target, what is not back in use yet."""
         self._well = set(PATHS) | set(SERVERS)
         self._zero = 0.0
+        self._load = ""
 
     @property
     def postponed_s(self) -> dict[str, float]:
@@ -83,6 +86,7 @@ class Runner:
                 sample_at = now + SAMPLE_EVERY_S
                 parts = self._hands.system.parts
                 self.watch.take(now, {name: parts[name] for name in ours})
+                self._load = str(self.machine.look(now))
             time.sleep(TURN_S)
         for state in self._lanes.values():
             if state.current is not None:
@@ -148,4 +152,4 @@ class Runner:
             found = _PROGRESS.findall(client.tail(3))
             sent, unanswered = found[-1] if found else ("0", "0")
             counts.append(f"{client.name}: {sent} sent, {unanswered} open")
-        return f"{self._length_s - now:5.0f} s left   {'   '.join(counts)}"
+        return f"{self._length_s - now:5.0f} s left   {'   '.join((*counts, self._load))}"

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bench.churn.machine import processor_s
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -27,6 +29,8 @@ class Sample:
     at_s: float
     rss_mb: float
     threads: int
+    processor_s: float = 0.0
+    """Used since it began."""
 
 
 @dataclass(slots=True)
@@ -79,7 +83,7 @@ class Watch:
             if life is None:
                 life = Life(name, pid)
                 self.lives.append(life)
-            life.samples.append(Sample(at_s, *read))
+            life.samples.append(Sample(at_s, *read, processor_s(pid)))
 
     def growths(self, length_s: float, every_s: float) -> list[Growth]:
         """How the processes grew that ran at the end of a run of `length_s`, sampled every `every_s`."""
