@@ -173,6 +173,9 @@ class Shortcut:
             )
         )
 
+    def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
+        assert problem is None
+
     def answered_here(self, request_id: RequestId) -> None:
         raise AssertionError("nothing has a fallback here")
 
@@ -180,7 +183,7 @@ class Shortcut:
         request_id, service = self._requests.pop(execution)
         assert self.robot is not None
         self.robot.handle(
-            ResponseArrived(request_id, service, payload, NodeName("cloud"), INTERFACE, processing_s, late=False)
+            ResponseArrived(request_id, service, 0, payload, NodeName("cloud"), INTERFACE, processing_s, late=False)
         )
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str) -> None:

@@ -96,6 +96,7 @@ class Side:
                     engine.complete(application_event.execution, ANSWER, 0.0, now)
                 elif isinstance(application_event, ResponseArrived):
                     self.answered += 1
+                    engine.judge_answer(application_event.request_id, application_event.copy, None, now)
                 elif isinstance(application_event, RequestFailed):
                     raise SystemExit(f"a request failed: {application_event.reason}")
             for _, command in engine.take_commands():

@@ -90,8 +90,10 @@ class System:
         }
         return self._start("controlplane", host, "controlplane", self._write("controlplane", config))
 
-    def start_cloud(self, name: str, services: Sequence[dict[str, Any]], **changes: Any) -> Part:
-        """Start a cloud's sidecar; `services` as in its configuration."""
+    def start_cloud(
+        self, name: str, services: Sequence[dict[str, Any]], *, module: str = "sidecar", **changes: Any
+    ) -> Part:
+        """Start a cloud's sidecar (or what takes its place); `services` as in its configuration."""
         config = {
             "name": name.replace("_", "-"),
             "role": "cloud",
@@ -103,7 +105,7 @@ class System:
             "services": list(services),
             **changes,
         }
-        return self._start(f"{name}.sidecar", self.lab.host(name), "sidecar", self._write(f"{name}.sidecar", config))
+        return self._start(f"{name}.sidecar", self.lab.host(name), module, self._write(f"{name}.sidecar", config))
 
     def start_robot(
         self,

@@ -165,6 +165,12 @@ def _requests(stats: EngineStats) -> Iterator[Metric]:
         stats.copies_refused,
     )
     yield counter(
+        "plr_bad_answers",
+        "Answers that could not be delivered; their server is out of favour for a while.",
+        ("peer", "service"),
+        stats.bad_answers,
+    )
+    yield counter(
         "plr_late_responses_dropped",
         "Responses after the deadline that drop_late kept from the application.",
         ("service",),

@@ -19,7 +19,13 @@ class DataPlane(Protocol):
         """This run's session."""
 
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
-        """Robot: send a serialised request; ends in exactly one ResponseArrived or RequestFailed."""
+        """Robot: send a serialised request. It ends in exactly one RequestFailed, or with an answer judged good."""
+
+    def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
+        """Robot: this copy's answer is with the application, or can not be delivered, for this reason.
+
+        To be said of every ResponseArrived. After a problem another server's answer is taken.
+        """
 
     def answered_here(self, request_id: RequestId) -> None:
         """Robot: the application has its answer, not from the network; how the request ends is told all the same."""

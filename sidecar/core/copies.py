@@ -32,12 +32,23 @@ class Carried(NamedTuple):
     size_class: int
 
 
+class Answer(NamedTuple):
+    """What is known of a copy's answer besides what it says."""
+
+    size: int
+    processing_s: float
+    at: float
+    measured: bool
+    """It tells of its path."""
+
+
 class CopyState(enum.Enum):
     """What became of a copy."""
 
     PENDING = "pending"
     ANSWERED = "answered"
     REJECTED = "rejected"
+    """It was refused, or its answer can not be delivered."""
     DEAD = "dead"
     """Its server's session ended, or it was called off or taken back."""
 
@@ -54,6 +65,8 @@ class Copy:
     """It was refused unrun, or nothing of it left before it was dead."""
     in_time: bool = False
     """It was answered before the deadline."""
+    answer: Answer | None = None
+    """Which the application judges at present."""
     ended_at: float | None = None
     """When it was answered or called off."""
     explores: bool = False
@@ -102,6 +115,8 @@ class Request:
     answered_here: bool = False
     """The application has its answer, not from the network: copies are sent no more, and are awaited until the deadline
     for what they tell of their paths."""
+    judged: int = 0
+    """How many answers the application judges at present."""
     found_unreachable: bool = False
     retry_at: float | None = None
     """When servers that refused it for the moment are asked again (s); None: not at all."""
@@ -120,6 +135,11 @@ class Request:
     @property
     def expires_at(self) -> float:
         return self.submitted_at + self.rule.lifetime_s
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether the application has an answer, or looks at one: no copy is sent any more meanwhile."""
+        return self.answered_here or self.judged > 0
 
     def pending(self) -> list[Copy]:
         return [copy for copy in self.copies if copy.state is CopyState.PENDING]
@@ -146,7 +166,7 @@ class Request:
 
     def may_be_sent(self) -> bool:
         """Whether no copy of it may be answered any more, and another one does no harm."""
-        return not self.done and not self.pending() and (self.rule.idempotent or self.certainly_not_run())
+        return not (self.done or self.judged or self.pending()) and (self.rule.idempotent or self.certainly_not_run())
 
     def worth_another_copy(self, servers: tuple[NodeName, ...], *, rejected: bool) -> tuple[NodeName, ...]:
         """Return those of `servers` that have no pending copy and refused none.

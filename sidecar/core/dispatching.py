@@ -20,7 +20,7 @@ from sidecar.core.path_records import PathRecords
 from sidecar.core.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from protos.model import NodeName
     from sidecar.core.messages import Encoded
@@ -70,9 +70,10 @@ class Dispatching:
             return ()
         return request.worth_another_copy(servers, rejected=rejected)
 
-    def start(self, request: Request, servers: list[NodeName], now: float) -> float | None:
+    def start(self, request: Request, servers: Collection[NodeName], now: float) -> float | None:
         """Send the first copies to some of these servers; returns when `look_again` is wanted, if at all."""
         rule = request.rule
+        servers = self._favoured(servers, now)
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
         if rule.redundancy is RedundancyMode.REPLICATE:
             paths = self._best_first(request, chosen, now) if self._budgets else chosen
@@ -87,6 +88,11 @@ class Dispatching:
             self._send(request, unmapped, now, _Why.EXPLORATION)
         request.choose_observation()
         return look_at
+
+    def _favoured(self, servers: Collection[NodeName], now: float) -> Collection[NodeName]:
+        """Those within reach that give good answers; the others where there is no such."""
+        reached = [server for server in servers if self._parts.routes.reaches(server)]
+        return self._parts.penalties.favoured(reached or servers, now)
 
     def _send_best(self, request: Request, paths: list[PathId], now: float) -> None:
         while paths and not request.copies:
@@ -128,7 +134,7 @@ class Dispatching:
         """Send further copies as the target asks for; returns when to look again, None if that has no sense."""
         while True:
             miss = self._adaptive.miss_probability(request, now)
-            path = self._next_over_another_interface(request)
+            path = self._next_over_another_interface(request, now)
             if path is None or not self._adaptive.needs(request, path, miss, now):
                 break
             if not self._send(request, path, now, _Why.HEDGE):
@@ -140,7 +146,7 @@ class Dispatching:
 
     def look_again(self, request: Request, now: float) -> float | None:
         """The moment that `start` or the last call named has come; returns when to look once more."""
-        if request.done or request.answered_here or not request.relied_on():
+        if request.done or request.is_answered or not request.relied_on():
             return None
         if request.rule.redundancy is RedundancyMode.ADAPTIVE:
             return self._adapt(request, now)
@@ -156,7 +162,7 @@ class Dispatching:
         """
         waiting = request.relied_on()
         if request.rule.redundancy is RedundancyMode.HEDGE:
-            path = self._next_withheld(request)
+            path = self._next_withheld(request, now)
             if path is not None and path.interface != waiting[0].path.interface:
                 if len(waiting) == 1:
                     self._send(request, path, now, _Why.HEDGE)
@@ -175,7 +181,7 @@ class Dispatching:
         """
         routes = self._parts.routes
         waiting = request.relied_on()
-        if request.answered_here or (waiting and not request.rule.redundancy.helps):
+        if request.is_answered or (waiting and not request.rule.redundancy.helps):
             return
         if rejected and len(request.copies) >= MAX_COPIES:
             return  # its retry asks on, without haste
@@ -185,7 +191,7 @@ class Dispatching:
             return
         if not insist and any(routes.state(copy.path) is PathState.UP for copy in waiting):
             return
-        path = self._next_withheld(request) or self._elsewhere(request, rejected=rejected)
+        path = self._next_withheld(request, now) or self._elsewhere(request, now, rejected=rejected)
         if path is None:
             path = self._take_back(request, waiting, now)
         if path is None:
@@ -198,17 +204,19 @@ class Dispatching:
         """Whether its server may not have all of it yet, as its path is slow and not silent."""
         return not copy.message.newest.over and self._parts.routes.state(copy.path) is PathState.UP
 
-    def _next_over_another_interface(self, request: Request) -> PathId | None:
+    def _next_over_another_interface(self, request: Request, now: float) -> PathId | None:
         used = {copy.path.interface for copy in request.relied_on()}
-        path = self._next_withheld(request)
+        path = self._next_withheld(request, now)
         return None if path is None or path.interface in used else path
 
-    def _next_withheld(self, request: Request) -> PathId | None:
+    def _next_withheld(self, request: Request, now: float) -> PathId | None:
         """The best path that is up of those its mapping names and that carry no copy, to a server that may run it."""
         waiting = {copy.path.peer for copy in request.relied_on()}
         refused = {copy.path.peer for copy in request.copies if copy.state is CopyState.REJECTED}
         for path in request.withheld:
             if self._parts.routes.state(path) is not PathState.UP or path.peer in refused:
+                continue
+            if self._parts.penalties.out_until(path.peer) > now:
                 continue
             if not self._parts.outbox.has_room(path.peer, request.size):
                 continue
@@ -216,8 +224,9 @@ class Dispatching:
                 return path
         return None
 
-    def _elsewhere(self, request: Request, *, rejected: bool) -> PathId | None:
-        return self._parts.mapping.rescue(self.with_room(self.candidates(request, rejected=rejected), request))
+    def _elsewhere(self, request: Request, now: float, *, rejected: bool) -> PathId | None:
+        servers = self._favoured(self.candidates(request, rejected=rejected), now)
+        return self._parts.mapping.rescue(self.with_room(servers, request))
 
     def _take_back(self, request: Request, waiting: list[Copy], now: float) -> PathId | None:
         """Free a request that is not idempotent from a server that nothing leads to, if nothing has left for it.

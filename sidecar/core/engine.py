@@ -170,6 +170,11 @@ class Engine:
         self._requests.submit(request_id, service, kind, rule, payload, now)
         self._count_in_flight()
 
+    def judge_answer(self, request_id: RequestId, copy: int, problem: str | None, now: float) -> None:
+        """Robot: this copy's answer is with the application, or can not be delivered, for this reason."""
+        self._requests.judge_answer(request_id, copy, problem, now)
+        self._count_in_flight()
+
     def answered_here(self, request_id: RequestId, now: float) -> None:
         """Robot: the application has its answer, not from the network."""
         self._requests.answered_here(request_id, now)

@@ -70,10 +70,13 @@ class WithdrawService:
 
 @dataclass(frozen=True, slots=True)
 class ResponseArrived:
-    """The first valid response to a request; there is never a second one."""
+    """A response to a request, whether it can be delivered or not: `judge_answer` says which. Until then another one
+    may come."""
 
     request_id: RequestId
     service: ServiceName
+    copy: int
+    """Which copy of the request was answered."""
     payload: bytes | memoryview = field(repr=False)
     """A view is of a buffer of its own: whoever wants bytes copies them, which takes milliseconds for the largest."""
     server: NodeName

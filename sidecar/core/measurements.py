@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from sidecar.core.copies import Carried
     from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
     from sidecar.core.link_events import PathMeasured
-    from sidecar.core.messages import ResponseMessage
     from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
 
@@ -78,14 +77,14 @@ class Measurements:
         """The class of a request before its answer is known: the service's latest one stands for it."""
         return size_class(request_bytes + self._answer_bytes.get(service, 0))
 
-    def answered(self, carried: Carried, latency_s: float, response: ResponseMessage) -> None:
-        """One copy was answered `latency_s` after it was sent."""
+    def answered(self, carried: Carried, latency_s: float, processing_s: float, answer_bytes: int) -> None:
+        """One copy was answered `latency_s` after it was sent, of which the server worked for `processing_s`."""
         if carried.service in self._answer_bytes or len(self._answer_bytes) < MAX_ANSWER_SIZES:
-            self._answer_bytes[carried.service] = len(response.payload)
+            self._answer_bytes[carried.service] = answer_bytes
         counts = self._of(carried)
         if counts is not None:
-            counts.network.record(latency_s - response.processing_s)
-            counts.processing.record(response.processing_s)
+            counts.network.record(latency_s - processing_s)
+            counts.processing.record(processing_s)
 
     def called_off(self, carried: Carried, after_s: float) -> None:
         """One copy that its server did not have yet was called off `after_s` after it was sent."""

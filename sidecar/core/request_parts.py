@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from sidecar.core.backlog import Backlog
+from sidecar.core.penalties import Penalties
 from sidecar.core.request_index import RequestIndex
 
 if TYPE_CHECKING:
@@ -39,3 +40,4 @@ class RequestParts:
     """What extra copies may cost."""
     backlog: Backlog = field(default_factory=Backlog)
     in_flight: RequestIndex = field(default_factory=RequestIndex)
+    penalties: Penalties = field(default_factory=Penalties)

@@ -1,10 +1,12 @@
 """Robot side: replicate a request, take the first valid response, notice the deadline (paper, figure "Workflow
 Diagram", request steps 3 to 10).
 
-A copy is one sending of a request to one server. When the first answer wins, the other copies are called off: what
-is unsent of them stays here, and their servers are told. What a called-off copy would have taken, nobody knows, and to
-measure only those that were not called off would flatter every path. So one request in `OBSERVED_ONE_IN` is a full
-race whose copies are all measured, and the others are not measured at all (docs/architecture.md, "What is measured").
+A copy is one sending of a request to one server. The application judges each answer: one that can not be delivered is a
+copy that failed, and its server is out of favour for a while. When the first good answer wins, the other copies are
+called off: what is unsent of them stays here, and their servers are told. What a called-off copy would have taken,
+nobody knows, and to measure only those that were not called off would flatter every path. So one request in
+`OBSERVED_ONE_IN` is a full race whose copies are all measured, and the others are not measured at all
+(docs/architecture.md, "What is measured").
 In a race, once the deadline is over and another copy has won, a copy that has not arrived is called off: its time in
 the network is known to be longer than that, and is reported so.
 """
@@ -19,7 +21,7 @@ from protos.histogram import Histogram
 from protos.model import Assignment
 from sidecar.core.backlog import GROUP, rest
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
-from sidecar.core.copies import Copy, CopyState, Request
+from sidecar.core.copies import Answer, Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.dispatching import MAX_COPIES, Dispatching
 from sidecar.core.events import (
@@ -88,7 +90,7 @@ class RequestTable:
         payload: bytes,
         now: float,
     ) -> None:
-        """Send a request; ends in exactly one ResponseArrived or RequestFailed."""
+        """Send a request. It ends in exactly one RequestFailed, or with an answer judged good."""
         size_class = self._parts.measurements.size_class(service, len(payload))
         request = Request(request_id, service, kind, rule, payload, now, size_class)
         problem = self._problem(request)
@@ -153,7 +155,7 @@ class RequestTable:
             yield partial(self._go, request, servers)
 
     def _go(self, request: Request, servers: list[NodeName], now: float) -> None:
-        if request.done or request.answered_here:
+        if request.done or request.is_answered:
             return
         if request.copies:
             self._rescue(request, now)
@@ -197,40 +199,99 @@ class RequestTable:
         copy.in_time = copy.state is CopyState.PENDING and now <= request.deadline_at
         copy.state = CopyState.ANSWERED
         copy.ended_at = now
-        self._dispatching.answered(request, copy, response.processing_s, now)
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
         self._parts.outbox.on_answered(copy.message)
-        if measure:
-            self._parts.measurements.answered(request.carried(copy), now - copy.sent_at, response)
+        answer = Answer(len(response.payload), response.processing_s, now, measure)
+        late = now - request.submitted_at > request.rule.deadline_s
+        if request.done or (late and request.rule.drop_late):
+            self._count_answer(request, copy, answer)
         if request.done:
             self._parts.stats.duplicate_responses += 1
+        elif late and request.rule.drop_late:
+            self._drop_late(request, copy, answer)
         else:
-            self._deliver(request, copy, response, now)
-            losers = [copy for copy in request.pending() if copy.hedges or not request.observed]
-            if losers:
-                small = len(response.payload) <= SMALL_ANSWER_BYTES
-                self._calling_off.call_off(request, losers, now, untold=server if small else None)
+            self._offer(request, copy, answer, response.payload, late=late)
         self._settle(request, now)
 
-    def _deliver(self, request: Request, copy: Copy, response: ResponseMessage, now: float) -> None:
-        stats = self._parts.stats
-        elapsed = now - request.submitted_at
-        late = elapsed > request.rule.deadline_s
+    def _count_answer(self, request: Request, copy: Copy, answer: Answer) -> None:
+        """Note what an answer tells of its path and server."""
+        self._dispatching.answered(request, copy, answer.processing_s, answer.at)
+        if answer.measured:
+            took_s = answer.at - copy.sent_at
+            self._parts.measurements.answered(request.carried(copy), took_s, answer.processing_s, answer.size)
+
+    def _drop_late(self, request: Request, copy: Copy, answer: Answer) -> None:
+        if not request.missed:
+            self._miss(request)
+        self._end_well(request, answer.at)
+        self._parts.stats.late_dropped[request.service] += 1
+        elapsed = answer.at - request.submitted_at
+        self._parts.emit(RequestFailed(request.id, request.service, "late_dropped", "came after its deadline", elapsed))
+        self._call_off_losers(request, copy, answer, answer.at)
+
+    def _offer(self, request: Request, copy: Copy, answer: Answer, payload: bytes | memoryview, *, late: bool) -> None:
+        """Let the application judge an answer. Meanwhile the request is as good as answered."""
         if late and not request.missed:
             self._miss(request)
-        self._finish(request, "deadline_missed" if late else "ok")
-        stats.durations.setdefault(request.service, Histogram()).record(elapsed)
-        if late and request.rule.drop_late:
-            stats.late_dropped[request.service] += 1
-            self._parts.emit(
-                RequestFailed(request.id, request.service, "late_dropped", "came after its deadline", elapsed)
-            )
-            return
-        stats.wins[copy.path.interface, copy.path.peer, request.service] += 1
-        payload = response.payload
+        copy.answer = answer
+        request.judged += 1
+        elapsed = answer.at - request.submitted_at
+        path, number = copy.path, request.copies.index(copy)
         self._parts.emit(
-            ResponseArrived(request.id, request.service, payload, copy.path.peer, copy.path.interface, elapsed, late)
+            ResponseArrived(request.id, request.service, number, payload, path.peer, path.interface, elapsed, late)
         )
+
+    def _call_off_losers(self, request: Request, winner: Copy, answer: Answer, now: float) -> None:
+        losers = [copy for copy in request.pending() if copy.hedges or not request.observed]
+        if losers:
+            small = answer.size <= SMALL_ANSWER_BYTES
+            self._calling_off.call_off(request, losers, now, untold=winner.path.peer if small else None)
+
+    def judge_answer(self, request_id: RequestId, number: int, problem: str | None, now: float) -> None:
+        """An answer that was offered is with the application, or can not be delivered, for this reason."""
+        request = self._requests.get(request_id)
+        copy = None if request is None or number >= len(request.copies) else request.copies[number]
+        if request is None or copy is None or copy.answer is None:
+            return  # its request ended meanwhile
+        answer, copy.answer = copy.answer, None
+        request.judged -= 1
+        if problem is not None:
+            self._answer_is_bad(request, copy, problem, now)
+        else:
+            self._count_answer(request, copy, answer)
+            if request.done:
+                self._parts.stats.duplicate_responses += 1
+            else:
+                self._parts.stats.wins[copy.path.interface, copy.path.peer, request.service] += 1
+                self._end_well(request, answer.at)
+                self._call_off_losers(request, copy, answer, now)
+        self._settle(request, now)
+
+    def _end_well(self, request: Request, at: float) -> None:
+        """It was answered then."""
+        elapsed = at - request.submitted_at
+        self._finish(request, "deadline_missed" if elapsed > request.rule.deadline_s else "ok")
+        self._parts.stats.durations.setdefault(request.service, Histogram()).record(elapsed)
+
+    def _answer_is_bad(self, request: Request, copy: Copy, problem: str, now: float) -> None:
+        """The copy has failed as if its server had not answered; others are asked, for a while in its place."""
+        copy.state = CopyState.REJECTED
+        copy.in_time = False
+        server = copy.path.peer
+        out_s = self._parts.penalties.bad_answer(server, now)
+        self._parts.stats.bad_answers[server, request.service] += 1
+        self._lost(request, copy, delivered=True)
+        if request.done or request.judged:
+            return
+        if now >= request.deadline_at and not request.missed:
+            self._miss(request)
+        self._rescue(request, now)
+        if not request.pending() and request not in self._no_room:
+            if request.may_be_sent() and self._dispatching.candidates(request):
+                self._requests.strand(request)
+            else:
+                why = f"bad answer of {server}, which is asked for others only after {out_s:.0f} s: {problem}"
+                self._fail(request, "failed", why, now)
 
     def on_rejection(self, server: NodeName, rejection: RejectionMessage, now: float) -> None:
         """A server did not run a copy, or can not say what came of it."""
@@ -347,7 +408,7 @@ class RequestTable:
 
     def _look_after(self, request: Request, now: float) -> None:
         """A path of this request changed: its copies on others than those that are up are not relied on."""
-        if request.done or request.answered_here or request.id not in self._requests:
+        if request.done or request.is_answered or request.id not in self._requests:
             return
         for copy in request.pending():
             if self._parts.routes.state(copy.path) is not PathState.UP:
@@ -429,6 +490,8 @@ class RequestTable:
             self._measure(request, now)
             if request.done:
                 self._settle(request, now)
+            elif request.judged:
+                pass  # in a moment it is answered, in time, or rescued
             elif request.answered_here:
                 self._end_answered_here(request, now)
             elif not request.missed:

@@ -71,6 +71,8 @@ class EngineStats:
     """(interface, service, copy: first | extra); bytes of messages, see `sidecar.core.budgets`."""
     copies_refused: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
     """(interface, service, limit: load | day); copies that a budget forbade."""
+    bad_answers: Counter[tuple[NodeName, ServiceName]] = field(default_factory=Counter)
+    """Answers that could not be delivered."""
     late_dropped: Counter[ServiceName] = field(default_factory=Counter)
     executions: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
     """Cloud: (service, result: run | coalesced | cached | cancelled | refused | abandoned)."""

@@ -156,6 +156,13 @@ class ThreadedDataPlane:
             woken = self._queue_outputs()
         self._wake(woken)
 
+    def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
+        """Robot: this copy's answer is with the application, or can not be delivered, for this reason."""
+        with self._lock:
+            self._engine.judge_answer(request_id, copy, problem, self._clock())
+            woken = self._queue_outputs()
+        self._wake(woken)
+
     def answered_here(self, request_id: RequestId) -> None:
         """Robot: the application has its answer, not from the network."""
         with self._lock:

@@ -150,17 +150,18 @@ class RobotSide:
         error = None if has_answer else self._answer(request_id, event.payload, now, late=event.late)
         if error is None:
             self._fallbacks.network_answered(request_id, now)
+            self._data_plane.judge_answer(request_id, event.copy, None)
             return
         self._limited.log(
             logging.ERROR,
-            ("bad_response", event.service),
+            (f"bad_response of {event.server}", event.service),
             now,
-            "%s: response from %s dropped: %s",
+            "%s: response from %s dropped, others are asked: %s",
             event.service,
             event.server,
             error,
         )
-        self._fail(RequestFailed(request_id, event.service, "bad_response", str(error), event.elapsed_s), now)
+        self._data_plane.judge_answer(request_id, event.copy, str(error))
 
     def _answer_from_fallback(self, answer: FallbackAnswer, now: float) -> None:
         error = self._answer(answer.request_id, answer.payload, now, late=answer.late)

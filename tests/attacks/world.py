@@ -67,14 +67,18 @@ class World:
     def lab(self) -> Lab:
         return self.system.lab
 
-    def start(self, policy: dict[str, Any] | None = None, **sidecars: Any) -> None:
-        """Everything a user would start; `sidecars` go to the configuration of all of them."""
+    def start(self, policy: dict[str, Any] | None = None, *, rogue: str | None = None, **sidecars: Any) -> None:
+        """Everything a user would start; `sidecars` go to the configuration of all of them.
+
+        `rogue`: the cloud whose program somebody has changed (`bench.attacker.rogue_cloud`).
+        """
         for name, profile in (("wlan0", WLAN), ("wwan0", WWAN)):
             self.lab.link(name, host="robot").set(profile)
         self.system.start_control_plane(**({} if policy is None else {"policy": policy}))
         for cloud in CLOUDS:
             self.system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
-            self.system.start_cloud(cloud, OFFERS, **sidecars)
+            module = "bench.attacker.rogue_cloud" if cloud == rogue else "sidecar"
+            self.system.start_cloud(cloud, OFFERS, module=module, **sidecars)
         self.system.wait_for_offer(self.start_robot(**sidecars))
 
     def start_robot(self, **changes: Any) -> Part:

@@ -172,6 +172,7 @@ class Robot:
                 case ResponseArrived():
                     call = self._by_id[event.request_id]
                     call.latency_s, call.interface = now - call.sent_s, event.interface
+                    self.plane.judge_answer(event.request_id, event.copy, None)
                 case OfferService():
                     self._offered.add(event.name)
                 case RequestFailed():

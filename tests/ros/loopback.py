@@ -152,11 +152,17 @@ class Loopback:
         request.answered = True
         elapsed = time.monotonic() - request.submitted_at
         event = ResponseArrived(
-            request.id, request.service, payload, SERVER, INTERFACE, elapsed, elapsed > self.faults.deadline_s
+            request.id, request.service, 0, payload, SERVER, INTERFACE, elapsed, elapsed > self.faults.deadline_s
         )
         self.robot_app.handle(event)
         if self.faults.duplicate_responses:
             self.robot_app.handle(event)
+
+    def judged(self, request_id: RequestId, problem: str | None) -> None:
+        """There is no other server that could be asked."""
+        if problem is not None:
+            request = self.requests[request_id]
+            self.robot_app.handle(RequestFailed(request.id, request.service, "failed", problem, 0.0))
 
     def refused(self, execution: ExecutionId, reason: RejectReason, detail: str) -> None:
         self.refusals.append((reason, detail))
@@ -204,6 +210,9 @@ class RobotPlane:
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
         self._link.submitted(request_id, service, payload)
 
+    def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
+        self._link.judged(request_id, problem)
+
     def answered_here(self, request_id: RequestId) -> None:
         self._link.answered_here.append(request_id)
 
@@ -230,6 +239,9 @@ class CloudPlane:
 
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
         raise AssertionError("a server submits nothing")
+
+    def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
+        raise AssertionError("a server asks nothing")
 
     def answered_here(self, request_id: RequestId) -> None:
         raise AssertionError("a server asks nothing")

@@ -165,7 +165,7 @@ def test_bytes_that_are_no_response(mesh: Mesh) -> None:
     mesh.wait_carried("/plan")
     mesh.faults.mangle_response = lambda payload: os.urandom(7)
     assert mesh.result(mesh.call("/plan", "--count", "5", "--timeout-s", "2"))["answered"] == 0
-    assert mesh.robot.stats.unanswered == {("/plan", "bad_response"): 5}
+    assert mesh.robot.stats.unanswered == {("/plan", "failed"): 5}
     assert mesh.robot.stats.pending == 0
 
 

@@ -87,6 +87,8 @@ class Node:
         self.offers: tuple[ServiceOffer, ...] = ()
         self.server_delay: Callable[[], float | None] = lambda: 0.001
         self.answer: Callable[[bytes], bytes] = b"echo:".__add__
+        self.judge: Callable[[bytes], str | None] = lambda _answer: None
+        """Why an answer can not be delivered, or None."""
         self.server: Callable[[ApplicationEvent], None] | None = None
         """Runs this cloud's requests in place of `server_delay` and `answer`."""
         self.events: list[ApplicationEvent] = []
@@ -335,6 +337,9 @@ class Mesh:
 
     def _application(self, node: Node, event: ApplicationEvent) -> None:
         node.events.append(event)
+        if isinstance(event, ResponseArrived):
+            problem = node.judge(bytes(event.payload))
+            node.engine.judge_answer(event.request_id, event.copy, problem, node.now)
         if node.server is not None:
             node.server(event)
         elif isinstance(event, ExecuteRequest):

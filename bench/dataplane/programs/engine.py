@@ -156,6 +156,7 @@ class EngineProgram:
         match event:
             case ResponseArrived():
                 self._caller.answered(event.payload, now)
+                self._plane.judge_answer(event.request_id, event.copy, None)
             case ExecuteRequest():
                 number, sent = HEADER.unpack_from(event.payload)
                 self._one_way.append((number, now - sent))

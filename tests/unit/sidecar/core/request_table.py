@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.copies import OBSERVED_ONE_IN
-from sidecar.core.events import ApplicationEvent, RejectReason, RequestFailed, RequestId
+from sidecar.core.events import ApplicationEvent, RejectReason, RequestFailed, RequestId, ResponseArrived
 from sidecar.core.link_events import LinkCommand, Send
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
@@ -47,6 +47,9 @@ class Table:
         self.measurements = Measurements(self.stats.dropped)
         self.commands: list[LinkCommand] = []
         self.events: list[ApplicationEvent] = []
+        self.judges = True
+        """Answers are judged good as soon as they come."""
+        self._judged = 0
         self.sought: list[frozenset[NodeName]] = []
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
         offers = Offers(Rules((self.rule,)))
@@ -111,6 +114,16 @@ class Table:
     def respond(self, server: str = A, copy: int = 0, number: int = 1, now: float = 0.1, size: int = 0) -> None:
         response = ResponseMessage(request_id(number), copy, 0.01, (b"from " + server.encode()).ljust(size))
         self.table.on_response(peer(server).name, response, now)
+        if self.judges:
+            self.judge(now)
+
+    def judge(self, now: float, problem: str | None = None) -> None:
+        """Say of all answers that were not judged yet that they are delivered, or why not."""
+        arrived = [event for event in self.events if isinstance(event, ResponseArrived)]
+        while self._judged < len(arrived):
+            event = arrived[self._judged]
+            self._judged += 1
+            self.table.judge_answer(event.request_id, event.copy, problem, now)
 
     def reject(self, reason: RejectReason, server: str = A, copy: int = 0, now: float = 0.1, number: int = 1) -> None:
         self.table.on_rejection(peer(server).name, RejectionMessage(request_id(number), copy, reason, "why"), now)

@@ -26,6 +26,7 @@ from sidecar.core.events import (
     OfferService,
     RejectReason,
     RequestFailed,
+    ResponseArrived,
 )
 from sidecar.core.fragments import OVER_REMEMBERED
 from sidecar.core.frame import BASE_SYMBOL_BYTES, Fragment
@@ -96,7 +97,11 @@ class Sidecar:
         self.engine.on_link_event(FragmentsReceived(self.path, SessionId(session), [fragment]), now)
 
     def take(self) -> tuple[list[LinkCommand], list[ApplicationEvent]]:
-        return [command for _, command in self.engine.take_commands()], self.engine.take_events()
+        events = self.engine.take_events()
+        for event in events:
+            if isinstance(event, ResponseArrived):
+                self.engine.judge_answer(event.request_id, event.copy, None, 0.1)
+        return [command for _, command in self.engine.take_commands()], events
 
     def replies(self) -> list[Message]:
         """What is sent to the peer, decoded."""

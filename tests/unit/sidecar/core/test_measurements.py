@@ -21,16 +21,11 @@ from sidecar.core.copies import Carried
 from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.measurements import Measurements
-from sidecar.core.messages import ResponseMessage
 from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path, request_id
+from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 
 ON_WLAN, ON_WWAN = Carried(WLAN, A, ECHO, 0), Carried(WWAN, A, ECHO, 3)
-
-
-def response(processing_s: float, size: int = 0) -> ResponseMessage:
-    return ResponseMessage(request_id(1), 0, processing_s, bytes(size))
 
 
 @pytest.fixture
@@ -39,8 +34,8 @@ def measurements() -> Measurements:
 
 
 def test_the_networks_share_is_kept_apart_from_the_servers(measurements: Measurements) -> None:
-    measurements.answered(ON_WLAN, 0.050, response(0.010))
-    measurements.answered(ON_WLAN, 0.030, response(0.040))
+    measurements.answered(ON_WLAN, 0.050, 0.010, 0)
+    measurements.answered(ON_WLAN, 0.030, 0.040, 0)
     measurements.called_off(ON_WLAN, 0.1)
     measurements.lost(ON_WWAN, delivered=False)
     measurements.lost(ON_WWAN, delivered=True)
@@ -55,7 +50,7 @@ def test_the_networks_share_is_kept_apart_from_the_servers(measurements: Measure
 
 def test_the_size_of_the_last_answer_counts_as_well(measurements: Measurements) -> None:
     assert measurements.size_class(ECHO, 1000) == 0
-    measurements.answered(ON_WLAN, 0.1, response(0.0, size=50_000))
+    measurements.answered(ON_WLAN, 0.1, 0.0, 50_000)
     assert measurements.size_class(ECHO, 1000) == 3
     measurements.take(Routes(), [])
     assert measurements.size_class(ECHO, 1000) == 3

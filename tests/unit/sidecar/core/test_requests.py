@@ -28,7 +28,7 @@ def test_the_first_response_wins_and_in_a_race_the_second_is_counted_and_measure
     table.submit(RACE)
     table.respond(B, copy=1, number=RACE, now=0.2)
     (arrived,) = table.events
-    assert arrived == ResponseArrived(request_id(RACE), ECHO, b"from cloud-b", B, WWAN, 0.2, late=False)
+    assert arrived == ResponseArrived(request_id(RACE), ECHO, 1, b"from cloud-b", B, WWAN, 0.2, late=False)
     assert table.cancelled() == []
     table.respond(A, copy=0, number=RACE, now=0.3)
     assert len(table.events) == 1

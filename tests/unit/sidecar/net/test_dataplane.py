@@ -88,6 +88,8 @@ class Node:
                 self.plane.complete(*arguments)
             else:
                 threading.Thread(target=self.plane.complete, args=arguments).start()
+        if isinstance(event, ResponseArrived):
+            self.plane.judge_answer(event.request_id, event.copy, None)
         with self.news:
             self.events.append(event)
             self.news.notify_all()

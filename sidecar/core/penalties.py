@@ -1,0 +1,76 @@
+"""Robot side: servers whose answers could not be delivered, and for how long others are asked in their place.
+
+Such a server answers fast, if it is faulty or hostile, and wins the races that it then spoils. So it is out of favour
+for a time that doubles with each bad answer and is forgotten by halves: then it is asked only where no other offers
+the service.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from protos.model import NodeName
+
+FIRST_S = 10.0
+"""After the first bad answer it is out of favour for so long, ..."""
+LONGEST_S = 600.0
+"""... and for this at most."""
+HALF_LIFE_S = 120.0
+"""In which half of what is held against it is forgotten."""
+FORGOTTEN_BELOW = 0.1
+"""What is held against it is forgotten: seven minutes after a single bad answer."""
+MAX_SERVERS = 1024
+"""Of more, the one that is back in favour first is forgotten."""
+
+
+@dataclass(slots=True)
+class _Record:
+    level: float
+    """Bad answers, each worth half after HALF_LIFE_S."""
+    updated_at: float
+    until: float
+
+    def now(self, now: float) -> float:
+        return self.level * math.pow(2.0, (self.updated_at - now) / HALF_LIFE_S)
+
+
+class Penalties:
+    """By server, whatever the service: who spoils one is not to be trusted with another."""
+
+    __slots__ = ("_records",)
+
+    def __init__(self) -> None:
+        self._records: dict[NodeName, _Record] = {}
+
+    def bad_answer(self, server: NodeName, now: float) -> float:
+        """It gave an answer that could not be delivered; returns for how long it is out of favour."""
+        record = self._records.pop(server, None)
+        level = 1.0 + (0.0 if record is None else record.now(now))
+        out_s = min(FIRST_S * math.pow(2.0, level - 1.0), LONGEST_S)
+        self._forget(now)
+        self._records[server] = _Record(level, now, now + out_s)
+        return out_s
+
+    def _forget(self, now: float) -> None:
+        """Called when one more comes, which is rare."""
+        for server in [name for name, record in self._records.items() if record.now(now) < FORGOTTEN_BELOW]:
+            del self._records[server]
+        if len(self._records) >= MAX_SERVERS:
+            del self._records[min(self._records, key=lambda name: self._records[name].until)]
+
+    def out_until(self, server: NodeName) -> float:
+        """When it is back in favour; the past, if it is."""
+        record = self._records.get(server)
+        return -math.inf if record is None else record.until
+
+    def favoured(self, servers: Iterable[NodeName], now: float) -> tuple[NodeName, ...]:
+        """Return those that are in favour; all, where none is."""
+        every = tuple(servers)
+        if not self._records:
+            return every
+        return tuple(server for server in every if self.out_until(server) <= now) or every
