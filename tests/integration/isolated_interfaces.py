@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import random
 import socket
 import threading
@@ -99,6 +100,8 @@ class Robot:
         """`mapping`: for each service over which interface it goes to which cloud, alone; the first is urgent."""
         self.calls: dict[str, list[Call]] = {service: [] for service in mapping}
         self._by_id: dict[RequestId, Call] = {}
+        self._numbers = itertools.count()
+        """Taken by several threads."""
         self._news = threading.Condition()
         self._offered: set[str] = set()
         self._stack = contextlib.ExitStack()
@@ -184,8 +187,7 @@ class Robot:
     def submit(self, service: str, size: int) -> Call:
         """Send a request."""
         call = Call(time.monotonic())
-        number = len(self._by_id)
-        request = RequestId(number.to_bytes(16, "big"))
+        request = RequestId(next(self._numbers).to_bytes(16, "big"))
         self._by_id[request] = call
         self.calls[service].append(call)
         # The cloud answers with the beginning of the request.
