@@ -16,7 +16,6 @@ import asyncio
 import logging
 import signal
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +26,7 @@ from controlplane.certificates import load_own_files
 from controlplane.config import load_config, refuse_exposed
 from protos import interpreter
 from protos.errors import ConfigError
+from protos.log_lines import LineFormatter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -96,13 +96,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _start_logging(level: str) -> None:
-    logging.Formatter.converter = time.gmtime
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=level.upper(),
-        format="%(asctime)s.%(msecs)03dZ %(levelname)s %(name)s: %(message)s",
-        datefmt="%Y-%m-%dT%H:%M:%S",
-    )
+    output = logging.StreamHandler(sys.stderr)
+    output.setFormatter(LineFormatter())
+    logging.basicConfig(level=level.upper(), handlers=[output])
     logging.getLogger("grpc._cython.cygrpc").addFilter(_is_not_a_lost_stream)
 
 

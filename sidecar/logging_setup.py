@@ -9,9 +9,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue
-import time
 from logging.handlers import QueueHandler, QueueListener
 from typing import TYPE_CHECKING
+
+from protos.log_lines import LineFormatter
 
 if TYPE_CHECKING:
     from typing import TextIO
@@ -23,24 +24,6 @@ STOP_TIMEOUT_S = 1.0
 """What a stalled stream may cost at the end of the program; waiting lines are lost then."""
 
 _PACKAGES = ("sidecar", "protos")
-
-
-class LineFormatter(logging.Formatter):
-    """2026-01-31T12:00:00.250Z WARNING control_client: text; a traceback follows on indented lines."""
-
-    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:
-        """Return UTC in ISO 8601 with milliseconds."""
-        seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-        return f"{seconds}.{int(record.msecs):03d}Z"
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
-        component = record.name.removeprefix("sidecar.")
-        text = record.getMessage().replace("\r", "\\r").replace("\n", "\\n")
-        line = f"{self.formatTime(record)} {record.levelname} {component}: {text}"
-        if record.exc_info:
-            line += "\n    " + self.formatException(record.exc_info).replace("\n", "\n    ")
-        return line
 
 
 class _BoundedQueueHandler(QueueHandler):
@@ -99,7 +82,7 @@ class Logging:
 
     def __init__(self, level: str, stream: TextIO, *, max_waiting: int = MAX_WAITING_LINES) -> None:
         output = logging.StreamHandler(stream)
-        output.setFormatter(LineFormatter())
+        output.setFormatter(LineFormatter("sidecar"))
         waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(max_waiting)
         self._handler = _BoundedQueueHandler(waiting)
         self._listener = _PatientListener(waiting, output)

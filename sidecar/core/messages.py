@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
 from protos.model import ServiceName
+from protos.names import clean_text
 from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.priority import Priority
 from sidecar.core.request_id import REQUEST_ID_BYTES
@@ -175,7 +176,7 @@ def _decode_rejection(request_id: RequestId, copy: int, view: memoryview, positi
     except ValueError:
         raise DecodeError("unknown reason of a rejection") from None
     text, position = _decode_text(view, position + 1, MAX_TEXT_BYTES, errors="replace")
-    return RejectionMessage(request_id, copy, reason, text)
+    return RejectionMessage(request_id, copy, reason, clean_text(text))
 
 
 def _decode_cancel(request_id: RequestId, _copy: int, _view: memoryview, _position: int) -> Message:

@@ -1,0 +1,55 @@
+"""What peers say reaches a log only without what moves a cursor or begins a line."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from protos.log_lines import LineFormatter, escaped
+from sidecar.core.events import RejectReason
+from sidecar.core.messages import RejectionMessage, decode_message, encode_message
+from tests.unit.sidecar.core.builders import request_id
+
+pytestmark = pytest.mark.audit("sec-11")
+
+FORGED = "x\n2026-11-22T18:16:15.605Z INFO runtime: all is well\x1b[2J\x9b1A\u202e"
+
+
+def line_of(text: str, *, exc_info: BaseException | None = None) -> str:
+    trouble = None if exc_info is None else (type(exc_info), exc_info, None)
+    record = logging.LogRecord("sidecar.net.path_log", logging.WARNING, __file__, 1, "%s", (text,), trouble)
+    record.created, record.msecs = 1767225600.25, 250.0
+    return LineFormatter("sidecar").format(record)
+
+
+def test_a_line_is_what_it_was() -> None:
+    assert line_of("path wlan0 to cloud-a is up: ä ✓") == (
+        "2026-01-01T00:00:00.250Z WARNING net.path_log: path wlan0 to cloud-a is up: ä ✓"
+    )
+
+
+def test_nothing_that_is_said_is_more_than_text() -> None:
+    line = line_of(FORGED)
+    assert line.isprintable()
+    assert r"x\n2026-11-22T18:16:15.605Z INFO runtime: all is well\x1b[2J\x9b1A\u202e" in line
+
+
+def test_nor_in_a_traceback() -> None:
+    first, *rest = line_of("failed", exc_info=ValueError(FORGED)).split("\n")
+    assert first.endswith("failed")
+    assert rest
+    assert all(part.startswith("    ") and part.isprintable() for part in rest)
+
+
+def test_every_control_character_is_escaped() -> None:
+    for code in (*range(32), 127, *range(128, 160), 0x2028, 0x2029, 0x200E, 0x2066):
+        assert escaped(f"a{chr(code)}b").isprintable()
+        assert escaped(f"a{chr(code)}b") != "ab"
+
+
+def test_a_rejections_words_are_printable() -> None:
+    encoded = encode_message(RejectionMessage(request_id(1), 0, RejectReason.OVERLOADED, FORGED))
+    decoded = decode_message(memoryview(b"".join(encoded)))
+    assert isinstance(decoded, RejectionMessage)
+    assert decoded.text.isprintable()
