@@ -18,12 +18,14 @@ import secrets
 import socket
 import ssl
 import time
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 from controlplane.core.token_bucket import TokenBucket
 from controlplane.gate_pipe import PipeEnd
+from controlplane.half_open import HalfOpen
 from controlplane.handshakes import server_context, why_failed
 from protos.identity import REVOKED, CertificateError
 
@@ -40,10 +42,17 @@ HANDSHAKE_TIMEOUT_S = 5.0
 """Two round trips over a bad cellular link take 1 to 2 s; a sidecar gives up after 5 s."""
 
 MAX_HANDSHAKES = 512
-"""Half-open connections at once; a further one ends the oldest, so that whoever holds all of them has to hurry."""
+"""TLS handshakes at once; a further one ends the oldest, so that whoever holds all of them has to hurry."""
 
-MAX_HANDSHAKES_PER_SOURCE = 64
-"""Of these, from one address (IPv6: one /64): a fleet behind one NAT that comes back at once is served in turn."""
+MAX_HANDSHAKES_PER_SOURCE = 256
+"""Of these, from one address (IPv6: one /64), which may be a NAT with a fleet behind it. A further one ends the oldest
+of the same address."""
+
+MAX_SILENT = 1024
+"""Connections at once that have said nothing yet: no TLS stands behind them, and each costs a descriptor only."""
+
+MAX_SILENT_PER_SOURCE = 512
+"""Of these, from one address."""
 
 MAX_CONNECTIONS = 2 * 4096 + 64
 """Connections at once: one for each sidecar that may register and its replacement, and some for operators."""
@@ -93,7 +102,10 @@ class TlsGate:
         self._loop = asyncio.get_running_loop()
         self._socket: socket.socket | None = None
         self._accepting: asyncio.Task[None] | None = None
-        self._handshakes: OrderedDict[asyncio.Task[None], str] = OrderedDict()
+        self._unread: set[socket.socket] = set()
+        """Of the silent ones."""
+        self._silent = HalfOpen(MAX_SILENT, MAX_SILENT_PER_SOURCE)
+        self._handshakes = HalfOpen(MAX_HANDSHAKES, MAX_HANDSHAKES_PER_SOURCE)
         self._connections: OrderedDict[str, _Connection] = OrderedDict()
         # Never the same name twice, in this process or another of this host: a stale one must not become somebody else.
         self._prefix = f"plr-{secrets.token_hex(8)}"
@@ -136,7 +148,9 @@ class TlsGate:
 
     async def close(self) -> None:
         """End everything."""
-        tasks = [*self._handshakes, *([self._accepting] if self._accepting is not None else [])]
+        tasks = [*self._silent.tasks(), *self._handshakes.tasks()]
+        if self._accepting is not None:
+            tasks.append(self._accepting)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -157,17 +171,39 @@ class TlsGate:
                 await asyncio.sleep(ACCEPT_PAUSE_S)
                 continue
             source = _source(address[0])
-            if Counter(self._handshakes.values())[source] >= MAX_HANDSHAKES_PER_SOURCE:
-                accepted.close()
-                self._refused(address[0], TOO_MANY_HANDSHAKES, "too many of its connections are half open")
-                continue
-            if len(self._handshakes) >= MAX_HANDSHAKES:
-                oldest = next(iter(self._handshakes))
-                del self._handshakes[oldest]
-                oldest.cancel()
-            task = self._loop.create_task(self._admit(accepted, address[0]))
-            self._handshakes[task] = source
-            task.add_done_callback(lambda done: self._handshakes.pop(done, None))
+            task = self._loop.create_task(self._greet(accepted, address[0], source))
+            self._note(self._silent, task, source)
+            task.add_done_callback(self._silent.remove)
+            task.add_done_callback(self._handshakes.remove)
+            self._unread.add(accepted)
+            task.add_done_callback(partial(self._close_unread, accepted))
+
+    async def _greet(self, accepted: socket.socket, address: str, source: str) -> None:
+        """Wait for the client's first bytes: who says nothing must not keep others from their handshakes."""
+        accepted.setblocking(False)
+        try:
+            async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
+                await _readable(self._loop, accepted)
+        except TimeoutError as error:
+            self._refused(address, *why_failed(error))
+            return
+        task = asyncio.current_task()
+        assert task is not None
+        self._silent.remove(task)
+        self._note(self._handshakes, task, source)
+        self._unread.discard(accepted)
+        await self._admit(accepted, address)
+
+    def _note(self, line: HalfOpen, task: asyncio.Task[None], source: str) -> None:
+        # Counted here: one that is pushed out before it came to run could not.
+        if line.add(task, source):
+            self._on_refused(TOO_MANY_HANDSHAKES)
+
+    def _close_unread(self, accepted: socket.socket, _: asyncio.Task[None]) -> None:
+        """Its task has ended before asyncio took the socket, perhaps before it came to run."""
+        if accepted in self._unread:
+            self._unread.discard(accepted)
+            accepted.close()
 
     async def _admit(self, accepted: socket.socket, address: str) -> None:
         outside = PipeEnd()
@@ -179,9 +215,6 @@ class TlsGate:
                 ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
                 ssl_shutdown_timeout=LAST_WORDS_S,
             )
-        except asyncio.CancelledError:
-            self._on_refused(TOO_MANY_HANDSHAKES)
-            raise
         except (OSError, ssl.SSLError) as error:
             self._refused(address, *why_failed(error))
             # In a cycle with asyncio's TLS buffers: without this, strangers take 100 MB before they are collected.
@@ -271,6 +304,21 @@ class TlsGate:
         # A stranger must not fill the disk; what is revoked is worth a line in any case.
         if reason == REVOKED or self._log_lines.take(self._loop.time()):
             log.warning("refused a connection of %s: %s: %s", who, reason, text)
+
+
+async def _readable(loop: asyncio.AbstractEventLoop, sock: socket.socket) -> None:
+    """Wait until there is something to read, the connection's end included."""
+    readable = loop.create_future()
+
+    def found() -> None:
+        if not readable.done():
+            readable.set_result(None)
+
+    loop.add_reader(sock, found)
+    try:
+        await readable
+    finally:
+        loop.remove_reader(sock)
 
 
 def _source(address: str) -> str:

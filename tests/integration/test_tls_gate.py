@@ -9,6 +9,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import pytest
+
 from controlplane import tls_gate
 from controlplane.ca import Authority
 from controlplane.tls_gate import TlsGate
@@ -18,8 +20,6 @@ from protos.tls_files import load_tls_files
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
-
-    import pytest
 
 PATIENCE_S = 30.0
 
@@ -159,12 +159,23 @@ def test_beyond_all_connections_a_further_one_is_refused(tmp_path: Path, monkeyp
     asyncio.run(run())
 
 
-def test_half_open_handshakes_make_room_oldest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tls_gate, "MAX_HANDSHAKES", 3)
+CLIENT_HELLO = b"\x16\x03\x01\x02\x00\x01"
+"""Its beginning; the rest never comes."""
+
+
+@pytest.mark.audit("sec-7")
+@pytest.mark.parametrize("limit", ["MAX_HANDSHAKES", "MAX_HANDSHAKES_PER_SOURCE"])
+def test_half_open_handshakes_make_room_oldest_first(
+    limit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tls_gate, limit, 3)
 
     async def run() -> None:
         async with opened(tmp_path) as gate:
             waiting = [await asyncio.open_connection("127.0.0.1", gate.port) for _ in range(3)]
+            for _, writer in waiting:
+                writer.write(CLIENT_HELLO)
+            await until(lambda: len(gate.gate._handshakes) == 3)
             reader, writer = await gate.connect("robot-1")
             writer.write(b"x")
             assert await reader.readexactly(1) == b"x"
@@ -172,6 +183,41 @@ def test_half_open_handshakes_make_room_oldest_first(tmp_path: Path, monkeypatch
             assert gate.refused["too_many_handshakes"] == 1
             for _, other in (*waiting[1:], (reader, writer)):
                 other.close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.audit("sec-7")
+def test_who_says_nothing_keeps_nobody_from_coming_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An attacker behind the operator's own NAT holds as many silent connections as there is room for, and more."""
+    monkeypatch.setattr(tls_gate, "MAX_SILENT_PER_SOURCE", 20)
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            silent = [await asyncio.open_connection("127.0.0.1", gate.port) for _ in range(50)]
+            await until(lambda: gate.refused["too_many_handshakes"] == 30)
+            for number in range(6):
+                reader, writer = await gate.connect(f"robot-{number}")
+                writer.write(b"x")
+                assert await reader.readexactly(1) == b"x"
+                writer.close()
+            assert len(gate.gate._silent) <= 20
+            for _, other in silent:
+                other.close()
+            await until(lambda: len(gate.gate._silent) == 0)
+
+    asyncio.run(run())
+
+
+@pytest.mark.audit("sec-7")
+def test_who_never_says_anything_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tls_gate, "HANDSHAKE_TIMEOUT_S", 0.2)
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            await ended(await asyncio.open_connection("127.0.0.1", gate.port))
+            assert gate.refused == {"handshake_timeout": 1}
+            assert len(gate.gate._silent) == len(gate.gate._handshakes) == len(gate.gate._unread) == 0
 
     asyncio.run(run())
 
