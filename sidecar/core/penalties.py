@@ -20,6 +20,8 @@ FIRST_S = 10.0
 """After the first bad answer it is out of favour for so long, ..."""
 LONGEST_S = 600.0
 """... and for this at most."""
+_MOST_DOUBLINGS = math.log2(LONGEST_S / FIRST_S)
+"""Thousands of bad answers may come at once: two to the power of their number is no float."""
 HALF_LIFE_S = 120.0
 """In which half of what is held against it is forgotten."""
 FORGOTTEN_BELOW = 0.1
@@ -51,7 +53,7 @@ class Penalties:
         """It gave an answer that could not be delivered; returns for how long it is out of favour."""
         record = self._records.pop(server, None)
         level = 1.0 + (0.0 if record is None else record.now(now))
-        out_s = min(FIRST_S * math.pow(2.0, level - 1.0), LONGEST_S)
+        out_s = min(FIRST_S * math.pow(2.0, min(level - 1.0, _MOST_DOUBLINGS)), LONGEST_S)
         self._forget(now)
         self._records[server] = _Record(level, now, now + out_s)
         return out_s

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pytest
+
 from protos.model import NodeName
 from sidecar.core.penalties import FIRST_S, HALF_LIFE_S, LONGEST_S, MAX_SERVERS, Penalties
 
@@ -29,3 +31,10 @@ def test_no_more_are_remembered_than_there_is_room_for() -> None:
         penalties.bad_answer(NodeName(f"cloud-{number}"), number * 1e-3)
     assert len(penalties._records) == MAX_SERVERS
     assert penalties.out_until(NodeName(f"cloud-{3 * MAX_SERVERS - 1}")) > FIRST_S
+
+
+@pytest.mark.audit("sec-2")
+def test_thousands_of_them_at_once_are_no_error() -> None:
+    penalties = Penalties()
+    outs = [penalties.bad_answer(A, 0.0) for _ in range(8192)]
+    assert outs[-1] == LONGEST_S
