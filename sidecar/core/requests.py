@@ -208,7 +208,8 @@ class RequestTable:
         if request.done:
             self._parts.stats.duplicate_responses += 1
         elif late and request.rule.drop_late:
-            self._drop_late(request, copy, answer)
+            if not request.judged:  # else the one that came in time may be good
+                self._drop_late(request, copy, answer)
         else:
             self._offer(request, copy, answer, response.payload, late=late)
         self._settle(request, now)
@@ -308,7 +309,7 @@ class RequestTable:
         self._parts.stats.dropped[f"rejected_{rejection.reason.name.lower()}"] += 1
         if not request.done:
             self._rescue(request, now, rejected=True)
-            if not request.pending() and request not in self._no_room:
+            if not (request.judged or request.pending() or request in self._no_room):
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
                 if rejection.reason.may_pass and request.may_be_sent():
                     self._wait_out(request, reason, now)
@@ -366,7 +367,7 @@ class RequestTable:
             self._dispatching.never_left(request, copy, now)
         if not request.done:
             self._rescue(request, now)
-            if not request.pending():
+            if not (request.judged or request.pending()):
                 if request.may_be_sent():
                     self._requests.strand(request)
                 else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.events import DeadlineMissed, ResponseArrived
+from sidecar.core.events import DeadlineMissed, RejectReason, ResponseArrived
 from sidecar.core.path_id import PathState
 from sidecar.core.penalties import FIRST_S
 from tests.unit.sidecar.core.builders import ECHO, A, B, request_id
@@ -13,9 +13,9 @@ from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 pytestmark = pytest.mark.audit("sec-2")
 
 
-def judging(*, idempotent: bool = True) -> Table:
+def judging(*, idempotent: bool = True, drop_late: bool = False) -> Table:
     """A table whose answers wait for the test's judgement."""
-    table = Table(idempotent=idempotent)
+    table = Table(idempotent=idempotent, drop_late=drop_late)
     table.judges = False
     return table
 
@@ -140,3 +140,27 @@ def test_a_word_on_what_nobody_asked_changes_nothing() -> None:
         table.table.judge_answer(request_id(number), copy, "garbage", 0.1)
     assert table.events == []
     assert table.stats.bad_answers == {}
+
+
+@pytest.mark.parametrize("reason", [None, *RejectReason])
+def test_a_good_answer_counts_though_the_other_copy_failed_while_it_was_judged(reason: RejectReason | None) -> None:
+    table = judging()
+    table.submit(RACE)
+    table.respond(A, copy=0, number=RACE, now=0.1)
+    if reason is None:
+        table.table.on_peer_gone(B, 0.1)
+    else:
+        table.reject(reason, B, copy=1, number=RACE, now=0.1)
+    table.judge(0.11)
+    assert [type(event) for event in table.events] == [ResponseArrived]
+    assert table.stats.requests == {(ECHO, "ok"): 1}
+
+
+def test_an_answer_in_time_counts_though_a_late_one_came_while_it_was_judged() -> None:
+    table = judging(drop_late=True)
+    table.submit(RACE)
+    table.respond(A, copy=0, number=RACE, now=0.99)
+    table.respond(B, copy=1, number=RACE, now=1.01)
+    table.judge(1.02)
+    assert [type(event) for event in table.events] == [ResponseArrived]
+    assert table.stats.requests == {(ECHO, "ok"): 1}
