@@ -198,6 +198,7 @@ class RequestTable:
         measure = request.observed and copy.state is CopyState.PENDING and not copy.hedges
         copy.in_time = copy.state is CopyState.PENDING and now <= request.deadline_at
         copy.state = CopyState.ANSWERED
+        copy.certainly_not_run = False  # whatever its server said before
         copy.ended_at = now
         # The response proves that the request arrived, also when the peer's FINISHED got lost.
         self._parts.outbox.on_answered(copy.message)
@@ -291,7 +292,7 @@ class RequestTable:
             if request.may_be_sent() and self._dispatching.candidates(request):
                 self._requests.strand(request)
             else:
-                why = f"bad answer of {server}, which is asked for others only after {out_s:.0f} s: {problem}"
+                why = f"bad answer of {server} (others go before it for {out_s:.0f} s): {problem}"
                 self._fail(request, "failed", why, now)
 
     def on_rejection(self, server: NodeName, rejection: RejectionMessage, now: float) -> None:

@@ -13,7 +13,7 @@ EVERY_S = 0.1
 DEADLINE_S = 0.5
 
 
-def called(bad_share: float, *, seed: int, loss: float = 0.0) -> tuple[Node, Node, Node]:
+def called(bad_share: float, *, seed: int, loss: float = 0.0) -> Node:
     """A robot on two interfaces that called for half a minute: cloud-a answers sooner, and so often wrongly."""
     mesh = Mesh(seed)
     robot = mesh.robot("wlan0", "wwan0", rules=(rule(deadline_s=DEADLINE_S, lifetime_s=5.0),))
@@ -31,20 +31,19 @@ def called(bad_share: float, *, seed: int, loss: float = 0.0) -> tuple[Node, Nod
         robot.submit(mesh.rng.randbytes(16))
         mesh.run(EVERY_S)
     mesh.run(6.0)
-    return robot, bad, good
+    return robot
 
 
 @pytest.mark.audit("sec-2")
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 @pytest.mark.parametrize("bad_share", [1.0, 0.5, 0.1])
 def test_no_request_is_lost_or_late_by_a_cloud_that_answers_wrongly(bad_share: float, loss: float) -> None:
-    for seed in range(1):
-        robot, bad, _ = called(bad_share, seed=seed, loss=loss)
-        stats = robot.engine.stats
-        good = {bytes(event.payload) for event in robot.responses()} - {GARBAGE}
-        assert len(good) == REQUESTS
-        assert not any(isinstance(event, (RequestFailed, DeadlineMissed)) for event in robot.events)
-        assert sum(stats.bad_answers.values()) == sum(event.payload == GARBAGE for event in robot.responses())
-        if bad_share == 1.0:
-            # Out of favour for 10, 20, 40 s: asked again only a few times.
-            assert stats.bad_answers[bad.name, "/echo"] <= 6
+    robot = called(bad_share, seed=1, loss=loss)
+    stats = robot.engine.stats
+    good = {bytes(event.payload) for event in robot.responses()} - {GARBAGE}
+    assert len(good) == REQUESTS
+    assert not any(isinstance(event, (RequestFailed, DeadlineMissed)) for event in robot.events)
+    assert sum(stats.bad_answers.values()) == sum(event.payload == GARBAGE for event in robot.responses())
+    if bad_share == 1.0:
+        # Out of favour for 10, 20, 40 s: asked again only a few times.
+        assert sum(stats.bad_answers.values()) <= 6

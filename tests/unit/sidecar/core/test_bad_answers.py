@@ -164,3 +164,17 @@ def test_an_answer_in_time_counts_though_a_late_one_came_while_it_was_judged() -
     table.judge(1.02)
     assert [type(event) for event in table.events] == [ResponseArrived]
     assert table.stats.requests == {(ECHO, "ok"): 1}
+
+
+def test_a_server_that_refuses_and_answers_does_not_make_a_request_run_twice() -> None:
+    table = judging(idempotent=False)
+    table.submit(1)
+    table.sent()
+    table.reject(RejectReason.NOT_OFFERED, A)
+    assert [path.peer for path in table.sent()] == [B]
+    table.respond(A, copy=0, now=0.2)
+    table.judge(0.2, "garbage")
+    table.reject(RejectReason.NOT_OFFERED, B, copy=1, now=0.3)
+    assert table.sent() == []
+    assert table.only_failure().outcome == "rejected"
+    table.assert_empty()
