@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from protos.errors import DecodeError
 from protos.model import ServiceName
+from protos.names import clean_text
 from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
@@ -50,6 +51,8 @@ def test_messages_come_back(message: Message) -> None:
     assert type(decoded) is type(message)
     for name in message.__slots__:
         before, after = getattr(message, name), getattr(decoded, name)
+        if isinstance(message, RejectionMessage) and name == "text":
+            before = clean_text(before)  # a reason is read fit for a log: the one field that may change
         # Times lose less than their unit.
         assert after == (pytest.approx(before, abs=1e-3) if isinstance(before, float) else before)
 
