@@ -34,11 +34,12 @@ from sidecar.core.link_events import (
     SetPeers,
     SetReady,
 )
+from sidecar.core.link_memory import LinkMemory
 from sidecar.core.link_mtu import LinkMtu
 from sidecar.core.link_reader import LinkReader
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keeper import PathKeeper
-from sidecar.core.path_keys import DEFAULT_LIMITS, KeyLimits, LinkMemory
+from sidecar.core.path_keys import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.path_table import PathTable
 from sidecar.core.stats import PathStats
 from sidecar.core.timers import NEVER, Timers

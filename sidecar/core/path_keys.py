@@ -6,12 +6,11 @@ datagram that opens with the next: nothing pauses, nothing is negotiated.
 
 The nonce is the last 12 of the 20 clear bytes: half of the sender's session, and the packet number, which never
 repeats within a session. A path's keys belong to one session, path and direction (`key_schedule.py`), so no nonce
-repeats under a key. What a path numbered and opened outlives it (`PathKeys` in `LinkMemory`).
+repeats under a key. What a path numbered and opened outlives it (`link_memory.py`).
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -25,17 +24,12 @@ if TYPE_CHECKING:
     from cryptography.utils import Buffer
 
     from protos.credential import Aead
-    from protos.model import InterfaceId, SessionId
+    from protos.model import InterfaceId
     from sidecar.core.aead import Cipher
     from sidecar.core.key_schedule import PairKeys
 
 _PHASE = PHASE_FLAG << 16
 """The phase bit in the first four clear bytes as one number."""
-MAX_REMEMBERED_PATHS = 4096
-"""Paths that are no more, of sessions that may come back: beyond this the longest gone are forgotten, and a session
-that comes back nevertheless is not understood until its peer starts anew."""
-
-
 MAX_SEALED_DATAGRAMS = 1 << 22
 """Datagrams sealed with one key, unless the peer confirms none of them; AES-GCM bears 2^23 of the longest by RFC 9001
 section 6.6, and a path over which nothing is confirmed is down long before."""
@@ -134,47 +128,28 @@ class OpeningKeys:
 class PathKeys:
     """What is known of one path for as long as its peer's session, whatever becomes of the path."""
 
-    __slots__ = ("opening", "received", "sealing")
+    __slots__ = ("incarnation", "opening", "received", "sealing")
 
-    def __init__(self, sealing: SealingKeys, opening: OpeningKeys, received: ReceivedPackets) -> None:
+    def __init__(self, sealing: SealingKeys, opening: OpeningKeys, received: ReceivedPackets, incarnation: int) -> None:
         self.sealing = sealing
         self.opening = opening
         self.received = received
         """The packet numbers that came: none is accepted twice."""
+        self.incarnation = incarnation
+        """Of the peer's session: a later session's is larger."""
 
     def copy(self) -> PathKeys:
         """Return the same, apart from these from now on."""
-        return PathKeys(copy(self.sealing), copy(self.opening), deepcopy(self.received))
+        return PathKeys(copy(self.sealing), copy(self.opening), deepcopy(self.received), self.incarnation)
 
 
-def make_path_keys(pair: PairKeys, ours: InterfaceId, theirs: InterfaceId, limits: KeyLimits, now: float) -> PathKeys:
-    """Return the keys of a path that neither end has used."""
+def make_path_keys(
+    pair: PairKeys, ours: InterfaceId, theirs: InterfaceId, limits: KeyLimits, now: float, incarnation: int = 0
+) -> PathKeys:
+    """Return the keys of a path that neither end has used; `incarnation` is that of the peer's session."""
     return PathKeys(
         SealingKeys(pair.aead, pair.sending(ours, theirs), clear_head(ours, theirs), limits, now),
         OpeningKeys(pair.aead, pair.receiving(ours, theirs), clear_head(theirs, ours)),
         ReceivedPackets(),
+        incarnation,
     )
-
-
-class LinkMemory:
-    """What an interface's next link, in the same run of the sidecar, must know of the one before."""
-
-    def __init__(self, next_number: int = 0) -> None:
-        self.next_number = next_number
-        """No path used this packet number or a later one."""
-        self._paths: OrderedDict[tuple[SessionId, InterfaceId], PathKeys] = OrderedDict()
-
-    def keep_all(self, other: LinkMemory) -> None:
-        """Take over what another one keeps."""
-        for (session, remote), keys in list(other._paths.items()):
-            self.keep(session, remote, keys.copy())
-
-    def keep(self, session: SessionId, remote: InterfaceId, keys: PathKeys) -> None:
-        """The path with these keys, to this interface of a session, is no more."""
-        self._paths[session, remote] = keys
-        if len(self._paths) > MAX_REMEMBERED_PATHS:
-            self._paths.popitem(last=False)
-
-    def take(self, session: SessionId, remote: InterfaceId) -> PathKeys | None:
-        """Return what was kept of a path that is there again."""
-        return self._paths.pop((session, remote), None)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 from protos.model import Role
 from sidecar.core.introduction import hello_id
+from sidecar.core.link_memory import LinkMemory
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.path_keys import LinkMemory, PathKeys, make_path_keys
+from sidecar.core.path_keys import make_path_keys
 from sidecar.core.paths import Path
 from sidecar.core.stats import LinkStats
 
@@ -66,7 +67,7 @@ class PathTable:
         memory = LinkMemory(self.next_number + (HANGING_LINK_NUMBERS if hangs else 0))
         memory.keep_all(self._memory)
         for path in list(self.paths.values()):
-            memory.keep(path.session, path.remote_id, path.keys.copy())
+            memory.keep(path.peer, path.session, path.remote_id, path.keys.copy())
         return memory
 
     def introduced(self, peer: LinkPeer, remote: InterfaceId, now: float) -> Path | None:
@@ -86,7 +87,8 @@ class PathTable:
                 return None
             self._drop(unproven)
         path = self._new_path(peer, remote, (), self.next_number, now)
-        self._enter(path)
+        if path is not None:
+            self._enter(path)
         return path
 
     def to(self, peer: NodeName) -> Sequence[Path]:
@@ -99,16 +101,18 @@ class PathTable:
 
     def _new_path(
         self, peer: LinkPeer, remote: InterfaceId, addresses: tuple[Address, ...], first_number: int, now: float
-    ) -> Path:
+    ) -> Path | None:
+        """None for a path of a session that this link has forgotten: what came over it once would count as new."""
+        keys = self._memory.take(peer.name, peer.session, remote)
+        if keys is None:
+            if self._memory.forgot(peer.name, peer.incarnation):
+                self.stats.dropped["forgotten_session"] += 1
+                return None
+            ours = self.identity.interface_id
+            keys = make_path_keys(peer.keys, ours, remote, self._limits, now, peer.incarnation)
         path_id = PathId(self.identity.interface, peer.name, remote)
-        keys, leads = self._keys(peer, remote, now), self.identity.role is Role.ROBOT
+        leads = self.identity.role is Role.ROBOT
         return Path(path_id, peer.session, keys, addresses, first_number, now, leads=leads)
-
-    def _keys(self, peer: LinkPeer, remote: InterfaceId, now: float) -> PathKeys:
-        known = self._memory.take(peer.session, remote)
-        if known is not None:
-            return known
-        return make_path_keys(peer.keys, self.identity.interface_id, remote, self._limits, now)
 
     def _drop(self, path: Path) -> None:
         del self.paths[path.peer, path.remote_id]
@@ -117,7 +121,9 @@ class PathTable:
         self._forget(path)
 
     def _forget(self, path: Path) -> None:
-        self._memory.keep(path.session, path.remote_id, path.keys)
+        # It may come back with the same keys: no number that it sealed with may be used again.
+        self._memory.next_number = max(self._memory.next_number, path.recovery.next_number)
+        self._memory.keep(path.peer, path.session, path.remote_id, path.keys)
 
     def owe(self, path: Path, encoded: bytes, by: float = 0.0) -> None:
         """Queue an encoded control frame for the path's next datagram, which leaves at `by` (s) at the latest."""
@@ -157,6 +163,8 @@ class PathTable:
                     if path is not None:
                         before[peer.name, remote] = path
                     path = self._new_path(peer, remote, addresses, first_number, now)
+                    if path is None:
+                        continue
                     self.dirty[path.id] = path
                 path.probing.crowd = crowd
                 self._enter(path)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceName
     from sidecar.config import SidecarConfig
-    from sidecar.core.path_keys import LinkMemory
+    from sidecar.core.link_memory import LinkMemory
     from sidecar.core.session import OwnSession
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from protos.model import Address, InterfaceName
     from sidecar.core.datagrams import LinkIdentity
     from sidecar.core.link_events import Rebind
-    from sidecar.core.path_keys import KeyLimits, LinkMemory
+    from sidecar.core.link_memory import LinkMemory
+    from sidecar.core.path_keys import KeyLimits
     from sidecar.net.interface_thread import LinkOwner
     from sidecar.net.interfaces import Interface
 

@@ -18,6 +18,7 @@ pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(300)]
 
 ROGUE = "cloud_a"
 CALLS = ("--rate", "20", "--duration", "8")
+MAX_RUNS = 5
 
 
 @pytest.fixture(scope="module")
@@ -33,15 +34,16 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
 @pytest.mark.audit("sec-2")
 def test_bad_answers_lose_no_request(world: World) -> None:
-    file = world.system.folder / f"{ROGUE}.sidecar{SHARE}"
-    call = Call(world.system, *CALLS)
-    call.wait_until_sending()
-    file.write_text("1")
-    run = call.result()
-    summary = run["summary"]
-    assert summary["answered_once"] == summary["sent"] > 0, summary
-    assert summary["invalid"] == summary["answered_twice"] == 0
-    counted = world.counter("robot", "plr_bad_answers_total", peer="cloud-a")
+    (world.system.folder / f"{ROGUE}.sidecar{SHARE}").write_text("1")
+    counted = 0.0
+    # On a busy machine the honest one may be the faster for all of a run.
+    for _ in range(MAX_RUNS):
+        summary = Call(world.system, *CALLS).result()["summary"]
+        assert summary["answered_once"] == summary["sent"] > 0, summary
+        assert summary["invalid"] == summary["answered_twice"] == 0
+        counted = world.counter("robot", "plr_bad_answers_total", peer="cloud-a")
+        if counted:
+            break
     # From the first one on others are asked for 10 s and more; those on their way then may still come.
     assert 0 < counted < 20 * 8 / 4
     assert "response from cloud-a dropped, others are asked" in world.system.parts["robot.sidecar"].log.read_text()

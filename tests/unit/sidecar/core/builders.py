@@ -42,10 +42,11 @@ from sidecar.core.link_events import (
     SetPeers,
     SetReady,
 )
+from sidecar.core.link_memory import LinkMemory
 from sidecar.core.messages import Encoded, RequestMessage
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.path_id import PathId
-from sidecar.core.path_keys import DEFAULT_LIMITS, LinkMemory, PathKeys, make_path_keys
+from sidecar.core.path_keys import DEFAULT_LIMITS, PathKeys, make_path_keys
 from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4
 from sidecar.core.priority import Priority
 from sidecar.core.rules import ServiceRule

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
 from protos.model import InterfaceId, NodeName
 from sidecar.core import frame
 from sidecar.core.frame import Probe, ProbeReply
@@ -158,3 +160,25 @@ def test_an_introduced_path_that_is_down_is_forgotten_with_the_next_view_but_its
     bench.receive_datagram(sealed)
     assert bench.link.stats.dropped == {"duplicate": 1}
     assert numbers(bench.sent())[0] > first[-1], "packet numbers go on"
+
+
+@pytest.mark.audit("sec-1")
+def test_a_path_that_made_room_and_comes_back_uses_no_packet_number_again() -> None:
+    """Its keys are those of the beginning: a number sealed with twice would open both datagrams."""
+    bench = up()
+    first = InterfaceId(10)
+    for interface in range(10, 9 + MAX_PATHS_OF_A_PEER):
+        introduce(bench, 0, interface=InterfaceId(interface))
+    used: list[bytes] = []
+    for number in range(1, 20):
+        introduce(bench, number, interface=first)
+        used += [
+            datagram[:20] for datagram in bench.sent() if frame.decode_header(datagram).receiver_interface == first
+        ]
+    introduce(bench, 0, interface=InterfaceId(90))
+    assert (A, first) not in bench.link._paths, "it made room"
+    introduce(bench, 20, interface=first)
+    again = [datagram[:20] for datagram in bench.sent() if frame.decode_header(datagram).receiver_interface == first]
+    assert len(used) > 10
+    assert again
+    assert not set(used) & set(again)

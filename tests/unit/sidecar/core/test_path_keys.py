@@ -6,20 +6,9 @@ import pytest
 from cryptography.exceptions import InvalidTag
 
 from protos.credential import Aead
-from protos.model import InterfaceId, Role, SessionId
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import CLEAR, HEADER_BYTES, NONCE_OFFSET, PHASE_FLAG
-from sidecar.core.path_keys import (
-    MAX_REMEMBERED_PATHS,
-    KeyLimits,
-    LinkMemory,
-    OpeningKeys,
-    PathKeys,
-    SealingKeys,
-    make_path_keys,
-)
-from tests.sessions import session_of
-from tests.unit.sidecar.core.builders import peer
+from sidecar.core.path_keys import KeyLimits, OpeningKeys, SealingKeys
 
 LIMITS = KeyLimits(datagrams=10, seconds=5.0)
 SECRET, HEAD = bytes(32), 0xD3010000
@@ -126,22 +115,3 @@ def test_nothing_is_lost_to_changes_of_keys_whatever_the_order(seed: int) -> Non
             if rng.random() < 0.5:
                 sealing.delivered(sent_at)
     assert sealing.phase > 20
-
-
-def path_keys(session: int = 1) -> PathKeys:
-    pair = session_of("robot-1", Role.ROBOT, 9).admit(peer(session=session))
-    return make_path_keys(pair, InterfaceId(0), InterfaceId(0), LIMITS, 0.0)
-
-
-def test_a_link_remembers_paths_up_to_its_cap() -> None:
-    memory, keys = LinkMemory(5), path_keys()
-    for session in range(1, MAX_REMEMBERED_PATHS + 2):
-        memory.keep(SessionId(session), InterfaceId(0), keys)
-    assert memory.take(SessionId(1), InterfaceId(0)) is None
-    assert memory.take(SessionId(2), InterfaceId(0)) is keys
-    assert memory.take(SessionId(2), InterfaceId(0)) is None
-    heir = LinkMemory()
-    heir.keep_all(memory)
-    inherited = heir.take(SessionId(3), InterfaceId(0))
-    assert inherited is not None
-    assert inherited.received is not keys.received, "the link before may not have ended"
