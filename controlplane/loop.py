@@ -22,9 +22,10 @@ from controlplane.core.plan import Plan
 from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
-from controlplane.core.token_bucket import TokenBucket
 from controlplane.mailbox import Mailbox
-from protos.identity import REVOKED, CertificateError
+from protos.identity import EXPIRED, REVOKED, CertificateError
+from protos.model import RemovalReason
+from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -208,7 +209,9 @@ class ControlLoop:
         del self._callers[name]
         log.warning("%s: %s", name, error)
         if error.reason == REVOKED:
-            self._core.revoke(name, self._loop.time())
+            self._core.part_with(name, RemovalReason.REVOKED, self._loop.time())
+        elif error.reason == EXPIRED:
+            self._core.part_with(name, RemovalReason.EXPIRED, self._loop.time())
         else:
             self._core.end_stream(name, CloseReason.CERTIFICATE_ENDED, self._loop.time())
 

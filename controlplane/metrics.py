@@ -160,7 +160,7 @@ def _members(core: ControlCore) -> Iterable[Metric]:
         "plr_departures_total",
         "Sidecars that left the registry, by reason.",
         ["reason"],
-        {("lease_expired",): counters.expired, ("left",): counters.left, ("revoked",): counters.revoked},
+        {(reason.value,): count for reason, count in counters.departed.items()},
     )
 
 

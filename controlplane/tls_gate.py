@@ -23,11 +23,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
-from controlplane.core.token_bucket import TokenBucket
 from controlplane.gate_pipe import PipeEnd
 from controlplane.half_open import HalfOpen
 from controlplane.handshakes import server_context, why_failed
 from protos.identity import REVOKED, CertificateError
+from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable

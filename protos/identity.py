@@ -78,7 +78,7 @@ class CertificateError(DecodeError):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Whom a certificate names, and for how long (seconds since 1970, both ends included)."""
+    """Whom a certificate names, and for how long (seconds since 1970, both ends included; never longer than its CA)."""
 
     name: NodeName
     role: IdentityRole
@@ -130,8 +130,8 @@ class Trust:
         identity, issuer = self._identify(certificate_der)
         if identity.serial in issuer.revoked:
             raise CertificateError(REVOKED, f"the certificate of {identity.name} is revoked")
-        _check_time(identity.not_before, identity.not_after, now_wall, f"the certificate of {identity.name}")
         _check_time(*_validity(issuer.certificate), now_wall, "the CA's certificate")
+        _check_time(identity.not_before, identity.not_after, now_wall, f"the certificate of {identity.name}")
         return identity
 
     def _identify(self, certificate_der: bytes) -> tuple[Identity, _Authority]:
@@ -141,13 +141,15 @@ class Trust:
             certificate = x509.load_der_x509_certificate(certificate_der)
             _check_leaf(certificate)
             name, role = _name_and_role(certificate)
-            identity = Identity(name, role, certificate.serial_number, *_validity(certificate))
+            begin, end = _validity(certificate)
         except CertificateError:
             raise
         except Exception as error:
             # What is wrong inside DER shows as a dozen kinds of errors, some only when a field is first looked at.
             raise CertificateError(MALFORMED, f"the certificate is malformed: {type(error).__name__}") from error
-        return identity, self._issuer(certificate)
+        issuer = self._issuer(certificate)
+        end = min(end, _validity(issuer.certificate)[1])
+        return Identity(name, role, certificate.serial_number, begin, end), issuer
 
     def _issuer(self, certificate: x509.Certificate) -> _Authority:
         for authority in self._authorities:

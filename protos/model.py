@@ -90,6 +90,8 @@ class RemovalReason(enum.Enum):
     REVOKED = "revoked"
     FORBIDDEN = "forbidden"
     """It is there, but the access policy leaves the two nothing to do with each other."""
+    EXPIRED = "expired"
+    """Its certificate has ended."""
 
 
 @dataclass(frozen=True, slots=True)

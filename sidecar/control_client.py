@@ -51,6 +51,9 @@ GOODBYE_S = 0.5
 WATCH_INTERVAL_S = 1.0
 """How often to look for new certificate files: they are renewed weeks before they end."""
 
+END_EXPIRED_S = 1.0
+"""How often to look for peers whose certificates have ended."""
+
 JUDGE_AGAIN_S = 10.0
 """Between two judgements on refused peers: a robot without a clock hears the time soon after its start, and 4096 peers
 are a second of public-key work."""
@@ -162,7 +165,7 @@ class ControlClient:
         self._loop = asyncio.get_running_loop()
         self._main_task = asyncio.current_task()
         self._running.set()
-        judging = asyncio.create_task(self._judge_again())
+        judging = asyncio.create_task(self._judge_credentials())
         self._dialer.start(self._network_changed)
         with contextlib.suppress(asyncio.CancelledError):
             while not self._stopping:
@@ -176,14 +179,18 @@ class ControlClient:
         self._session.network_changed(time.monotonic())
         self._wake.set()
 
-    async def _judge_again(self) -> None:
+    async def _judge_credentials(self) -> None:
         """Also without any stream: while our clock is wrong, the control plane's certificate is no good either."""
+        again_at = time.monotonic() + JUDGE_AGAIN_S
         while True:
-            await asyncio.sleep(JUDGE_AGAIN_S)
+            await asyncio.sleep(min(END_EXPIRED_S, JUDGE_AGAIN_S))
             try:
-                self._hooks.judge_again()
+                self._hooks.end_expired()
+                if time.monotonic() >= again_at:
+                    again_at = time.monotonic() + JUDGE_AGAIN_S
+                    self._hooks.judge_again()
             except Exception:
-                log.exception("judge_again failed")
+                log.exception("judging credentials failed")
 
     def _begin_stop(self) -> None:
         self._stopping = True

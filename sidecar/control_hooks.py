@@ -27,6 +27,9 @@ class ControlHooks(Protocol):
     def connection_changed(self, connected: bool, reason: str) -> None:
         """The control plane came within reach, or went out of it."""
 
+    def end_expired(self) -> None:
+        """Part with peers whose certificates have ended by now."""
+
     def judge_again(self) -> None:
         """Time has passed, or our clock was set: refused peers may be good now."""
 

@@ -248,6 +248,10 @@ class Sidecar:
         """Return what was measured since the last call."""
         return self._data_plane.take_report()
 
+    def end_expired(self) -> None:
+        """Part with peers whose certificates have ended by now."""
+        self._data_plane.end_expired()
+
     def judge_again(self) -> None:
         """Time has passed, or our clock was set: refused peers may be good now."""
         self._data_plane.judge_again()

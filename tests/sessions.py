@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -32,7 +33,7 @@ def credential_of(
 
 def session_of(name: str, role: Role, session: int, incarnation: int = 1, aead: Aead = Aead.AES_256_GCM) -> OwnSession:
     return OwnSession(
-        credential_of(name, role, session, incarnation, aead), private_key(name, session), lambda credential: None
+        credential_of(name, role, session, incarnation, aead), private_key(name, session), lambda credential: math.inf
     )
 
 

@@ -68,6 +68,12 @@ PUBLISH_DELAY_S = 0.02
 messages, and these should make one version."""
 
 
+_CLOSED_FOR = {
+    RemovalReason.REVOKED: CloseReason.REVOKED,
+    RemovalReason.EXPIRED: CloseReason.CERTIFICATE_ENDED,
+}
+
+
 class ControlCore:
     """Registry, estimator, plan and snapshots, put together."""
 
@@ -195,13 +201,13 @@ class ControlCore:
         self.registry.counters.refused[refusal] += 1
         return refusal
 
-    def revoke(self, name: NodeName, now: float) -> None:
+    def part_with(self, name: NodeName, reason: RemovalReason, now: float) -> None:
         """This sidecar must not be talked to any more: it goes at once, and its peers are told so at once."""
-        sidecar = self.registry.revoke(name)
+        sidecar = self.registry.remove(name, reason)
         if sidecar is None:
             return
-        self._close(sidecar.stream, CloseReason.REVOKED, now)
-        self._forget(name, RemovalReason.REVOKED)
+        self._close(sidecar.stream, _CLOSED_FOR[reason], now)
+        self._forget(name, reason)
         self._drawing.members_changed()
         self._debounce.note(Change.MEMBERS, now)
         self._publish(now)

@@ -117,14 +117,16 @@ class Sidecar:
         )
 
 
+DEPARTURES = (RemovalReason.LEASE_EXPIRED, RemovalReason.LEFT, RemovalReason.REVOKED, RemovalReason.EXPIRED)
+"""Why one leaves the registry, and so every view."""
+
+
 @dataclass(slots=True)
 class RegistryCounters:
     """What happened, for the metrics."""
 
     refused: dict[Refusal, int] = field(default_factory=lambda: dict.fromkeys(Refusal, 0))
-    expired: int = 0
-    left: int = 0
-    revoked: int = 0
+    departed: dict[RemovalReason, int] = field(default_factory=lambda: dict.fromkeys(DEPARTURES, 0))
     removals_forgotten: int = 0
 
 
@@ -184,12 +186,11 @@ class Registry:
         self._renew(name, now)
         return Admission(replaced=known.stream, new_run=not same_run)
 
-    def revoke(self, name: NodeName) -> Sidecar | None:
+    def remove(self, name: NodeName, reason: RemovalReason) -> Sidecar | None:
         """Remove it, whatever its lease; returns it as it was, or None if it was not there."""
         known = self._sidecars.get(name)
         if known is not None:
-            self.counters.revoked += 1
-            self._remove(name, RemovalReason.REVOKED)
+            self._remove(name, reason)
         return known
 
     def _refuse(self, refusal: Refusal) -> Refusal:
@@ -243,7 +244,6 @@ class Registry:
             return None
         known = self._sidecars[name]
         if known.draining:
-            self.counters.left += 1
             self._remove(name, RemovalReason.LEFT)
             return RemovalReason.LEFT
         self._sidecars[name] = replace(known, stream=None)
@@ -270,13 +270,13 @@ class Registry:
             if known.lease_end > now:
                 self._await_end(name)
                 continue
-            self.counters.expired += 1
             gone.append(known)
             self._remove(name, RemovalReason.LEASE_EXPIRED)
         return gone
 
     def _remove(self, name: NodeName, reason: RemovalReason) -> None:
         del self._sessions[self._sidecars.pop(name).registration.session]
+        self.counters.departed[reason] += 1
         self._removals[name] = reason
         self._removals.move_to_end(name)
         if len(self._removals) > MAX_REMEMBERED_REMOVALS:

@@ -70,6 +70,7 @@ _REASONS = {
     control_pb2.REMOVAL_REASON_LEFT: RemovalReason.LEFT,
     control_pb2.REMOVAL_REASON_REVOKED: RemovalReason.REVOKED,
     control_pb2.REMOVAL_REASON_FORBIDDEN: RemovalReason.FORBIDDEN,
+    control_pb2.REMOVAL_REASON_EXPIRED: RemovalReason.EXPIRED,
 }
 _REASON_NUMBERS = {reason: number for number, reason in _REASONS.items()}
 

@@ -261,19 +261,25 @@ class DatagramBuilder:
     def _add_probe(self, path: Path, burst: Burst, now: float) -> None:
         probe_id = path.next_probe(now, self._rng)
         probe = frame.encode_probe(frame.Probe(probe_id))
-        me = self.identity
         destinations = path.destinations()
-        if destinations == (path.remote,) and path.state is not PathState.DOWN:
+        remote = path.remote
+        if remote is not None and destinations == (remote,) and path.state is not PathState.DOWN:
             self._add_control(path, [*path.take_control(now), probe], burst, now)
+            if path.renewed_at is not None:
+                # Its probe is another one: the answer tells which of the two arrived.
+                self._add_introduction(path, remote, path.probing.ask(now, sealed=False), burst)
             return
         for address in destinations:
-            number = path.recovery.take_numbers()
             if path.state is PathState.DOWN:
-                header = Header(me.interface_id, path.remote_id, me.session, number)
-                datagram: bytes = encode_introduction(header, me.token, path.peer, probe_id, me.credential)
+                self._add_introduction(path, address, probe_id, burst)
             else:
-                datagram = self._sealed(path, number, now, probe)
-            self._add_alone(path, address, datagram, burst)
+                self._add_alone(path, address, self._sealed(path, path.recovery.take_numbers(), now, probe), burst)
+
+    def _add_introduction(self, path: Path, address: Address, probe_id: int, burst: Burst) -> None:
+        me = self.identity
+        header = Header(me.interface_id, path.remote_id, me.session, path.recovery.take_numbers())
+        datagram = encode_introduction(header, me.token, path.peer, probe_id, me.credential)
+        self._add_alone(path, address, datagram, burst)
 
     def _answer_introductions(self, path: Path, burst: Burst, now: float) -> None:
         """Answer to where each came from, and ask back: the reply to that proves who it was, and moves the path."""

@@ -38,6 +38,7 @@ from sidecar.core.link_events import (
     PathMeasured,
     PathMtuChanged,
     PeerClosed,
+    PeerRenewed,
     PeerRestarted,
     Seek,
     SetPeers,
@@ -348,6 +349,9 @@ class Engine:
                 if self.peers.restarted(event, now):
                     self._forget_session(event.peer, now)
                     self._follow_gone((event.peer,), now)
+                    self._commands.append((None, SetPeers(self.peers.for_links())))
+            case PeerRenewed():
+                if self.peers.renewed(event, now):
                     self._commands.append((None, SetPeers(self.peers.for_links())))
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:

@@ -131,7 +131,7 @@ class Link:
             case SetPeers(peers):
                 self._set_peers(peers, now)
             case SetCredential(credential):
-                self._builder.identity = replace(self.identity, credential=credential)
+                self._renew(credential, now)
             case SetReady(ready):
                 self._ready = ready
                 self._probe_what_is_down(now)
@@ -296,6 +296,14 @@ class Link:
         return self._table.remember(hangs=hangs)
 
     # -- peers ----------------------------------------------------------------------------------------------------
+
+    def _renew(self, credential: bytes, now: float) -> None:
+        """Introduce ourselves with this credential; to those as well to whom we talk: theirs may end before."""
+        if credential == self._builder.identity.credential:
+            return
+        self._builder.identity = replace(self.identity, credential=credential)
+        for path in self._paths.values():
+            path.renewed_at = now
 
     def _set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> None:
         for path in self._table.set_peers(peers, now):

@@ -22,6 +22,7 @@ class LinkPeer:
     session: SessionId
     token: bytes = field(repr=False)
     incarnation: int
+    credential: bytes = field(repr=False)
     keys: PairKeys
     addresses: tuple[tuple[InterfaceId, tuple[Address, ...]], ...]
     """For each of the peer's interfaces, where it may be reached."""
@@ -258,6 +259,17 @@ class PeerRestarted:
 
     peer: NodeName
     credential: SessionCredential
+    at_home: bool
+    """It came from where the peer is known to be."""
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRenewed:
+    """As `PeerRestarted`, for the session in use with another certificate."""
+
+    peer: NodeName
+    credential: SessionCredential
+    at_home: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,5 +291,6 @@ LinkEvent = (
     | PathMtuChanged
     | PathMeasured
     | PeerRestarted
+    | PeerRenewed
     | PeerClosed
 )

@@ -12,7 +12,7 @@ from sidecar.core import frame
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAGRAM_BYTES, NONCE_OFFSET
 from sidecar.core.introduction import UnauthenticError, open_introduction, read_hello_id
-from sidecar.core.link_events import PeerRestarted
+from sidecar.core.link_events import PeerRenewed, PeerRestarted
 from sidecar.core.path_id import PathState
 from sidecar.core.path_table import MAX_INTRODUCTIONS
 
@@ -127,8 +127,10 @@ class LinkOpener:
         if header.session != peer.session:
             if credential.incarnation <= peer.incarnation:
                 return "old_introduction"
-            table.events.append(PeerRestarted(peer.name, credential))
+            table.events.append(PeerRestarted(peer.name, credential, table.is_home(peer.name, source)))
             return None
+        if credential.encode() != peer.credential:
+            table.events.append(PeerRenewed(peer.name, credential, table.is_home(peer.name, source)))
         path = table.introduced(peer, header.sender_interface, now)
         if path is None:
             return None  # counted

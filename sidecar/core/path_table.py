@@ -95,6 +95,10 @@ class PathTable:
         """The paths to one peer."""
         return self._by_peer.get(peer, ())
 
+    def is_home(self, peer: NodeName, source: Address) -> bool:
+        """Whether the peer is known to be at this address."""
+        return any(source == path.remote or source in path.candidates for path in self.to(peer))
+
     def _enter(self, path: Path) -> None:
         self.paths[path.peer, path.remote_id] = path
         self._by_peer.setdefault(path.peer, []).append(path)

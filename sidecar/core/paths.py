@@ -59,6 +59,7 @@ class Path:
         "recovery",
         "remote",
         "remote_id",
+        "renewed_at",
         "reported_fates",
         "reported_lost",
         "reported_sent",
@@ -114,6 +115,8 @@ class Path:
         self.reported_fates = (0, 0)
         self._introduced = False
         self._introducer: Address | None = None
+        self.renewed_at: float | None = None
+        """When our credential was signed anew, until the peer answers an introduction with it."""
         self._waiting_since: float | None = None
         self._oldest_at = now
         """When the oldest of what waits for an answer left."""
@@ -212,6 +215,8 @@ class Path:
         self.recovery.rtt.sample(now - probe.sent_at, now)
         if probe.sealed:
             self.sealing.delivered(probe.sent_at)
+        elif self.renewed_at is not None and probe.sent_at >= self.renewed_at:
+            self.renewed_at = None
         self.note_rtt()
         return probe.sent_at
 

@@ -12,6 +12,7 @@ it may do under the new one.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from protos.errors import DecodeError
 from protos.identity import CertificateError
 from protos.model import NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
 from sidecar.core.link_events import LinkPeer
+from sidecar.core.verification_budget import VerificationBudget
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -27,14 +29,14 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceId, NodeName, Peer, ServiceName, SessionId
     from sidecar.core.key_schedule import PairKeys
-    from sidecar.core.link_events import PeerRestarted
+    from sidecar.core.link_events import PeerRenewed, PeerRestarted
     from sidecar.core.session import OwnSession
 
 MAX_PEERS = 4096
 """Peers kept; a control plane that names more is refused."""
 RESTART_GAP_S = 1.0
-"""A peer that says more often that it restarted is not believed, nor is its credential looked at: every restart costs
-all links work, and every look public-key work."""
+"""A peer that restarts more often is not believed: every restart costs all links work. What it costs to look at the
+credentials of those who say so has a budget of its own (`verification_budget.py`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,7 @@ class Peers:
         self._told: dict[NodeName, tuple[Peer, PairKeys, LinkPeer]] = {}
         """What links were told of each, and what that was made of."""
         self._restarted_at: dict[NodeName, float] = {}
+        self._budget = VerificationBudget()
         self._policy = NO_POLICY
         """Fingerprint of the access policy that was judged by last."""
         self.version = Version(0)
@@ -115,6 +118,7 @@ class Peers:
                 unlisted.add(name)
         self._known, self._keys = known, keys
         self._restarted_at = {name: at for name, at in self._restarted_at.items() if name in known}
+        self._budget.keep(known)
         self._unlisted = unlisted
         if peer_set.policy != POLICY_PENDING:
             self._policy = peer_set.policy
@@ -124,7 +128,12 @@ class Peers:
     def _newer(self, listed: Peer, sessions: set[SessionId]) -> Peer:
         """The view may be older than what the peer itself proved by its introduction; `sessions` are the view's."""
         known = self._known.get(listed.name)
-        if known is None or known.token != listed.token or known.session in sessions:
+        if known is None or known.token != listed.token or known.credential == listed.credential:
+            return listed
+        if (known.session, known.incarnation) == (listed.session, listed.incarnation):
+            renewed = self._ends_at(known) > self._ends_at(listed)
+            return dataclasses.replace(listed, credential=known.credential) if renewed else listed
+        if known.session in sessions:
             return listed
         if known.incarnation > listed.incarnation:
             return dataclasses.replace(
@@ -143,17 +152,48 @@ class Peers:
             return False
         if any(other.session == credential.session for other in self._known.values()):
             return False
-        self._restarted_at[name] = now
         newer = dataclasses.replace(
             peer, session=credential.session, incarnation=credential.incarnation, credential=credential.encode()
         )
+        if not self._introduced(newer, now, at_home=event.at_home):
+            return False
+        self._restarted_at[name] = now
+        return True
+
+    def renewed(self, event: PeerRenewed, now: float) -> bool:
+        """Take the credential of a peer's session signed anew; False when it is not proven, or ends no later."""
+        name, credential = event.peer, event.credential
+        peer = self._known.get(name)
+        if peer is None or (peer.session, peer.incarnation) != (credential.session, credential.incarnation):
+            return False
+        keys = self._keys[name]
+        renewed = dataclasses.replace(peer, credential=credential.encode())
+        if renewed.credential == peer.credential or not self._introduced(renewed, now, at_home=event.at_home):
+            return False
+        if self._keys[name] == keys and self._ends_at(renewed) > self._ends_at(peer):
+            return True
+        # Of another session key, which our paths do not have, or the one before: a copy of an old introduction.
+        self._known[name], self._keys[name] = peer, keys
+        return False
+
+    def _introduced(self, peer: Peer, now: float, *, at_home: bool) -> bool:
+        """Take what a peer proves of itself; False when it does not, or when its credential is not looked at now."""
+        if not self._own.has_admitted(peer.credential) and not self._budget.take(peer.name, now, at_home=at_home):
+            self._dropped["verifications_full"] += 1
+            return False
         try:
-            self._keys[name] = self._own.admit(newer)
+            self._keys[peer.name] = self._own.admit(peer)
         except DecodeError:
             self._dropped["bad_credential"] += 1
             return False
-        self._known[name] = newer
+        self._known[peer.name] = peer
         return True
+
+    def _ends_at(self, peer: Peer) -> float:
+        """When its credential ends (seconds since 1970): never was good, if it is bad."""
+        with contextlib.suppress(DecodeError):
+            self._own.admit(peer)
+        return self._own.ends_at(peer.credential)
 
     def recheck(self) -> list[NodeName]:
         """Whom to trust has changed; returns those that are no peers any more. See `OwnSession.forget_admitted`."""
@@ -240,6 +280,7 @@ def _link_peer(peer: Peer, keys: PairKeys) -> LinkPeer:
         peer.session,
         peer.token,
         peer.incarnation,
+        peer.credential,
         keys,
         tuple((interface, tuple(addresses)) for interface, addresses in sorted(by_interface.items())),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
@@ -26,16 +27,20 @@ def public_key(private_key: bytes) -> bytes:
 
 
 class OwnSession:
-    """Who we are in this run. Any thread may use it: what is remembered is only ever added to or dropped whole."""
+    """Who we are in this run. Any thread may use it: what is remembered is only ever added to, or dropped."""
 
     def __init__(
-        self, credential: SessionCredential, private_key: bytes, verify: Callable[[SessionCredential], object]
+        self, credential: SessionCredential, private_key: bytes, verify: Callable[[SessionCredential], float]
     ) -> None:
-        """`private_key` belongs to the credential's public key. `verify` raises DecodeError for a bad credential."""
+        """`private_key` belongs to the credential's public key.
+
+        `verify` raises DecodeError for a bad credential, and returns when a good one ends (seconds since 1970).
+        """
         self.credential = credential
         self._private_key = X25519PrivateKey.from_private_bytes(private_key)
         self._verify = verify
-        self._admitted: dict[bytes, PairKeys] = {}
+        self._admitted: dict[bytes, tuple[PairKeys, float]] = {}
+        """What is shared under each credential, and when that ends."""
 
     def admit(self, peer: Peer) -> PairKeys:
         """Return what we share with a peer, having judged its credential: about 0.3 ms, nothing when it is known.
@@ -50,10 +55,10 @@ class OwnSession:
         ):  # fmt: skip
             raise DecodeError("the credential is of another node or session")
         if known is not None:
-            return known
+            return known[0]
         if (theirs.name, theirs.role) == (self.credential.name, self.credential.role):
             raise DecodeError("the credential is of a node with our own name and role")
-        self._verify(theirs)
+        ends_at = self._verify(theirs)
         try:
             shared = self._private_key.exchange(X25519PublicKey.from_public_bytes(theirs.public_key))
         except ValueError:  # a point of small order (RFC 7748 section 6.1)
@@ -61,8 +66,24 @@ class OwnSession:
         keys = pair_keys(shared, self.credential, theirs)
         if len(self._admitted) >= MAX_ADMITTED:
             self._admitted.clear()
-        self._admitted[peer.credential] = keys
+        self._admitted[peer.credential] = keys, ends_at
         return keys
+
+    def has_admitted(self, credential: bytes) -> bool:
+        """Whether this one was judged good: admitting it again costs nothing."""
+        return credential in self._admitted
+
+    def ends_at(self, credential: bytes) -> float:
+        """Return when an admitted credential ends (seconds since 1970); that of no other, which is never."""
+        known = self._admitted.get(credential)
+        return -math.inf if known is None else known[1]
+
+    def forget_ended(self, now_wall: float) -> bool:
+        """Judge those anew that have ended by now (seconds since 1970); False when there are none."""
+        ended = [credential for credential, (_, ends_at) in list(self._admitted.items()) if ends_at < now_wall]
+        for credential in ended:
+            self._admitted.pop(credential, None)
+        return bool(ended)
 
     def renew(self, credential: SessionCredential) -> None:
         """Take the same credential signed anew, with a renewed certificate.

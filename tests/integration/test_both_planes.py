@@ -54,6 +54,9 @@ class Engine:
     def certificate_changed(self, files: TlsFiles) -> None:
         raise AssertionError("insecure here")
 
+    def end_expired(self) -> None:
+        pass
+
     def judge_again(self) -> None:
         """Nobody is refused here."""
 

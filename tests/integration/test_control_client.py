@@ -96,6 +96,9 @@ class Recorder:
     def certificate_changed(self, files: TlsFiles) -> None:
         raise AssertionError("insecure here")
 
+    def end_expired(self) -> None:
+        pass
+
     def judge_again(self) -> None:
         self.judgements += 1
         if self.crash:

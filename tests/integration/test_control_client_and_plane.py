@@ -134,6 +134,9 @@ class Sidecar:
     def certificate_changed(self, files: TlsFiles) -> None:
         raise AssertionError("insecure here")
 
+    def end_expired(self) -> None:
+        pass
+
     def judge_again(self) -> None:
         """Nobody is refused here."""
 

@@ -67,6 +67,9 @@ class Robot:
     def take_report(self) -> Report:
         return Report()
 
+    def end_expired(self) -> None:
+        pass
+
     def judge_again(self) -> None:
         """Nobody is refused here."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from typing import TYPE_CHECKING
 
@@ -118,9 +119,10 @@ def test_a_restart_that_somebody_else_introduces_is_not_believed() -> None:
     mesh, robot, cloud = pair()
     forged = credential_of("robot", robot.role, 77, incarnation=robot.incarnation + 10**9)
 
-    def judge(credential: SessionCredential) -> None:
+    def judge(credential: SessionCredential) -> float:
         if credential == forged:
             raise DecodeError("the credential's signature is wrong")
+        return math.inf
 
     cloud.own._verify = judge
     eth0, first = cloud.interfaces[0], InterfaceId(0)
@@ -132,5 +134,5 @@ def test_a_restart_that_somebody_else_introduces_is_not_believed() -> None:
         mesh.run(0.05)
     mesh.run(0.1)
     assert_each_answered_once(robot, 10)
-    assert cloud.engine.stats.dropped["bad_credential"] == 1
+    assert cloud.engine.stats.dropped["bad_credential"] == 10
     assert cloud.engine.peers.session(robot.name) == robot.session

@@ -52,6 +52,8 @@ class _RemovalReasonEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Removal
     """It must not be talked to any more."""
     REMOVAL_REASON_FORBIDDEN: _RemovalReason.ValueType  # 4
     """It is there, but the access policy leaves the two nothing to do with each other."""
+    REMOVAL_REASON_EXPIRED: _RemovalReason.ValueType  # 5
+    """Its certificate has ended."""
 
 class RemovalReason(_RemovalReason, metaclass=_RemovalReasonEnumTypeWrapper): ...
 
@@ -64,6 +66,8 @@ REMOVAL_REASON_REVOKED: RemovalReason.ValueType  # 3
 """It must not be talked to any more."""
 REMOVAL_REASON_FORBIDDEN: RemovalReason.ValueType  # 4
 """It is there, but the access policy leaves the two nothing to do with each other."""
+REMOVAL_REASON_EXPIRED: RemovalReason.ValueType  # 5
+"""Its certificate has ended."""
 Global___RemovalReason: _TypeAlias = RemovalReason  # noqa: Y015
 
 @_typing.final

@@ -128,26 +128,32 @@ def test_an_expired_robot_that_returns_is_told_who_went_meanwhile() -> None:
     assert robot.removed == {"b": RemovalReason.LEFT}
 
 
-def test_a_revoked_server_goes_at_once_and_its_peers_are_told_why(world: World) -> None:
+@pytest.mark.parametrize(
+    ("reason", "closed"),
+    [(RemovalReason.REVOKED, CloseReason.REVOKED), (RemovalReason.EXPIRED, CloseReason.CERTIFICATE_ENDED)],
+)
+def test_a_server_that_must_not_be_talked_to_goes_at_once_and_its_peers_are_told_why(
+    world: World, reason: RemovalReason, closed: CloseReason
+) -> None:
     a, b = world.cloud("a"), world.cloud("b")
     robot = world.robot()
     world.run(SETTLED_S)
     world.all_up(robot, ("a", "b"))
     world.run(SETTLED_S)
     assert set(robot.pairs().values()) == {"a", "b"}
-    world.core.revoke(NodeName("b"), world.now)
+    world.core.part_with(NodeName("b"), reason, world.now)
     world.dispatch()
-    assert b.closed == [CloseReason.REVOKED]
+    assert b.closed == [closed]
     assert robot.peer_names == {"a"}
-    assert robot.removed == {"b": RemovalReason.REVOKED}
+    assert robot.removed == {"b": reason}
     assert "b" not in robot.pairs().values()
     assert a.closed == []
     world.run(SETTLED_S)
     assert set(robot.pairs().values()) == {"a"}
-    assert world.core.registry.counters.revoked == 1
+    assert world.core.registry.counters.departed[reason] == 1
     # Nobody there: nothing to do.
-    world.core.revoke(NodeName("b"), world.now)
-    assert world.core.registry.counters.revoked == 1
+    world.core.part_with(NodeName("b"), reason, world.now)
+    assert world.core.registry.counters.departed[reason] == 1
 
 
 def test_a_stream_that_is_ended_leaves_its_sidecar_registered(world: World) -> None:

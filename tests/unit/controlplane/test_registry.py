@@ -25,7 +25,7 @@ def test_a_silent_sidecar_disappears_when_its_lease_ends(registry: Registry) -> 
     assert [gone.name for gone in registry.expire(LEASE_S)] == [ROBOT]
     assert registry.get(ROBOT) is None
     assert registry.removal_reason(ROBOT) is RemovalReason.LEASE_EXPIRED
-    assert registry.counters.expired == 1
+    assert registry.counters.departed[RemovalReason.LEASE_EXPIRED] == 1
     assert registry.next_expiry() is None
 
 

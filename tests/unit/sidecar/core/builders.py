@@ -169,7 +169,7 @@ class Bench:
         if name == A:
             self.session, self._incarnations[session] = session, incarnation
         subject = with_credential(Peer(name, Role.CLOUD, session, token, incarnation))
-        return LinkPeer(name, session, token, incarnation, self.own.admit(subject), addresses)
+        return LinkPeer(name, session, token, incarnation, subject.credential, self.own.admit(subject), addresses)
 
     def peer_keys(self, session: SessionId = PEER_SESSION, interface: InterfaceId = FIRST) -> PathKeys:
         """The other end's keys of the path to this interface of a session of A."""

@@ -218,7 +218,7 @@ def test_a_cancel_stops_what_has_not_started_and_what_is_being_sent() -> None:
 def test_fragments_of_a_session_that_is_over_are_dropped() -> None:
     sidecar = cloud()
     sidecar.receive(request(), session=2)
-    sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential_of(ROBOT, Role.CLOUD, 2, 2)), 0.1)
+    sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential_of(ROBOT, Role.CLOUD, 2, 2), at_home=True), 0.1)
     sidecar.receive(request(), session=1)
     assert sidecar.engine.stats.dropped["fragment_of_old_session"] == 2
     sidecar.take()
@@ -311,7 +311,7 @@ def test_a_flood_of_restarts_makes_little_work() -> None:
     sidecar = cloud()
     for incarnation in range(2, 1000):
         credential = credential_of(ROBOT, Role.CLOUD, incarnation, incarnation)
-        sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential), 0.001 * incarnation)
+        sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential, at_home=True), 0.001 * incarnation)
     assert len([command for command in sidecar.take()[0] if isinstance(command, SetPeers)]) == 1
 
 

@@ -327,7 +327,7 @@ def test_a_robot_stays_with_the_address_that_answers_when_the_peer_uses_another_
 def test_a_known_peers_newer_start_is_reported() -> None:
     bench = up()
     bench.receive_datagram(bench.introduction(session=OTHER_SESSION, incarnation=2))
-    assert bench.events() == [PeerRestarted(A, credential_of(A, Role.CLOUD, OTHER_SESSION, 2))]
+    assert bench.events() == [PeerRestarted(A, credential_of(A, Role.CLOUD, OTHER_SESSION, 2), at_home=True)]
     assert bench.sent() == []
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -127,7 +128,7 @@ def test_only_a_known_robot_may_call_and_only_what_it_was_permitted() -> None:
 
 
 def restart(name: NodeName = A, session: int = 9, incarnation: int = 2) -> PeerRestarted:
-    return PeerRestarted(name, credential_of(name, Role.CLOUD, session, incarnation))
+    return PeerRestarted(name, credential_of(name, Role.CLOUD, session, incarnation), at_home=True)
 
 
 def test_a_restart_is_believed_when_it_is_newer() -> None:
@@ -199,29 +200,13 @@ def test_a_peer_whose_credential_is_bad_is_no_peer_and_one_held_for_its_paths_is
     assert [link_peer.name for link_peer in peers.for_links()] == [B]
 
 
-def test_a_restart_whose_credential_is_refused_changes_nothing_and_keeps_others_waiting() -> None:
-    refused: list[str] = []
-
-    def judge(credential: SessionCredential) -> None:
-        if credential.session == 9:
-            refused.append(credential.name)
-            raise DecodeError("forged")
-
-    peers = Peers(OwnSession(OWN.credential, private_key("robot-1", 99), judge), Counter())
-    peers.apply(view(*HELD), nobody)
-    for step in range(10):
-        assert not peers.restarted(restart(), 1.0 + step * RESTART_GAP_S / 10)
-    assert refused == [A], "one look in this time, however many ask for it"
-    assert peers.session(A) == 1
-    assert peers.restarted(restart(session=10, incarnation=3), 1.0 + RESTART_GAP_S)
-
-
 def test_peers_are_judged_anew_when_trust_changes() -> None:
     revoked: set[str] = set()
 
-    def judge(credential: SessionCredential) -> None:
+    def judge(credential: SessionCredential) -> float:
         if credential.name in revoked:
             raise DecodeError("revoked")
+        return math.inf
 
     own = OwnSession(OWN.credential, private_key("robot-1", 99), judge)
     peers = Peers(own, Counter())
@@ -243,10 +228,11 @@ class Judge:
         self.own = OwnSession(OWN.credential, private_key("robot-1", 99), self)
         self.peers = Peers(self.own, Counter())
 
-    def __call__(self, credential: SessionCredential) -> None:
+    def __call__(self, credential: SessionCredential) -> float:
         self.looks += 1
         if (error := self.wrong.get(credential.name)) is not None:
             raise error
+        return math.inf
 
 
 EARLY = CertificateError(NOT_YET_VALID, "not valid yet, for 99 s")

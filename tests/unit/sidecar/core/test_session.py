@@ -12,15 +12,18 @@ from sidecar.core.session import OwnSession
 from tests.sessions import credential_of, private_key, session_of
 from tests.unit.sidecar.core.builders import A, B, peer
 
+ENDS_AT = 1000.0
+
 
 def judged(refused: str = "") -> tuple[OwnSession, list[str]]:
     """A session, and whose credentials it looked at; that of `refused` is no good."""
     looked_at: list[str] = []
 
-    def judge(credential: SessionCredential) -> None:
+    def judge(credential: SessionCredential) -> float:
         looked_at.append(credential.name)
         if credential.name == refused:
             raise DecodeError("revoked")
+        return ENDS_AT
 
     own = OwnSession(credential_of("robot-1", Role.ROBOT, 9), private_key("robot-1", 9), judge)
     return own, looked_at
@@ -35,6 +38,20 @@ def test_a_credential_is_judged_once_until_trust_changes() -> None:
     own.forget_admitted()
     assert own.admit(peer(A)) == keys
     assert looked_at == [A, B, A]
+
+
+@pytest.mark.audit("sec-6")
+def test_a_credential_that_has_ended_is_judged_anew() -> None:
+    own, looked_at = judged()
+    own.admit(peer(A))
+    assert own.has_admitted(peer(A).credential)
+    assert own.ends_at(peer(A).credential) == ENDS_AT
+    assert not own.forget_ended(ENDS_AT)
+    assert own.forget_ended(ENDS_AT + 0.1)
+    assert not own.has_admitted(peer(A).credential)
+    assert own.ends_at(peer(A).credential) < 0
+    own.admit(peer(A))
+    assert looked_at == [A, A]
 
 
 def test_a_refused_credential_is_looked_at_every_time() -> None:

@@ -46,7 +46,7 @@ def test_a_restart_ends_what_was_asked_before_whoever_tells_of_it() -> None:
     sidecar.view(peer(ROBOT, session=2, incarnation=2), version=2)
     assert cancelled(sidecar) == 1
     sidecar = busy_cloud()
-    sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential_of(ROBOT, Role.CLOUD, 2, 2)), 1.0)
+    sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential_of(ROBOT, Role.CLOUD, 2, 2), at_home=True), 1.0)
     assert cancelled(sidecar) == 1
 
 

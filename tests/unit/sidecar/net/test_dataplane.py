@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import random
 import socket
 import threading
@@ -212,7 +213,7 @@ def test_a_peer_that_trust_no_longer_covers_loses_its_session_at_once(nodes: tup
     submit(robot, 1, b"before")
     robot.wait_for(ResponseArrived)
 
-    def judge(credential: SessionCredential) -> None:
+    def judge(credential: SessionCredential) -> float:
         raise DecodeError(f"{credential.name} is revoked")
 
     robot.own._verify = judge
@@ -228,9 +229,10 @@ def test_a_peer_refused_while_the_clock_was_wrong_is_talked_to_when_it_is_right(
     seconds = itertools.count(1000, -1)
     wrong = True
 
-    def judge(credential: SessionCredential) -> None:
+    def judge(credential: SessionCredential) -> float:
         if wrong:
             raise CertificateError(NOT_YET_VALID, f"not valid yet, for {next(seconds)} s")
+        return math.inf
 
     robot, cloud = Node("robot", Role.ROBOT, 1), Node("cloud", Role.CLOUD, 2)
     robot.own._verify = judge
@@ -253,7 +255,7 @@ def test_a_peer_refused_while_the_clock_was_wrong_is_talked_to_when_it_is_right(
 def test_a_peer_of_a_ca_that_is_copied_late_is_talked_to_from_then_on(nodes: tuple[Node, Node]) -> None:
     robot, cloud = nodes
 
-    def judge(credential: SessionCredential) -> None:
+    def judge(credential: SessionCredential) -> float:
         raise CertificateError(UNTRUSTED, "the certificate is of another CA")
 
     believe, robot.own._verify = robot.own._verify, judge
