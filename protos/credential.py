@@ -7,12 +7,15 @@ The control plane relays it as opaque bytes and so can not put another key in be
     name | certificate (DER; none in insecure mode)
     length of signature (8) | signature (ECDSA P-256 with SHA-256, DER, over a label and all that stands before it)
 
-Nothing may follow, so that equal credentials are equal bytes.
+Nothing may follow, so that equal credentials are equal bytes. The session is the first 64 bits of SHA-256 over a label,
+the role (8), the length of the name (8), the name and the public key, 1 for 0: nobody can take a number that is another
+node's, though it stands in clear in every datagram of that one.
 """
 
 from __future__ import annotations
 
 import enum
+import hashlib
 import struct
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -36,6 +39,7 @@ PUBLIC_KEY_BYTES = 32
 _FORMAT = 1
 _HEAD = struct.Struct(f">BBBBQQ{PUBLIC_KEY_BYTES}sH")
 _LABEL = b"plr session credential\0"
+_NUMBER_LABEL = b"plr session number\0"
 _ALGORITHM = ec.ECDSA(hashes.SHA256())
 
 
@@ -80,6 +84,13 @@ class SessionCredential:
 
     def _signed(self) -> bytes:
         return _head(self) + self.name.encode() + self.certificate
+
+
+def session_number(name: NodeName, role: Role, public_key: bytes) -> SessionId:
+    """Return the number of the session with this X25519 key."""
+    whose = bytes([_ROLE_NUMBERS[role], len(name)]) + name.encode()
+    digest = hashlib.sha256(_NUMBER_LABEL + whose + public_key).digest()
+    return SessionId(int.from_bytes(digest[:8], "big") or 1)
 
 
 def _head(credential: SessionCredential) -> bytes:
@@ -130,7 +141,8 @@ def verify(credential: SessionCredential, check: Callable[[bytes], Identity]) ->
     """Return whose credential it is. `check` judges the certificate (DER), as `Trust.check` does.
 
     Raises:
-        CertificateError: the certificate is no good, belongs to another name or role, or did not sign this.
+        CertificateError: the certificate is no good, belongs to another name or role, or did not sign this, or the
+            session's number is not its key's.
     """
     identity = check(credential.certificate)
     if identity.name != credential.name or identity.role is not IdentityRole(credential.role.value):
@@ -146,4 +158,6 @@ def verify(credential: SessionCredential, check: Callable[[bytes], Identity]) ->
         key.verify(credential.signature, _LABEL + credential._signed(), _ALGORITHM)
     except InvalidSignature:
         raise CertificateError(UNTRUSTED, "the credential's signature is wrong") from None
+    if credential.session != session_number(credential.name, credential.role, credential.public_key):
+        raise CertificateError(MALFORMED, "the credential's session number is not that of its key")
     return identity

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-import random
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos.credential import Aead, SessionCredential, verify
+from protos.credential import Aead, SessionCredential, session_number, verify
 from protos.errors import ConfigError
-from protos.model import SessionId
 from sidecar.core.introduction import MAX_INTRODUCED_BYTES
 from sidecar.core.session import OwnSession, public_key
 
@@ -33,8 +31,9 @@ def start_session(name: NodeName, role: Role, incarnation: int, tls: Callable[[]
         ConfigError: the certificate is too long for introductions.
     """
     private_key = os.urandom(PRIVATE_KEY_BYTES)
-    session = SessionId(random.SystemRandom().getrandbits(64) or 1)
-    credential = SessionCredential(name, role, session, incarnation, public_key(private_key), preferred_aead())
+    public = public_key(private_key)
+    session = session_number(name, role, public)
+    credential = SessionCredential(name, role, session, incarnation, public, preferred_aead())
     if tls is None:
         return OwnSession(credential, private_key, _take_as_it_is)
 

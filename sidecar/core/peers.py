@@ -93,21 +93,23 @@ class Peers:
         """Take a new view; returns why it is refused, or None. `reaches` tells whether a path to a peer lives."""
         if len(peer_set.peers) > MAX_PEERS:
             return f"{len(peer_set.peers)} peers, the limit is {MAX_PEERS}"
-        if len({peer.session for peer in peer_set.peers}) != len(peer_set.peers):
-            return "two peers share a session"
         gone = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
-        sessions = {peer.session for peer in peer_set.peers}
         known: dict[NodeName, Peer] = {}
         keys: dict[NodeName, PairKeys] = {}
-        self.refused = {}
+        refused: dict[NodeName, Refusal] = {}
         for listed in peer_set.peers:
-            peer = self._newer(listed, sessions)
+            peer = self._newer(listed)
             try:
                 keys[peer.name] = self._own.admit(peer)
                 known[peer.name] = peer
             except DecodeError as error:
-                self._dropped["bad_credential"] += 1
-                self.refused[peer.name] = Refusal.of(peer, error)
+                refused[peer.name] = Refusal.of(peer, error)
+        # Not of the refused: what they say is nobody's but the control plane's.
+        sessions = {peer.session for peer in known.values()}
+        if len(sessions) != len(known):
+            return "two peers share a session"
+        self._dropped["bad_credential"] += len(refused)
+        self.refused = refused
         unlisted = set()
         new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)
         for name, peer in self._known.items():
@@ -125,16 +127,14 @@ class Peers:
         self.version = peer_set.version
         return None
 
-    def _newer(self, listed: Peer, sessions: set[SessionId]) -> Peer:
-        """The view may be older than what the peer itself proved by its introduction; `sessions` are the view's."""
+    def _newer(self, listed: Peer) -> Peer:
+        """The view may be older than what the peer itself proved by its introduction."""
         known = self._known.get(listed.name)
         if known is None or known.token != listed.token or known.credential == listed.credential:
             return listed
         if (known.session, known.incarnation) == (listed.session, listed.incarnation):
             renewed = self._ends_at(known) > self._ends_at(listed)
             return dataclasses.replace(listed, credential=known.credential) if renewed else listed
-        if known.session in sessions:
-            return listed
         if known.incarnation > listed.incarnation:
             return dataclasses.replace(
                 listed, session=known.session, incarnation=known.incarnation, credential=known.credential

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
-import zlib
 from typing import TYPE_CHECKING
 
 from protos.convert import sidecar_message_to_proto
-from protos.credential import Aead, SessionCredential
-from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, SessionId, Version
+from protos.credential import Aead, SessionCredential, session_number
+from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, Version
 
 if TYPE_CHECKING:
     from controlplane.ca import Issued
@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 def registration(issued: Issued, name: str, role: Role, incarnation: int | None = None) -> bytes:
     """An encoded registration with a credential signed by this certificate's key."""
     incarnation = int(time.time() * 1000.0) if incarnation is None else incarnation
-    session = SessionId(zlib.crc32(name.encode()) + incarnation)
+    public_key = hashlib.sha256(f"{name} {incarnation}".encode()).digest()
+    session = session_number(NodeName(name), role, public_key)
     credential = SessionCredential(
-        NodeName(name), role, session, incarnation, bytes(range(32)), Aead.AES_256_GCM, issued.certificate_der
+        NodeName(name), role, session, incarnation, public_key, Aead.AES_256_GCM, issued.certificate_der
     ).sign(issued.key)
     said = Registration(
         protocol_version=PROTOCOL_VERSION,

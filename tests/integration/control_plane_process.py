@@ -16,7 +16,7 @@ import grpc
 import yaml
 
 from protos.convert import control_message_from_proto, sidecar_message_to_proto, status_from_proto
-from protos.credential import Aead, SessionCredential
+from protos.credential import Aead, SessionCredential, session_number
 from protos.identity import CONTROL_PLANE_DNS
 from protos.model import (
     Ack,
@@ -157,13 +157,23 @@ class Secured:
     ca_pem: bytes
 
     def claim(self, said: Registration) -> Registration:
-        """The registration with the credential that belongs to it."""
+        """The registration with the credential that belongs to it, and the session that this is of."""
+        said = with_own_session(said)
         return replace(said, credential=credential_of(said, self.issued.certificate_der, self.issued.key))
+
+
+def with_own_session(said: Registration) -> Registration:
+    """The registration with the session that belongs to its credential."""
+    return replace(said, session=session_number(said.name, said.role, _public_key_of(said)))
+
+
+def _public_key_of(said: Registration) -> bytes:
+    return said.incarnation.to_bytes(32, "big")
 
 
 def credential_of(said: Registration, certificate: bytes, key: EllipticCurvePrivateKey) -> bytes:
     """What a sidecar that registers so says of its session; of no use for datagrams."""
-    public_key = bytes(32)
+    public_key = _public_key_of(said)
     own = SessionCredential(
         said.name, said.role, said.session, said.incarnation, public_key, Aead.AES_256_GCM, certificate
     )

@@ -19,7 +19,14 @@ from sidecar import control_client
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
-from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, credential_of
+from tests.integration.control_plane_process import (
+    PATIENCE_S,
+    ControlPlaneProcess,
+    Sidecar,
+    cloud,
+    credential_of,
+    with_own_session,
+)
 from tests.integration.secured_control_plane import HOUR_S, SecuredControlPlane
 from tests.unit.controlplane.samples import registration
 
@@ -40,7 +47,7 @@ class Robot:
     """A control client with the files of a folder; what happens waits in queues."""
 
     def __init__(self, address: str, folder: Path | None, name: str = "robot-1") -> None:
-        self.said = registration(name)
+        self.said = with_own_session(registration(name))
         self.session = ControlSession(self.said, random.Random(1))
         self.tls = TlsWatch(load_tls_files(folder)) if folder is not None else None
         if self.tls is not None:

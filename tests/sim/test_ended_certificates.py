@@ -1,4 +1,4 @@
-"""Certificates that end while their sessions live: peers part with them, and a renewed one is told without a control plane."""
+"""Certificates that end while sessions live: peers part with them; a renewed one is told without a control plane."""
 
 from __future__ import annotations
 

@@ -9,10 +9,10 @@ import pytest
 from controlplane.ca import Authority, Issued
 from controlplane.core.claims import check_claims, check_unproven_claims
 from controlplane.core.registry import Refusal
-from protos.credential import Aead, SessionCredential
+from protos.credential import Aead, SessionCredential, session_number
 from protos.identity import Identity, IdentityRole, Trust
 from protos.model import NodeName, Registration, Role
-from tests.unit.controlplane.samples import registration
+from tests.unit.controlplane.samples import registration as sample
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,15 @@ def identity(authority: Authority, issued: Issued) -> Identity:
     return Trust(authority.ca_pem).identify(issued.certificate_der)
 
 
+KEY = bytes(32)
+
+
+def registration(name: str, role: Role = Role.ROBOT) -> Registration:
+    return replace(sample(name, role), session=session_number(NodeName(name), role, KEY))
+
+
 def credential(said: Registration, certificate: bytes = b"") -> SessionCredential:
-    return SessionCredential(
-        said.name, said.role, said.session, said.incarnation, bytes(32), Aead.AES_256_GCM, certificate
-    )
+    return SessionCredential(said.name, said.role, said.session, said.incarnation, KEY, Aead.AES_256_GCM, certificate)
 
 
 def test_what_agrees_is_accepted(issued: Issued, identity: Identity) -> None:

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protos.credential import Aead, SessionCredential, decode_credential, verify
+from protos.credential import Aead, SessionCredential, decode_credential, session_number, verify
 from protos.errors import DecodeError
 from protos.identity import CertificateError, Identity, IdentityRole
 from protos.model import MAX_CREDENTIAL_BYTES, NodeName, Role, SessionId
@@ -34,6 +35,22 @@ def test_the_bytes_of_a_credential() -> None:
     credential = replace(PLAIN, certificate=b"CERT", signature=b"SIG")
     golden = "01 01 01 07 0000000000000102 0000000000000003" + bytes(range(32)).hex() + "0004"
     assert credential.encode() == bytes.fromhex(golden) + b"robot-1" + b"CERT" + b"\x03SIG"
+
+
+@pytest.mark.audit("sec-4")
+def test_a_sessions_number_belongs_to_name_role_and_key() -> None:
+    """Also who knows another's public key, which is no secret, gets another number."""
+    name, role, key = PLAIN.name, PLAIN.role, PLAIN.public_key
+    number = session_number(name, role, key)
+    assert number == int.from_bytes(
+        hashlib.sha256(b"plr session number\0" + b"\x01\x07robot-1" + key).digest()[:8], "big"
+    )
+    others = [
+        session_number(NodeName("robot-2"), role, key),
+        session_number(name, Role.CLOUD, key),
+        session_number(name, role, bytes(32)),
+    ]
+    assert len({number, *others}) == 4
 
 
 @given(credentials)

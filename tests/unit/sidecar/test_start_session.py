@@ -94,6 +94,8 @@ def test_what_a_credential_may_not_say(fleet: Fleet) -> None:
         (replace(credential, name=fleet.issue("robot-2").identity.name).sign(files.private_key), WRONG_ROLE),
         (replace(credential, role=Role.CLOUD).sign(files.private_key), WRONG_ROLE),
         (replace(credential, certificate=b"", signature=b""), MALFORMED),
+        (replace(credential, session=SessionId(1)).sign(files.private_key), MALFORMED),
+        (replace(credential, public_key=bytes(32)).sign(files.private_key), MALFORMED),
     ):
         assert refusal(changed, fleet, now) == reason
 

@@ -6,8 +6,10 @@ from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import pytest
+
 from protos.errors import DecodeError
-from protos.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
+from protos.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
     NO_POLICY,
     POLICY_PENDING,
@@ -153,11 +155,26 @@ def test_a_peer_cannot_take_the_session_of_another() -> None:
     assert not peers.restarted(restart(session=2), 1.0)
     newcomer = peer("cloud-c", session=9)
     assert peers.restarted(restart(session=9), 1.0)
-    assert peers.apply(view(*HELD, newcomer), everybody) is None
-    assert peers.session(NodeName("cloud-c")) == 9
-    assert peers.session(A) == 1
+    assert "share a session" in (peers.apply(view(*HELD, newcomer), everybody) or "")
+    assert NodeName("cloud-c") not in peers
+    assert peers.session(A) == 9
     peers.apply(view(peer("cloud-d", session=2)), everybody)
     assert B not in peers, "kept for its paths, but its session is another's now"
+
+
+@pytest.mark.audit("sec-4")
+def test_one_that_is_refused_takes_no_session_of_a_living_peer() -> None:
+    """The control plane started anew; somebody registered with the number of a peer that is only known by its paths."""
+    judge = Judge()
+    judge.wrong = {B: CertificateError(MALFORMED, "the credential's session number is not that of its key")}
+    peers = judge.peers
+    assert peers.apply(view(HELD[0]), nobody) is None
+    squatter = peer(B, session=1)
+    assert peers.apply(view(squatter), everybody) is None
+    assert peers.session(A) == 1
+    assert peers.names() == [A]
+    assert peers.apply(view(HELD[0], squatter), everybody) is None, "not even a view that lists both is refused for it"
+    assert peers.names() == [A]
 
 
 def test_a_view_older_than_the_restart_does_not_bring_the_old_session_back() -> None:
