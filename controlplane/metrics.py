@@ -257,6 +257,7 @@ def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
             ("stale_answer",): core.counters.stale_answers,
             ("old_stream",): core.counters.old_stream_messages,
             ("report_of_cloud",): core.counters.reports_ignored,
+            ("report_forbidden",): core.counters.report_entries_forbidden,
             ("superseded_before_sent",): superseded,
         },
     )

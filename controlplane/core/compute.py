@@ -10,6 +10,7 @@ from controlplane.core.distribution import Distribution
 from controlplane.core.fading import FadedCount, FadedHistogram
 from controlplane.core.regime import ChangeWatch
 from controlplane.core.silence import HeardClock
+from controlplane.core.witnesses import Witnesses
 from protos.histogram import Histogram
 
 if TYPE_CHECKING:
@@ -46,10 +47,29 @@ class _OfServer:
 
     times: FadedHistogram
     lately: FadedCount
+    witnesses: Witnesses
     watch: ChangeWatch = field(default_factory=ChangeWatch)
     changes: int = 0
     before: Distribution | None = None
     """What it needed before the last change."""
+
+    def changed_with(self, robot: NodeName, processing: Histogram, now: float) -> Histogram | None:
+        """What came since the server changed, if these samples of a robot show that; they are still to be added."""
+        if not processing.total:
+            return None
+        since = self.times.held_against(processing, self.watch, now)
+        if self.watch.accused:
+            self.witnesses.accuses(robot)
+        elif not self.watch.suspects:
+            self.witnesses.acquit()
+        if since is None:
+            return None
+        if not self.witnesses.agree(now):
+            self.watch.doubted()
+            return None
+        self.watch.settled()
+        self.witnesses.acquit()
+        return since
 
 
 @dataclass(slots=True)
@@ -76,8 +96,8 @@ class ComputeTimes:
         self.dropped = 0
         """Entries evicted because a table was full."""
 
-    def merge(self, server: NodeName, service: ServiceName, processing: Histogram, now: float) -> bool:
-        """Add what a server needed; True if that is not what it needed before."""
+    def merge(self, robot: NodeName, server: NodeName, service: ServiceName, processing: Histogram, now: float) -> bool:
+        """Add what a server needed, as a robot says; True if that is not what it needed before."""
         if not processing.total:
             return False
         of_service = self._services.get(service)
@@ -88,7 +108,9 @@ class ComputeTimes:
         of_server = self._servers.get((server, service))
         if of_server is None:
             of_server = _OfServer(
-                FadedHistogram(self._half_life_s, now, of_service.clock), FadedCount(LATELY_HALF_LIFE_S, now)
+                FadedHistogram(self._half_life_s, now, of_service.clock),
+                FadedCount(LATELY_HALF_LIFE_S, now),
+                Witnesses(self._half_life_s),
             )
             self._servers[server, service] = of_server
             of_service.servers[server] = of_server.times
@@ -96,7 +118,8 @@ class ComputeTimes:
         if len(self._servers) > MAX_PROCESSING:
             self._forget(*self._servers.popitem(last=False)[0])
         of_server.lately.add(processing.total, 0.0, now)
-        since = of_server.times.held_against(processing, of_server.watch, now)
+        processing = of_server.witnesses.weigh(robot, processing, now)
+        since = of_server.changed_with(robot, processing, now)
         if since is None:
             of_server.times.add(processing, now)
             return False

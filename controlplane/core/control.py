@@ -36,6 +36,7 @@ from controlplane.core.publisher import Publisher
 from controlplane.core.reconcile import changed_robots
 from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import Admission, Refusal, Registry, StreamId
+from controlplane.core.report_filter import believable
 from controlplane.core.stability import Stability
 from controlplane.core.status import statuses
 from protos.errors import DecodeError
@@ -159,7 +160,9 @@ class ControlCore:
         if sidecar is None or sidecar.role is not Role.ROBOT:
             self.counters.reports_ignored += 1
             return
+        report, left_out = believable(report, name, self.registry, self.permits)
         self.counters.reports += 1
+        self.counters.report_entries_forbidden += left_out
         change = Change.MISSES if self._drawing.reported(name, report) else Change.REPORT
         if self.estimator.merge(name, report, now):
             change = Change.PATH

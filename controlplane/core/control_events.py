@@ -68,6 +68,8 @@ class Counters:
     reports: int = 0
     reports_ignored: int = 0
     """Reports of clouds, which measure nothing."""
+    report_entries_forbidden: int = 0
+    """Of robots about servers or services that they may not use."""
     old_stream_messages: int = 0
     """Messages on a stream that is not the sidecar's any more."""
     offers_refused: int = 0

@@ -161,7 +161,7 @@ class Estimator:
         dropped_before = network.dropped
         changed = False
         for latency in report.latencies:
-            changed |= self._merge_latency(tables, latency, now)
+            changed |= self._merge_latency(robot, tables, latency, now)
         for joint in report.joints:
             self._merge_joint(tables, joint, now)
         for fate in report.interface_joints:
@@ -184,9 +184,9 @@ class Estimator:
             self._dropped += len(forgotten.network)
         return changed
 
-    def _merge_latency(self, tables: _Robot, latency: LatencyReport, now: float) -> bool:
+    def _merge_latency(self, robot: NodeName, tables: _Robot, latency: LatencyReport, now: float) -> bool:
         tables.network.merge_requests(latency, now)
-        changed = self._compute.merge(latency.server, latency.service, latency.processing, now)
+        changed = self._compute.merge(robot, latency.server, latency.service, latency.processing, now)
         if latency.requests:
             of_service = tables.services.get(latency.service) or _Service(self._half_life_s, now)
             self._keep(tables.services, latency.service, of_service, MAX_OUTCOMES_PER_ROBOT)

@@ -56,9 +56,11 @@ USUAL_SHARE = 0.2
 class ChangeWatch:
     """Holds new samples against a memory of old ones; the memory is the caller's. Times are monotonic seconds."""
 
-    __slots__ = ("_began", "_evidence", "_since")
+    __slots__ = ("_began", "_evidence", "_since", "accused")
 
     def __init__(self) -> None:
+        self.accused = False
+        """Whether the samples added last spoke for a change."""
         self._evidence = 0.0
         self._began = math.inf
         self._since: Histogram | None = None
@@ -73,15 +75,18 @@ class ChangeWatch:
     ) -> Histogram | None:
         """Judge new samples by what is known without them, of which a share of `kept` still counts.
 
-        What came since the change if there was one, else None.
+        What came since the change if there was one, else None; it is `settled` then, or `doubted`.
         """
+        self.accused = False
         if self._since is None and _is_usual(new, known, known_lost, kept):
             return None
         expected = kept * _smooth(known, known_lost)
         expected = np.log((expected + PRIOR_SAMPLES / _BINS) / (expected.sum() + PRIOR_SAMPLES))
         counts = _binned(new.counts, new.lost)
         says = _log_begun(counts, self._since) - float(counts @ expected)
-        self._evidence += min(says, MAX_EVIDENCE * new.total) - DRIFT * new.total
+        gain = min(says, MAX_EVIDENCE * new.total) - DRIFT * new.total
+        self._evidence += gain
+        self.accused = gain > 0.0
         if self._evidence <= 0.0:
             self._evidence, self._since = 0.0, None
             if _is_usual(new, known, known_lost, kept):
@@ -92,9 +97,15 @@ class ChangeWatch:
             self._since.merge(new)
         if self._evidence < ENOUGH_EVIDENCE or now - self._began < LEAST_S:
             return None
-        since = self._since
+        return self._since
+
+    def settled(self) -> None:
+        """The change is taken note of."""
         self._evidence, self._since = 0.0, None
-        return since
+
+    def doubted(self) -> None:
+        """The change is not believed yet: more of the same says no more than this did."""
+        self._evidence = ENOUGH_EVIDENCE
 
 
 def _is_usual(new: Histogram, known: NDArray[np.float64], known_lost: float, kept: float) -> bool:

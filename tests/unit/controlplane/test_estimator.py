@@ -135,7 +135,7 @@ def test_a_servers_last_answers_are_odd_until_it_answers_as_usual() -> None:
     times = compute_module.ComputeTimes(half_life_s=60.0)
     found = []
     for second, took in enumerate([0.01] * 30 + [0.5] + [0.01] * 5):
-        times.merge(A, PLAN, histogram(took), float(second))
+        times.merge(ROBOT, A, PLAN, histogram(took), float(second))
         found.append(times.is_odd(A, PLAN))
     assert found[20:31] == [False] * 10 + [True]
     assert not found[-1]

@@ -12,6 +12,7 @@ from protos.model import NodeName
 from tests.unit.controlplane.samples import PLAN, histogram
 
 A, B, C = (NodeName(name) for name in "abc")
+ROBOT = NodeName("robot")
 IDLE_S, BUSY_S = 0.02, 0.25
 INTERVAL_S = 0.5
 HALF_LIFE_S = 60.0
@@ -35,7 +36,7 @@ class Fed:
                 for _ in range(2):
                     took = BUSY_S if self.rng.random() < odd else median_s
                     times.record(took * self.rng.lognormvariate(0.0, 0.25))
-                noticed += self.compute.merge(server, PLAN, times, self.now)
+                noticed += self.compute.merge(ROBOT, server, PLAN, times, self.now)
         return noticed
 
     def late(self, server: NodeName) -> float:
@@ -63,7 +64,7 @@ def test_a_steady_server_hardly_ever_seems_to_change(odd: float) -> None:
 def test_one_hiccup_is_no_change_however_many_waited_behind_it() -> None:
     fed = Fed()
     fed.feed({A: IDLE_S}, 30.0)
-    assert not fed.compute.merge(A, PLAN, histogram(BUSY_S, times=20), fed.now)
+    assert not fed.compute.merge(ROBOT, A, PLAN, histogram(BUSY_S, times=20), fed.now)
 
 
 def test_when_one_server_changes_the_others_are_doubted_unless_they_are_in_use() -> None:
@@ -79,8 +80,8 @@ def test_when_one_server_changes_the_others_are_doubted_unless_they_are_in_use()
 
 def test_a_service_usually_needs_what_its_servers_need_however_often_each_was_asked() -> None:
     compute = ComputeTimes(HALF_LIFE_S)
-    compute.merge(A, PLAN, histogram(BUSY_S, times=1000), 0.0)
-    compute.merge(B, PLAN, histogram(IDLE_S, times=20), 0.0)
+    compute.merge(ROBOT, A, PLAN, histogram(BUSY_S, times=1000), 0.0)
+    compute.merge(ROBOT, B, PLAN, histogram(IDLE_S, times=20), 0.0)
     times = compute.times(C, PLAN, 0.0).times
     assert times is not None
     assert times.sum_exceeds(None, 0.1) == pytest.approx(0.5, abs=0.05)

@@ -1,0 +1,43 @@
+"""Of a robot's report what is about pairs and services that it may use: nobody bears witness to anything else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from protos.model import Role
+
+if TYPE_CHECKING:
+    from controlplane.core.permits import Permits
+    from controlplane.core.registry import Registry
+    from protos.model import CallPermit, NodeName, Report, ServiceName
+
+
+def believable(report: Report, robot: NodeName, registry: Registry, permits: Permits) -> tuple[Report, int]:
+    """Return what is left of a report, and how many of its entries are not."""
+    group = permits.group(robot)
+    known: dict[NodeName, tuple[CallPermit | None, frozenset[ServiceName]]] = {}
+
+    def of(server: NodeName) -> tuple[CallPermit | None, frozenset[ServiceName]]:
+        found = known.get(server)
+        if found is None:
+            cloud = registry.get(server)
+            is_cloud = cloud is not None and cloud.role is Role.CLOUD
+            found = known[server] = (
+                (permits.of(group, cloud), cloud.offered) if cloud and is_cloud else (None, frozenset())
+            )
+        return found
+
+    def calls(server: NodeName, service: ServiceName) -> bool:
+        permit, offered = of(server)
+        return permit is not None and service in offered and service in permit
+
+    latencies = tuple(one for one in report.latencies if calls(one.server, one.service))
+    joints = tuple(
+        one for one in report.joints if calls(one.first.server, one.service) and calls(one.second.server, one.service)
+    )
+    paths = tuple(one for one in report.paths if of(one.server)[0])
+    left_out = (
+        len(report.latencies) - len(latencies) + len(report.joints) - len(joints) + len(report.paths) - len(paths)
+    )
+    return (replace(report, latencies=latencies, joints=joints, paths=paths) if left_out else report), left_out

@@ -1,0 +1,115 @@
+"""A robot that lies in its reports: what it may not call it bears no witness to, and what it may it moves a little."""
+
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core.control_events import Settings
+from controlplane.core.policy import CallRule, OfferRule, Policy
+from protos.histogram import MAX_COUNT, Histogram
+from protos.model import (
+    CandidateSet,
+    InterfaceName,
+    LatencyReport,
+    NodeName,
+    Report,
+    Role,
+    ServiceName,
+    ServiceSet,
+)
+from tests.sim.control_world import World
+from tests.unit.controlplane.samples import histogram, interfaces, latency, offer, registration, use
+
+pytestmark = pytest.mark.audit("sec-10")
+
+QUICK, SLOW = "cloud-a", "cloud-b"
+NEEDS_S = {QUICK: 0.020, SLOW: 0.300}
+"""The deadline is between the two."""
+VICTIMS = 3
+
+
+class Fleet:
+    """Robots whose calls take what they take, and one whose reports say what it likes."""
+
+    def __init__(self, *, permitted: bool) -> None:
+        liars = CallRule(("evil",), ("/plan" if permitted else "/other",), ("*",))
+        policy = Policy((CallRule(("victim*",), ("/plan",), ("*",)), liars), (OfferRule(("*",), ("*",)),))
+        self.world = World(Settings(warm_up_s=0.0, policy=policy))
+        for name in (QUICK, SLOW):
+            cloud = self.world.join(registration(name, Role.CLOUD))
+            self.world.say(cloud, CandidateSet(interfaces("eth0")))
+            self.world.say(cloud, ServiceSet((offer("/plan"), offer("/other"))))
+        self.victims = [self.world.robot(f"victim{number}", "wlan0") for number in range(VICTIMS)]
+        self.evil = self.world.join(registration("evil", Role.ROBOT))
+        self.world.say(self.evil, CandidateSet(interfaces("wlan0")))
+        self.world.say(self.evil, ServiceSet((), (use("/plan" if permitted else "/other"),)))
+
+    def call(self, seconds: int, rate: int = 10, lies: int = 0, every_s: int = 1) -> float:
+        """So many seconds of calls; returns the share that missed."""
+        missed = total = 0
+        for second in range(seconds):
+            if lies and second % every_s == 0:
+                self.lie(lies)
+            for victim in self.victims:
+                self.world.all_up(victim, (QUICK, SLOW), "wlan0")
+                server = victim.pairs().get("wlan0")
+                if server is None:
+                    continue
+                late = rate if server == SLOW else 0
+                missed, total = missed + late, total + rate
+                took = histogram(NEEDS_S[server], times=rate)
+                found = LatencyReport(
+                    InterfaceName("wlan0"),
+                    NodeName(server),
+                    ServiceName("/plan"),
+                    0,
+                    histogram(0.010, times=rate),
+                    Histogram(),
+                    took,
+                    requests=rate,
+                    missed=late,
+                )
+                self.world.say(victim, Report(latencies=(found,)))
+            self.world.run(1.0)
+        return missed / total
+
+    def lie(self, samples: int) -> None:
+        """The quick server needs ages, and the slow one nothing."""
+        ages, nothing = (Histogram.from_sparse([bucket], [samples], 0) for bucket in (341, 10))
+        about = ((QUICK, ages), (SLOW, nothing))
+        self.world.say(
+            self.evil,
+            Report(
+                latencies=tuple(
+                    latency("wlan0", server, Histogram(), processing=times, service="/plan") for server, times in about
+                )
+            ),
+        )
+
+
+@pytest.mark.parametrize("samples", [20, MAX_COUNT])
+def test_who_may_not_call_a_service_moves_nobodys_mapping(samples: int) -> None:
+    """Before: one report moved all of them, and every tenth second of it kept them away for half an hour."""
+    fleet = Fleet(permitted=False)
+    assert fleet.call(60) < 0.1
+    assert fleet.call(120, lies=samples) == 0.0
+    assert fleet.world.core.counters.report_entries_forbidden == 2 * 120
+    assert fleet.evil.name not in fleet.world.core.estimator._robots or not list(
+        fleet.world.core.estimator.paths(fleet.evil.name)
+    )
+
+
+@pytest.mark.parametrize("samples", [20, 1000, MAX_COUNT])
+@pytest.mark.parametrize("every_s", [1, 30])
+def test_who_may_call_it_costs_the_others_little(samples: int, every_s: int) -> None:
+    fleet = Fleet(permitted=True)
+    assert fleet.call(60) < 0.1
+    share = fleet.call(180, lies=samples, every_s=every_s)
+    assert share < 0.05
+
+
+def test_lies_from_the_beginning_are_outvoted() -> None:
+    fleet = Fleet(permitted=True)
+    share = fleet.call(240, lies=MAX_COUNT)
+    assert share < 0.2
+    assert fleet.call(60, lies=MAX_COUNT) < 0.05
