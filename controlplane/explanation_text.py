@@ -36,6 +36,7 @@ def render(explanation: Explanation) -> str:
     for title, section in (
         ("mapping in force", list(_mapping(found))),
         ("pairs (times in ms, * in force)", list(_pairs(found))),
+        ("who says what the servers need", list(columns(_witnesses(found)))),
         (
             "interfaces that carried copies of the same requests",
             list(columns([_joint(joint) for joint in found.joints])),
@@ -86,6 +87,20 @@ def _pair(pair: PairExplanation) -> tuple[str, ...]:
         *_quantiles(pair.network),
         *_quantiles(pair.compute),
     )
+
+
+def _witnesses(found: Explanation) -> list[tuple[str, ...]]:
+    """One line for each server; nothing where this robot alone calls it."""
+    of_servers = {pair.path.server: pair for pair in found.pairs if pair.witnesses}
+    return [
+        (
+            f"{server}:",
+            f"{pair.witnesses} robot{'s' * (pair.witnesses != 1)},",
+            f"{pair.busiest_witness} counts for {pair.busiest_share:.0%}",
+        )
+        for server, pair in of_servers.items()
+        if (pair.witnesses, pair.busiest_witness) != (1, found.robot)
+    ]
 
 
 def _labelled(name: str, label: str) -> str:

@@ -52,6 +52,12 @@ class PairExplanation:
     """Where the server stands; empty if nobody said."""
     barred: bool = False
     """The operator's path rules keep mappings from it."""
+    witnesses: int = 0
+    """Robots that said what the server needs."""
+    busiest_witness: NodeName | None = None
+    """Whose word counts for most; None without witnesses."""
+    busiest_share: float = 0.0
+    """For what share of all."""
 
 
 class Correlation(enum.Enum):

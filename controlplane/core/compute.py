@@ -162,6 +162,16 @@ class ComputeTimes:
         of_server = self._servers.get((server, service))
         return of_server.times.scaled(now, sample) if of_server is not None else Histogram()
 
+    def witnesses(self, server: NodeName, service: ServiceName) -> int:
+        """How many robots said what the server needs."""
+        of_server = self._servers.get((server, service))
+        return len(of_server.witnesses) if of_server is not None else 0
+
+    def busiest_witness(self, server: NodeName, service: ServiceName, now: float) -> tuple[NodeName, float] | None:
+        """The robot whose word counts for most, and for what share of all; None without any."""
+        of_server = self._servers.get((server, service))
+        return of_server.witnesses.largest_share(now) if of_server is not None else None
+
     def times(self, server: NodeName, service: ServiceName, now: float) -> ServerTimes:
         """What the server is thought to need: less of its own times, and more of the usual, the fewer these are."""
         of_server = self._servers.get((server, service))

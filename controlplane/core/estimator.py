@@ -86,6 +86,10 @@ class Evidence:
     rtt: Histogram
     network: Histogram
     compute: Histogram
+    witnesses: int
+    """Robots that said what the server needs."""
+    busiest: tuple[NodeName, float] | None
+    """Whose word counts for most, and for what share."""
 
 
 class _Service:
@@ -312,6 +316,8 @@ class Estimator:
             rtt=state.rtt.scaled(now, SAMPLE) if state is not None else Histogram(),
             network=network,
             compute=self._compute.requests(path.server, service, now, sample=SAMPLE),
+            witnesses=self._compute.witnesses(path.server, service),
+            busiest=self._compute.busiest_witness(path.server, service, now),
         )
 
     def common_misses(

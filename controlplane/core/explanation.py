@@ -144,6 +144,9 @@ def _pairs(
                 carrier=_carrier(block, path.interface),
                 region=_region(block, path.server),
                 barred=(path.interface, path.server) in notes.barred,
+                witnesses=evidence.witnesses,
+                busiest_witness=evidence.busiest[0] if evidence.busiest is not None else None,
+                busiest_share=evidence.busiest[1] if evidence.busiest is not None else 0.0,
             )
         )
     return tuple(found)

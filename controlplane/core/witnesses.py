@@ -1,7 +1,7 @@
 """Who bore witness to what a server needs, and for how much it counts: no robot outweighs all the others.
 
 What a server needs is known from all robots' reports, and one of them may be hacked, or merely odd. So a robot counts
-for as much as the busiest other one, and for a few hundred requests in any case; alone, for some thousands.
+for as much as the busiest other one, and for a few hundred requests in any case; alone, for a thousand.
 And that a server has changed, after which what was known of it is forgotten, takes the word of two where more than one
 bears witness.
 """
@@ -25,8 +25,8 @@ MAX_WITNESSES = 64
 COUNTS_ANYWAY = 300.0
 """For so many requests a robot counts however little the others call: misses of one in a hundred are known."""
 
-MOST_ALONE = 3000.0
-"""For so many a robot counts where no other one has reported lately: misses of one in a thousand are known."""
+MOST_ALONE = 1000.0
+"""For so many a robot counts where no other one has reported lately, lest those who come later wait long to be heard."""
 
 LATELY_S = 5.0
 """Who reported within this time bears witness now: robots report once a second or so."""

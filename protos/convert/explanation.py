@@ -174,6 +174,9 @@ def _pair_from_proto(message: admin_pb2.ExplainedPair) -> PairExplanation:
         carrier=text(message.carrier, "carrier"),
         region=text(message.region, "region"),
         barred=message.barred,
+        witnesses=message.witnesses,
+        busiest_witness=node_name(message.busiest_witness, "busiest_witness") if message.busiest_witness else None,
+        busiest_share=probability(message.busiest_share, "busiest_share"),
     )
 
 
@@ -191,6 +194,9 @@ def _pair_to_proto(pair: PairExplanation) -> admin_pb2.ExplainedPair:
         carrier=clean_text(pair.carrier),
         region=clean_text(pair.region),
         barred=pair.barred,
+        witnesses=pair.witnesses,
+        busiest_witness=pair.busiest_witness or "",
+        busiest_share=pair.busiest_share,
     )
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from controlplane.core.control_events import Settings
 from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.explanation_text import render
 from protos.histogram import MAX_COUNT, Histogram
 from protos.model import (
     CandidateSet,
@@ -113,3 +114,24 @@ def test_lies_from_the_beginning_are_outvoted() -> None:
     share = fleet.call(240, lies=MAX_COUNT)
     assert share < 0.2
     assert fleet.call(60, lies=MAX_COUNT) < 0.05
+
+
+def test_explain_tells_who_counts_for_how_much() -> None:
+    fleet = Fleet(permitted=True)
+    fleet.call(60, lies=MAX_COUNT)
+    found = fleet.world.core.explain(fleet.victims[0].name, ServiceName("/plan"), fleet.world.now)
+    of_quick = next(pair for pair in found.pairs if pair.path.server == QUICK)
+    assert of_quick.witnesses == VICTIMS + 1
+    assert of_quick.busiest_share < 0.5
+    assert f"cloud-a:  4 robots,  {of_quick.busiest_witness} counts for {of_quick.busiest_share:.0%}" in render(found)
+    assert "cloud-b:  1 robot,   evil counts for 100%" in render(found)
+
+
+def test_explain_does_not_tell_a_robot_that_it_is_its_own_witness() -> None:
+    world = World()
+    world.cloud("a")
+    robot = world.robot()
+    world.all_up(robot, ("a",))
+    world.say(robot, Report(latencies=(latency("wlan0", "a", histogram(0.01), processing=histogram(0.01)),)))
+    world.run(3.0)
+    assert "who says" not in render(world.core.explain(robot.name, ServiceName("/plan"), world.now))

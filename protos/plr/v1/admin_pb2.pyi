@@ -300,6 +300,9 @@ class ExplainedPair(_message.Message):
     CARRIER_FIELD_NUMBER: _builtins.int
     REGION_FIELD_NUMBER: _builtins.int
     BARRED_FIELD_NUMBER: _builtins.int
+    WITNESSES_FIELD_NUMBER: _builtins.int
+    BUSIEST_WITNESS_FIELD_NUMBER: _builtins.int
+    BUSIEST_SHARE_FIELD_NUMBER: _builtins.int
     chosen: _builtins.bool
     state: Global___PathState.ValueType
     requests: _builtins.float
@@ -310,6 +313,10 @@ class ExplainedPair(_message.Message):
     region: _builtins.str
     barred: _builtins.bool
     """The operator's path rules keep mappings from it."""
+    witnesses: _builtins.int
+    """How many robots said what the server needs, which of them counts for most, and for what share of all."""
+    busiest_witness: _builtins.str
+    busiest_share: _builtins.float
     @_builtins.property
     def path(self) -> _control_pb2.Assignment: ...
     @_builtins.property
@@ -341,10 +348,13 @@ class ExplainedPair(_message.Message):
         carrier: _builtins.str = ...,
         region: _builtins.str = ...,
         barred: _builtins.bool = ...,
+        witnesses: _builtins.int = ...,
+        busiest_witness: _builtins.str = ...,
+        busiest_share: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["compute", b"compute", "miss", b"miss", "network", b"network", "path", b"path", "rtt", b"rtt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["barred", b"barred", "carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "miss", b"miss", "network", b"network", "path", b"path", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["barred", b"barred", "busiest_share", b"busiest_share", "busiest_witness", b"busiest_witness", "carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "miss", b"miss", "network", b"network", "path", b"path", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state", "witnesses", b"witnesses"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -73,13 +73,15 @@ def test_a_change_that_two_robots_see_is_believed_and_that_of_the_only_one_as_we
     assert compute.merge(HONEST[0], A, PLAN, histogram(0.02, times=10), 61.0), "nobody else has reported lately"
 
 
-def test_a_robot_alone_counts_for_some_thousands_and_is_cut_down_when_others_come() -> None:
+def test_a_robot_alone_counts_for_a_thousand_and_is_cut_down_when_others_come() -> None:
     witnesses = Witnesses(HALF_LIFE_S)
     assert witnesses.weigh(EVIL, LIE, 0.0).total == MOST_ALONE
     assert witnesses.weigh(EVIL, LIE, 0.0).total == 0
     assert witnesses.weigh(HONEST[0], histogram(0.02, times=500), 1.0).total == 500
     assert witnesses.weigh(EVIL, LIE, 1.0).total == 0
-    assert witnesses.largest_share(1.0) == (EVIL, pytest.approx(0.85, abs=0.02))
+    name, share = witnesses.largest_share(1.0) or (None, 0.0)
+    assert name == EVIL
+    assert share == pytest.approx(0.66, abs=0.02)
     assert witnesses.weigh(EVIL, LIE, 300.0).total <= COUNTS_ANYWAY
 
 
