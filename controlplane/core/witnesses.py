@@ -26,7 +26,7 @@ COUNTS_ANYWAY = 300.0
 """For so many requests a robot counts however little the others call: misses of one in a hundred are known."""
 
 MOST_ALONE = 1000.0
-"""For so many a robot counts where no other one has reported lately, lest those who come later wait long to be heard."""
+"""For so many a robot counts where no other one has reported lately: those who come later need not wait for long."""
 
 LATELY_S = 5.0
 """Who reported within this time bears witness now: robots report once a second or so."""
