@@ -160,6 +160,8 @@ class ControlCore:
         if sidecar is None or sidecar.role is not Role.ROBOT:
             self.counters.reports_ignored += 1
             return
+        # Before the rest: after a restart a robot reports on servers that are not back yet.
+        reaches_again = self._publisher.waits_for(name, (path.server for path in report.paths))
         report, left_out = believable(report, name, self.registry, self.permits)
         self.counters.reports += 1
         self.counters.report_entries_forbidden += left_out
@@ -169,7 +171,7 @@ class ControlCore:
         if change is not Change.REPORT:
             self._drawing.robot_changed(name)
         self._debounce.note(change, now)
-        if self._publisher.waits_for(name, (path.server for path in report.paths)):
+        if reaches_again:
             self._publish_soon(now)
 
     def _receive_ack(self, name: NodeName, ack: Ack) -> None:

@@ -108,7 +108,8 @@ class Peers:
         sessions = {peer.session for peer in known.values()}
         if len(sessions) != len(known):
             return "two peers share a session"
-        self._dropped["bad_credential"] += len(refused)
+        if refused:
+            self._dropped["bad_credential"] += len(refused)
         self.refused = refused
         unlisted = set()
         new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)

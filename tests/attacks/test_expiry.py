@@ -36,10 +36,9 @@ def test_a_certificate_that_ends_takes_its_living_session_with_it(world: World) 
     out = system.folder / "expiry.json"
     argv = ["-m", "bench.echo", "call", "--rate", "5", "--duration", str(CALLS_S), "--json", str(out)]
     with world.calls():
-        began_at = time.time()
         system.start_node("expiry.client", "robot_2", argv).process.wait(CALLS_S + 60)
         del system.parts["expiry.client"]
-    requests = [(began_at + one["sent_s"], one["latency_ms"]) for one in read_json(out)["requests"]]
+    requests = [(one["sent_wall_s"], one["latency_ms"]) for one in read_json(out)["requests"]]
     before = [latency for sent_at, latency in requests if sent_at < ends_at - 1]
     after = [latency for sent_at, latency in requests if sent_at > ends_at + LATE_S]
     assert before
@@ -47,5 +46,6 @@ def test_a_certificate_that_ends_takes_its_living_session_with_it(world: World) 
     assert len(after) > 10
     assert set(after) == {None}
     for part in ("cloud_a.sidecar", "cloud_b.sidecar"):
-        assert f"{ROBOT_2} is not talked to" in system.parts[part].log.read_text()
+        # By its own look at the clock, or told by the control plane: whoever is first.
+        assert f"to {ROBOT_2} is down" in system.parts[part].log.read_text()
     assert world.counter("controlplane", "plr_departures_total", reason="expired") >= 1
