@@ -21,6 +21,8 @@ from typing import Any
 
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
+from sidecar.ros.cdr_layouts import layout_of
+from sidecar.ros.cdr_walk import CdrError, check
 from sidecar.ros.errors import RosBridgeError
 
 _OK = 0
@@ -30,6 +32,8 @@ _ERROR_TEXT_BYTES = 1024
 """RCUTILS_ERROR_MESSAGE_MAX_LENGTH"""
 _KEEP_LAST = _RELIABLE = _TRANSIENT_LOCAL = 1
 """Of rmw_qos_history_policy_e, rmw_qos_reliability_policy_e and rmw_qos_durability_policy_e."""
+MAX_UNKNOWN_BYTES = 1 << 20
+"""Of a message whose layout is not known: a type support may take a hundred times as much to read it."""
 LARGE_MESSAGE_BYTES = 65_536
 """From here on a copy takes longer than handing the interpreter lock to another thread and back (tens of µs)."""
 
@@ -191,10 +195,20 @@ class Message:
 class MessageType:
     """A generated message class whose type support is loaded, to and from bytes (CDR with its 4-byte header)."""
 
-    __slots__ = ("_buffer", "_clean_capacity", "_create", "_destroy", "_last_length", "name", "type_support")
+    __slots__ = (
+        "_buffer",
+        "_clean_capacity",
+        "_create",
+        "_destroy",
+        "_last_length",
+        "_layout",
+        "name",
+        "type_support",
+    )
 
     def __init__(self, message_class: Any) -> None:
         self.name: str = message_class.__name__
+        self._layout = layout_of(message_class)
         meta = type(message_class)
         if meta._TYPE_SUPPORT is None:
             meta.__import_type_support__()
@@ -248,9 +262,10 @@ class MessageType:
     def deserialize(self, payload: bytes | memoryview) -> Message:
         """Return the message in `payload`, or raise RosBridgeError.
 
-        The type support checks lengths against the bytes that are there, so hostile bytes neither crash nor make it
-        allocate more than a small multiple of their size (tests/ros/hostile_bytes.py).
+        Hostile bytes neither crash the type support nor make it allocate more than a small multiple of their size: what
+        it would make of them is known before (tests/ros/hostile_bytes.py).
         """
+        self._check(payload)
         message = self.new()
         payload = bytes(payload)
         self._last_length = len(payload)
@@ -258,6 +273,17 @@ class MessageType:
         if self.functions().deserialize(view, self.type_support, message.pointer) != _OK:
             raise RosBridgeError(f"the bytes are not a {self.name}: {_take_error()}")
         return message
+
+    def _check(self, payload: bytes | memoryview) -> None:
+        if self._layout is None:
+            if len(payload) > MAX_UNKNOWN_BYTES:
+                many = f"{len(payload)} bytes are more than the {MAX_UNKNOWN_BYTES} that may be"
+                raise RosBridgeError(f"{many} of a {self.name}: it has fields of a kind that cannot be checked before")
+            return
+        try:
+            check(self._layout, payload)
+        except CdrError as error:
+            raise RosBridgeError(f"the bytes are not a {self.name} that is let in: {error}") from error
 
 
 def take_request(service: int, request_type: MessageType) -> tuple[RmwRequestId, bytes] | None:

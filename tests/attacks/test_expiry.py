@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(240)]
 
-LIFE_S = 25.0
-CALLS_S = 45
+LIFE_S = 35.0
+CALLS_S = 55
+SETTLED_S = 5.0
+"""ROS drops answers to a client that it has only just found."""
 LATE_S = 5.0
 """After the end, for a look at the clock and for what was on its way: generous for a busy machine."""
 ROBOT_2 = "robot-2"
@@ -39,7 +41,8 @@ def test_a_certificate_that_ends_takes_its_living_session_with_it(world: World) 
         system.start_node("expiry.client", "robot_2", argv).process.wait(CALLS_S + 60)
         del system.parts["expiry.client"]
     requests = [(one["sent_wall_s"], one["latency_ms"]) for one in read_json(out)["requests"]]
-    before = [latency for sent_at, latency in requests if sent_at < ends_at - 1]
+    settled_at = requests[0][0] + SETTLED_S
+    before = [latency for sent_at, latency in requests if settled_at < sent_at < ends_at - LATE_S]
     after = [latency for sent_at, latency in requests if sent_at > ends_at + LATE_S]
     assert before
     assert None not in before
@@ -48,4 +51,4 @@ def test_a_certificate_that_ends_takes_its_living_session_with_it(world: World) 
     for part in ("cloud_a.sidecar", "cloud_b.sidecar"):
         # By its own look at the clock, or told by the control plane: whoever is first.
         assert f"to {ROBOT_2} is down" in system.parts[part].log.read_text()
-    assert world.counter("controlplane", "plr_departures_total", reason="expired") >= 1
+    assert world.counter("control", "plr_departures_total", reason="expired") >= 1

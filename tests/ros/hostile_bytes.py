@@ -1,14 +1,17 @@
-"""Deserialises truncated, mutated and random bytes; prints how many were accepted and refused.
+"""Deserialises truncated, mutated, random and huge bytes; prints how many were accepted and refused, and the slowest.
 
-Run as `python -m tests.ros.hostile_bytes SEED COUNT`. The invariant: `deserialize` returns or raises RosBridgeError,
-within an address space that leaves no room for what the lengths in the bytes promise.
+Run as `python -m tests.ros.hostile_bytes SEED COUNT HUGE`. The invariant: `deserialize` returns or raises
+RosBridgeError, within an address space that leaves no room for what the lengths in the bytes promise.
 """
 
 from __future__ import annotations
 
 import random
 import resource
+import struct
 import sys
+import time
+from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -23,8 +26,10 @@ from std_srvs.srv import Empty, SetBool, Trigger
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.rcl import MessageType
 
-ADDRESS_SPACE_BYTES = 3 << 30
-"""Generous for rclpy's libraries, and less than one array of 2**32 - 1 poses."""
+HUGE_BYTES = 16 << 20
+"""The longest request (docs/limits.md)."""
+MORE_ADDRESS_SPACE_BYTES = 8 * HUGE_BYTES
+"""Beyond what rclpy's libraries take: two copies of the bytes, three times them as a message, the allocator's rest."""
 INTERESTING = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x00\x00\x00\x10", b"\x00\x00\x10\x00")
 
 
@@ -64,23 +69,42 @@ def damage(payload: bytes, rng: random.Random) -> bytes:
     return bytes(mutated)
 
 
+def huge(payload: bytes, rng: random.Random) -> bytes:
+    """The longest bytes: a message's beginning, one length of which announces as many elements as could be there."""
+    head = bytearray(payload)
+    position = rng.randrange(1, len(head) // 4 + 1) * 4
+    announced = HUGE_BYTES // rng.choice((1, 2, 4, 8, 16, 24, 32, 56, 72)) - rng.choice((0, 64))
+    head[position : position + 4] = struct.pack("<I", announced)
+    return bytes(head) + bytes(HUGE_BYTES - len(head))
+
+
+def address_space() -> int:
+    """Bytes that this process takes."""
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
 def main() -> None:
-    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE_BYTES, ADDRESS_SPACE_BYTES))
-    seed, count = map(int, sys.argv[1:])
+    seed, count, huge_count = map(int, sys.argv[1:])
     rng = random.Random(seed)
     originals = []
     for message in samples():
         check_for_type_support(type(message))
         originals.append((MessageType(type(message)), serialize_message(message)))
-    accepted = 0
-    for _ in range(count):
+    limit = address_space() + MORE_ADDRESS_SPACE_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    accepted, slowest_s = 0, 0.0
+    for number in range(count + huge_count):
         kind, payload = rng.choice(originals)
+        hostile = damage(payload, rng) if number < count else huge(payload, rng)
+        began = time.thread_time()
         try:
-            kind.deserialize(damage(payload, rng))
+            kind.deserialize(hostile)
+            accepted += 1
         except RosBridgeError:
-            continue
-        accepted += 1
-    sys.stdout.write(f"{accepted} {count - accepted}\n")
+            pass
+        finally:
+            slowest_s = max(slowest_s, time.thread_time() - began)
+    sys.stdout.write(f"{accepted} {count + huge_count - accepted} {slowest_s:.3f}\n")
 
 
 if __name__ == "__main__":

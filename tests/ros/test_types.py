@@ -81,11 +81,12 @@ def test_messages_are_freed() -> None:
     assert resident_bytes() - before < 10_000_000
 
 
+@pytest.mark.audit("sec-3")
 @pytest.mark.parametrize("seed", range(3))
 def test_hostile_bytes(seed: int) -> None:
     """In a process of its own, with little memory: a crash or a huge allocation would take the sidecar with it."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.ros.hostile_bytes", str(seed), "4000"],
+        [sys.executable, "-m", "tests.ros.hostile_bytes", str(seed), "4000", "200"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -93,7 +94,8 @@ def test_hostile_bytes(seed: int) -> None:
         check=False,
     )
     assert done.returncode == 0, (done.returncode, done.stdout, done.stderr[-2000:])
-    accepted, refused = map(int, done.stdout.split())
-    assert accepted + refused == 4000
+    accepted, refused, slowest_s = map(float, done.stdout.split())
+    assert accepted + refused == 4200
+    assert slowest_s < 5, "generous for a busy machine: without the walk 14 s and more"
     assert accepted > 100
     assert refused > 1000

@@ -1,0 +1,343 @@
+"""Walks over a message in CDR before a type support may read it: are its lengths true, and what memory will it take?
+
+A type support makes room for all elements that a length announces before it reads the first one. A length needs four
+bytes, and an element of 200 bytes at least one on the wire: so 16 MiB of bytes from a peer become 4 GB and 14 s on the
+only ROS thread. Here each length is held against the bytes that are there, by the least and the true size of what it
+counts, and the memory that the C message takes is added up. Nothing is allocated but a view.
+
+The layout is plain CDR (XCDR1, DDS-XTypes 1.3 section 7.4.3) as the rmw implementations of ROS 2 write it: primitives
+are aligned to their size, counted from behind the encapsulation header of 4 bytes; strings and sequences begin with a
+length of 32 bits, a string's counts its NUL.
+
+An honest large message is one long array, or thousands of elements that look alike: runs of elements with the same
+lengths at the same places are skipped at once. What is left is walked step by step, and `MAX_STEPS` of them must do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+ENCAPSULATION_BYTES = 4
+ALIGNMENT = 8
+"""The largest: sizes of what is fixed depend on where it begins, by this."""
+MAX_STEPS = 20_000
+"""Lengths looked at one by one, some 20 ms."""
+MAX_ALLOCATIONS = 250_000
+"""Strings and sequences of one message, some 30 ms of the type support's time."""
+MEMORY_FACTOR = 3
+"""A C message takes at most so many times its bytes ..."""
+FREE_MEMORY_BYTES = 16 << 20
+"""... or this, whichever is more: small messages may be of many short strings."""
+MALLOC_BYTES = 16
+"""What an allocation takes beside its content, at least, and what it is rounded up to."""
+_FEW, _FIRST_CHUNK = 64, 16
+_TRY_AGAIN_AFTER = 64
+"""Elements walked one by one after some that look alike were not followed by more."""
+
+_BIG_ENDIAN, _LITTLE_ENDIAN = b"\0\0", b"\0\1"
+
+
+class CdrError(ValueError):
+    """The bytes are not a message of the type, or one that takes too much memory or time; the text says what."""
+
+
+class Walk:
+    """One walk over one message."""
+
+    __slots__ = ("allocations", "bytes", "data", "end", "lengths", "memory", "memory_left", "order", "steps_left")
+
+    def __init__(self, data: memoryview, order: str, memory_bytes: int) -> None:
+        self.data = data
+        self.bytes = np.frombuffer(data, np.uint8)
+        self.end = len(data)
+        self.order = "little" if order == "<" else "big"
+        self.memory = 0
+        """Bytes that the C message takes beside its own structure."""
+        self.memory_left = memory_bytes
+        self.allocations = 0
+        self.steps_left = MAX_STEPS
+        self.lengths: list[int] | None = None
+        """Where the lengths stood, while elements are compared."""
+
+    def length(self, position: int) -> tuple[int, int]:
+        """Return the length at an aligned position, and where what it counts begins."""
+        position = -(-position // 4) * 4
+        begin = position + 4
+        if begin > self.end:
+            raise CdrError("cut off")
+        self.steps_left -= 1
+        if self.steps_left < 0:
+            raise CdrError(f"more than {MAX_STEPS} strings and sequences of different lengths")
+        found = int.from_bytes(self.data[position:begin], self.order)  # type: ignore[arg-type]  # one of the two
+        if self.lengths is not None:
+            self.lengths.append(position)
+        return found, begin
+
+    def note_lengths(self) -> None:
+        """Note from here on where lengths stand."""
+        self.lengths = []
+
+    def noted_lengths(self) -> list[int] | None:
+        """Return where they stood since `note_lengths`, None if another noted them in between."""
+        lengths, self.lengths = self.lengths, None
+        return lengths
+
+    def take(self, size: int) -> None:
+        """An allocation of so many bytes."""
+        self.taken(1, MALLOC_BYTES + -(-size // MALLOC_BYTES) * MALLOC_BYTES)
+
+    def taken(self, allocations: int, memory: int) -> None:
+        """So many allocations, of so much memory together."""
+        self.allocations += allocations
+        if self.allocations > MAX_ALLOCATIONS:
+            raise CdrError(f"more than {MAX_ALLOCATIONS} strings and sequences")
+        self.memory += memory
+        if self.memory > self.memory_left:
+            raise CdrError(f"takes more than {self.memory_left} bytes of memory")
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """What always takes the same bytes from the same alignment on."""
+
+    sizes: tuple[int, ...]
+    """On the wire, the padding before it included, by where it begins modulo ALIGNMENT."""
+    struct_bytes: int
+    struct_alignment: int
+
+    least: int = 0
+
+    def walk(self, walk: Walk, position: int) -> int:
+        """Return where it ends; raises CdrError."""
+        position += self.sizes[position % ALIGNMENT]
+        if position > walk.end:
+            raise CdrError("cut off")
+        return position
+
+    def walk_many(self, walk: Walk, position: int, count: int) -> int:
+        """The same for `count` in a row."""
+        sizes, begin = self.sizes, position
+        # Where they begin modulo ALIGNMENT repeats after ALIGNMENT of them at the latest.
+        for _ in range(min(count, ALIGNMENT)):
+            position += sizes[position % ALIGNMENT]
+        if count > ALIGNMENT:
+            cycle = position
+            for _ in range(ALIGNMENT):
+                cycle += sizes[cycle % ALIGNMENT]
+            more = count - ALIGNMENT
+            position += more // ALIGNMENT * (cycle - position)
+            for _ in range(more % ALIGNMENT):
+                position += sizes[position % ALIGNMENT]
+        if position > walk.end:
+            raise CdrError(f"{count} elements announced, {walk.end - begin} bytes left")
+        return position
+
+
+def primitive(size: int) -> Fixed:
+    """Return the layout of a number of so many bytes."""
+    alignment = min(size, ALIGNMENT)
+    return Fixed(tuple(-position % alignment + size for position in range(ALIGNMENT)), size, alignment, size)
+
+
+@dataclass(frozen=True, slots=True)
+class String:
+    """Characters of one byte, with their NUL."""
+
+    bound: int | None = None
+    struct_bytes: int = 24
+    struct_alignment: int = 8
+    least: int = 4
+
+    def walk(self, walk: Walk, position: int) -> int:
+        """Return where it ends; raises CdrError."""
+        size, begin = walk.length(position)
+        if size > walk.end - begin:
+            raise CdrError(f"a string of {size} bytes, {walk.end - begin} left")
+        if self.bound is not None and size > self.bound + 1:
+            raise CdrError(f"a string of {size} bytes, at most {self.bound} may be")
+        walk.take(size + 1)
+        return begin + size
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """Fields, one after the other."""
+
+    fields: tuple[Layout, ...]
+    struct_bytes: int
+    struct_alignment: int
+    least: int
+
+    def walk(self, walk: Walk, position: int) -> int:
+        """Return where it ends; raises CdrError."""
+        for field in self.fields:
+            position = field.walk(walk, position)
+        return position
+
+
+@dataclass(frozen=True, slots=True)
+class Array:
+    """Always so many elements of one kind, none of which is fixed."""
+
+    element: Layout
+    count: int
+    struct_bytes: int
+    struct_alignment: int
+    least: int
+
+    def walk(self, walk: Walk, position: int) -> int:
+        """Return where it ends; raises CdrError."""
+        return _walk_elements(self.element, walk, position, self.count)
+
+
+@dataclass(frozen=True, slots=True)
+class Elements:
+    """A sequence: as many elements as its length says."""
+
+    element: Layout
+    bound: int | None = None
+    struct_bytes: int = 24
+    struct_alignment: int = 8
+    least: int = 4
+
+    def walk(self, walk: Walk, position: int) -> int:
+        """Return where it ends; raises CdrError."""
+        count, begin = walk.length(position)
+        if count * self.element.least > walk.end - begin:
+            raise CdrError(f"{count} elements announced, {walk.end - begin} bytes left")
+        if self.bound is not None and count > self.bound:
+            raise CdrError(f"{count} elements, at most {self.bound} may be")
+        if not count:
+            return begin
+        walk.take(count * self.element.struct_bytes)
+        if isinstance(self.element, Fixed):
+            return self.element.walk_many(walk, begin, count)
+        return _walk_elements(self.element, walk, begin, count)
+
+
+Layout = Fixed | String | Structure | Array | Elements
+
+
+def fixed_structure(fields: Sequence[Layout]) -> Fixed | None:
+    """Return the fields as one, if all of them are fixed."""
+    sizes = []
+    for begin in range(ALIGNMENT):
+        position = begin
+        for field in fields:
+            if not isinstance(field, Fixed):
+                return None
+            position += field.sizes[position % ALIGNMENT]
+        sizes.append(position - begin)
+    struct_bytes, alignment = _struct(fields)
+    return Fixed(tuple(sizes), struct_bytes, alignment, min(sizes))
+
+
+def structure(fields: Sequence[Layout]) -> Layout:
+    """Return the layout of a message with these fields; one without any has a byte all the same."""
+    fields = fields or (primitive(1),)
+    fixed = fixed_structure(fields)
+    if fixed is not None:
+        return fixed
+    struct_bytes, alignment = _struct(fields)
+    return Structure(tuple(fields), struct_bytes, alignment, sum(field.least for field in fields))
+
+
+def array(element: Layout, count: int) -> Layout:
+    """Return the layout of always `count` elements."""
+    struct_bytes = count * element.struct_bytes
+    if not isinstance(element, Fixed):
+        return Array(element, count, struct_bytes, element.struct_alignment, count * element.least)
+    sizes = []
+    for begin in range(ALIGNMENT):
+        position = begin
+        for _ in range(count):
+            position += element.sizes[position % ALIGNMENT]
+        sizes.append(position - begin)
+    return Fixed(tuple(sizes), struct_bytes, element.struct_alignment, min(sizes))
+
+
+def _struct(fields: Sequence[Layout]) -> tuple[int, int]:
+    """How many bytes the C structure takes, and its alignment."""
+    size, alignment = 0, 1
+    for field in fields:
+        size = -(-size // field.struct_alignment) * field.struct_alignment + field.struct_bytes
+        alignment = max(alignment, field.struct_alignment)
+    return -(-size // alignment) * alignment, alignment
+
+
+def _walk_elements(element: Layout, walk: Walk, position: int, count: int) -> int:
+    """Return where `count` elements end that are not fixed; those that look alike are skipped together."""
+    left, patience = count, 0
+    while left:
+        if patience or left < 2 * ALIGNMENT or (walk.lengths is not None and left <= _FEW):
+            # Few within others that are compared are compared with these.
+            position = element.walk(walk, position)
+            left -= 1
+            patience = max(0, patience - 1)
+            continue
+        began, allocations, memory = position, walk.allocations, walk.memory
+        walk.note_lengths()
+        # After so many the next begins as the first did, whatever the size of one.
+        for _ in range(ALIGNMENT):
+            position = element.walk(walk, position)
+        # None: among them were many to be compared themselves.
+        lengths = walk.noted_lengths()
+        left -= ALIGNMENT
+        size = position - began
+        alike = _alike(walk, began, size, lengths, left // ALIGNMENT) if lengths is not None else 0
+        walk.taken(alike * (walk.allocations - allocations), alike * (walk.memory - memory))
+        position += alike * size
+        left -= alike * ALIGNMENT
+        patience = 0 if alike else _TRY_AGAIN_AFTER
+    return position
+
+
+def _alike(walk: Walk, began: int, size: int, lengths: list[int], most: int) -> int:
+    """How many blocks after the one at `began` have the same lengths at the same places."""
+    most = min(most, (walk.end - began) // size - 1)
+    first = walk.bytes[began : began + size]
+    alike, chunk = 0, _FIRST_CHUNK
+    # What is compared in vain is no more than what was found before: hostile bytes must not make this slow.
+    while alike < most:
+        chunk = min(chunk, most - alike)
+        start = began + size * (alike + 1)
+        blocks = walk.bytes[start : start + chunk * size].reshape(chunk, size)
+        same = chunk
+        for position in lengths:
+            at = position - began
+            other = (blocks[:same, at : at + 4] != first[at : at + 4]).any(axis=1)
+            found = int(other.argmax())
+            if other[found]:
+                same = found
+            if not same:
+                break
+        alike += same
+        if same < chunk:
+            break
+        chunk *= 2
+    return alike
+
+
+def check(layout: Layout, payload: bytes | memoryview) -> int:
+    """Return how much memory the C message in `payload` will take, in bytes.
+
+    Raises:
+        CdrError: the bytes are no such message, or one that takes too much memory or too long to check.
+    """
+    if len(payload) < ENCAPSULATION_BYTES:
+        raise CdrError("shorter than its header")
+    kind = bytes(payload[:2])
+    if kind not in (_BIG_ENDIAN, _LITTLE_ENDIAN):
+        raise CdrError(f"encapsulation {kind.hex()}, not plain CDR")
+    order = "<" if kind == _LITTLE_ENDIAN else ">"
+    limit = max(MEMORY_FACTOR * len(payload), FREE_MEMORY_BYTES)
+    walk = Walk(memoryview(payload)[ENCAPSULATION_BYTES:], order, limit)
+    walk.taken(0, layout.struct_bytes)
+    layout.walk(walk, 0)
+    return walk.memory
