@@ -23,6 +23,10 @@ class TokenBucket:
         self._tokens -= cost
         return True
 
+    def fill(self, now: float) -> None:
+        """All of them are back."""
+        self._tokens, self._at = self._burst, max(self._at, now)
+
     def is_full(self, now: float) -> bool:
         """Whether it is as good as a new one."""
         return self._tokens + self._rate * max(0.0, now - self._at) >= self._burst

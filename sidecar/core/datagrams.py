@@ -19,13 +19,13 @@ from sidecar.core.frame import (
     REPAIR_TYPE,
     Header,
 )
-from sidecar.core.introduction import encode_introduction
+from sidecar.core.introduction import INTRODUCTION_BYTES, encode_introduction
+from sidecar.core.path_address import LEAST_CREDIT_BYTES
 from sidecar.core.path_id import PathState
+from sidecar.core.path_table import MAX_PENDING_FRAMES
 from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
-    import random
-
     from protos.credential import SessionCredential
     from protos.model import Address, InterfaceId, InterfaceName, NodeName, Role, SessionId
     from sidecar.core.outbound import OutboundMessage
@@ -124,20 +124,22 @@ class Burst:
 class DatagramBuilder:
     """Turns the state of a link's paths into datagrams, and notes in it what left."""
 
-    __slots__ = ("_rng", "_stats", "identity")
+    __slots__ = ("_stats", "identity")
 
-    def __init__(self, identity: LinkIdentity, stats: LinkStats, rng: random.Random) -> None:
+    def __init__(self, identity: LinkIdentity, stats: LinkStats) -> None:
         self.identity = identity
         self._stats = stats
-        self._rng = rng
 
     def build(self, path: Path, burst: Burst, now: float, *, probing: bool) -> bool:
         """Add what the path may send now; False when the burst got full first. `probing` allows probes."""
         if path.introductions:
             self._answer_introductions(path, burst, now)
+        if path.state is PathState.DOWN and path.control_at <= now:
+            # What is owed goes before what we ask: both count against what may go to an address that is not proven.
+            self._add_control(path, path.take_control(now), burst, now)
         if probing and path.probe_at <= now:
             self._add_probe(path, burst, now)
-        if probing and path.mtu.timer is not None and path.mtu.timer <= now:
+        if probing and path.mtu_probe_at is not None and path.mtu_probe_at <= now:
             self._add_mtu_probe(path, burst, now)
         complete = self._add_fragments(path, burst, now)
         if path.control_at <= now:
@@ -156,8 +158,19 @@ class DatagramBuilder:
             if burst.full:
                 complete = False
                 break
+            if path.address.allowance is not None and path.control_at < NEVER:
+                self._add_control(path, path.take_control(now), burst, now)
+            allowance = path.address.allowance
+            if allowance is not None:
+                budget = min(budget, allowance)
             run = queue.take(now, budget, control.pacing_rate or 0.0, recovery.rtt.smoothed)
             if run is None:
+                control.ran_dry()
+                break
+            if allowance is not None and run.symbols * run.message.datagram_bytes > allowance:
+                # Until the peer has proven to be there, or sent more from there.
+                queue.resend(run.message, range(run.first, run.first + run.symbols))
+                path.address.block()
                 control.ran_dry()
                 break
             sent = self._add_run(path, path.remote, run, burst, now)
@@ -216,7 +229,7 @@ class DatagramBuilder:
         last = end - segment * (count - 1)
         path.recovery.on_run_sent(first_number, count, now, segment, last, message, indices.start)
         burst.add(remote, buffer, segment if count > 1 else last, count)
-        self._sent(path, end)
+        self._sent(path, remote, end)
         return end
 
     def _add_with_control(
@@ -236,18 +249,26 @@ class DatagramBuilder:
         path.recovery.on_run_sent(number, 1, now, size, size, message, index, _finished(control))
         self._stats.datagrams["sent", "data" if index < message.count else "repair"] += 1
         burst.add(remote, datagram, size)
-        self._sent(path, size)
+        self._sent(path, remote, size)
         return size
 
-    def _sent(self, path: Path, size: int) -> None:
+    def _sent(self, path: Path, address: Address, size: int) -> None:
         path.bytes_sent += size
+        path.address.went(address, size)
         self._stats.bytes["sent"] += size
 
     def _add_control(self, path: Path, control: list[bytes], burst: Burst, now: float) -> None:
         if path.remote is None:
             return
         while control:
-            taken = _fill(control)
+            allowance = path.address.allowance
+            taken = _fill(control, None if allowance is None else allowance - HEADER_BYTES - TAG_BYTES)
+            if not taken:
+                path.address.block()
+                if len(control) > MAX_PENDING_FRAMES:
+                    self._stats.dropped["pending_frames_full"] += len(control) - MAX_PENDING_FRAMES
+                path.pending, path.pending_by = control[:MAX_PENDING_FRAMES], now
+                return
             finished = _finished(taken)
             number = path.recovery.take_numbers()
             datagram = self._sealed(path, number, now, *taken)
@@ -259,21 +280,21 @@ class DatagramBuilder:
             self._add_alone(path, path.remote, datagram, burst)
 
     def _add_probe(self, path: Path, burst: Burst, now: float) -> None:
-        probe_id = path.next_probe(now, self._rng)
-        probe = frame.encode_probe(frame.Probe(probe_id))
-        destinations = path.destinations()
         remote = path.remote
-        if remote is not None and destinations == (remote,) and path.state is not PathState.DOWN:
-            self._add_control(path, [*path.take_control(now), probe], burst, now)
-            if path.renewed_at is not None:
-                # Its probe is another one: the answer tells which of the two arrived.
-                self._add_introduction(path, remote, path.probing.ask(now, sealed=False), burst)
-            return
-        for address in destinations:
-            if path.state is PathState.DOWN:
-                self._add_introduction(path, address, probe_id, burst)
-            else:
+        # Each destination has a probe of its own: the answer tells which of them the peer is at.
+        if remote is not None and path.goes_to_one:
+            probe = frame.encode_probe(frame.Probe(path.ask(now, remote)))
+            self._add_control(path, [probe, *path.take_control(now)], burst, now)
+            if path.renewed_at is not None and path.address.is_proven:
+                self._add_introduction(path, remote, path.probing.ask(now, remote, sealed=False), burst)
+        elif path.state is PathState.DOWN:
+            for address in path.destinations(now, INTRODUCTION_BYTES + len(self.identity.credential)):
+                self._add_introduction(path, address, path.ask(now, address), burst)
+        else:
+            for address in path.destinations(now, LEAST_CREDIT_BYTES):
+                probe = frame.encode_probe(frame.Probe(path.ask(now, address)))
                 self._add_alone(path, address, self._sealed(path, path.recovery.take_numbers(), now, probe), burst)
+        path.plan_probe(now)
 
     def _add_introduction(self, path: Path, address: Address, probe_id: int, burst: Burst) -> None:
         me = self.identity
@@ -286,7 +307,7 @@ class DatagramBuilder:
         introductions, path.introductions = path.introductions, []
         for address, probe_id in introductions:
             reply = frame.encode_probe_reply(frame.ProbeReply(probe_id))
-            probe = frame.encode_probe(frame.Probe(path.probing.ask_back(now)))
+            probe = frame.encode_probe(frame.Probe(path.probing.ask_back(now, address)))
             datagram = self._sealed(path, path.recovery.take_numbers(), now, reply, probe)
             self._add_alone(path, address, datagram, burst)
 
@@ -304,7 +325,7 @@ class DatagramBuilder:
     def _add_alone(self, path: Path, address: Address, datagram: bytes, burst: Burst) -> None:
         burst.add(address, datagram, len(datagram))
         self._stats.datagrams["sent", "control"] += 1
-        self._sent(path, len(datagram))
+        self._sent(path, address, len(datagram))
 
     def _sealed(self, path: Path, number: int, now: float, *frames: bytes | memoryview) -> bytes:
         """Return a datagram of these encoded frames."""
@@ -324,12 +345,13 @@ def _left_us(path: Path, message: OutboundMessage, now: float) -> int:
     return min(max(0, int(left_s * 1e6)), MAX_LEFT_US) if left_s < NEVER else MAX_LEFT_US
 
 
-def _fill(control: list[bytes]) -> list[bytes]:
-    """Take the frames of one datagram from `control`."""
+def _fill(control: list[bytes], allowance: int | None) -> list[bytes]:
+    """Take the frames of one datagram from `control`; none if already the first takes more than is allowed (bytes)."""
     size = 0
     count = 0
+    limit = BASE_FRAMES_BYTES if allowance is None else min(allowance, BASE_FRAMES_BYTES)
     for encoded in control:
-        if size + len(encoded) > BASE_FRAMES_BYTES or count == frame.MAX_FRAMES:
+        if size + len(encoded) > limit or count == frame.MAX_FRAMES:
             break
         size += len(encoded)
         count += 1

@@ -38,6 +38,7 @@ from sidecar.core.link_events import (
     PathMeasured,
     PathMtuChanged,
     PeerClosed,
+    PeerLied,
     PeerRenewed,
     PeerRestarted,
     Seek,
@@ -356,6 +357,10 @@ class Engine:
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
                     self._on_peer_closed(peer, now)
+            case PeerLied(peer, session):
+                if self.peers.session(peer) == session:
+                    self.peers.condemn(session)
+                    self.recheck_peers((), now)
         self._after_news(now)
 
     def on_decoded(self, decoding: Decoding, now: float) -> None:

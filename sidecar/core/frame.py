@@ -24,8 +24,8 @@ section 5) on the same socket.
 Frames, each a type byte and then::
 
     PADDING      0  and every zero byte after it             makes a probe as long as the path shall carry (pmtu.py)
-    PROBE        1  id (32)                                  is answered at once
-    PROBE_REPLY  2  id (32)
+    PROBE        1  id (64)                                  is answered at once
+    PROBE_REPLY  2  id (64)                                  proves that what stood in the probe was read
     ACK          3  largest (64) delay in us (32) n (8), n times: length - 1 of a range (16), gap - 1 below it (16)
     FRAGMENT     4  message (64) total size (32) symbol size (16) index (16) left in us (32), then the symbol: its
                     length follows from the other fields
@@ -82,7 +82,6 @@ MAX_FRAMES = 64
 _PADDING, _PROBE, _PROBE_REPLY, _ACK, FRAGMENT_TYPE, REPAIR_TYPE, FINISHED_TYPE, _ABANDON = range(8)
 _CLOSE, _FORGOTTEN = 8, 10
 
-_U32 = struct.Struct(">I")
 _U64 = struct.Struct(">Q")
 _ACK_HEAD = struct.Struct(">QIB")
 _ACK_RANGE = struct.Struct(">HH")
@@ -219,12 +218,12 @@ def decode_header(data: bytes | memoryview) -> Header:
 
 def encode_probe(frame: Probe) -> bytes:
     """Return the frame's bytes."""
-    return b"\x01" + _U32.pack(frame.id)
+    return b"\x01" + _U64.pack(frame.id)
 
 
 def encode_probe_reply(frame: ProbeReply) -> bytes:
     """Return the frame's bytes."""
-    return b"\x02" + _U32.pack(frame.id)
+    return b"\x02" + _U64.pack(frame.id)
 
 
 def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
@@ -313,9 +312,9 @@ def decode_frames(view: memoryview) -> list[Frame]:
                 frames.append(_ABOUT_A_MESSAGE[kind](_U64.unpack_from(view, position)[0]))
                 position += 8
             elif kind in (_PROBE, _PROBE_REPLY):
-                (probe_id,) = _U32.unpack_from(view, position)
+                (probe_id,) = _U64.unpack_from(view, position)
                 frames.append(Probe(probe_id) if kind == _PROBE else ProbeReply(probe_id))
-                position += 4
+                position += 8
             elif kind == _CLOSE:
                 frames.append(Close())
             else:

@@ -3,7 +3,7 @@
 Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
 
     hello id (8 bytes)        = Expand(token, "plr 2 hello id")
-    sealed:  probe id (32), credential (protos/credential.py)
+    sealed:  probe id (64), credential (protos/credential.py)
     tag (16 bytes)
 
 The token is stable, and known to the sender's peers from the control plane: a gate that costs a stranger's datagram a
@@ -40,9 +40,11 @@ if TYPE_CHECKING:
 HELLO_BYTES = 8
 INTRODUCTION_FLAGS = SEALED_FLAG | INTRODUCTION_FLAG
 _SEALED_FROM = HEADER_BYTES + HELLO_BYTES
-_PROBE_ID = struct.Struct(">I")
+_PROBE_ID = struct.Struct(">Q")
 _KEY_HEAD = struct.Struct(">QBB")
-MAX_INTRODUCED_BYTES = BASE_BYTES - _SEALED_FROM - _PROBE_ID.size - TAG_BYTES
+INTRODUCTION_BYTES = _SEALED_FROM + _PROBE_ID.size + TAG_BYTES
+"""Of an introduction beside its credential."""
+MAX_INTRODUCED_BYTES = BASE_BYTES - INTRODUCTION_BYTES
 """Longest credential that can be introduced: every path carries BASE_BYTES."""
 
 

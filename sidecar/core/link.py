@@ -74,9 +74,9 @@ class Link:
     ) -> None:
         """`memory`: what the link that had this interface before, in the same session, left by `remember`."""
         self.identity = identity
-        table = self._table = PathTable(identity, memory or LinkMemory(), limits)
+        table = self._table = PathTable(identity, LinkMemory() if memory is None else memory, limits, rng)
         self.stats = table.stats
-        self._builder = DatagramBuilder(identity, table.stats, rng)
+        self._builder = DatagramBuilder(identity, table.stats)
         self._mtu = LinkMtu(table.events)
         self._keeper = PathKeeper(table, self._mtu)
         self._reader = LinkReader(table, self._keeper, self._mtu)
@@ -237,6 +237,7 @@ class Link:
         return self._ready and self._carrier and not self._table.closing
 
     def _probe_what_is_down(self, now: float) -> None:
+        self._table.way_changed(now)
         for path in self._paths.values():
             if path.state is PathState.DOWN:
                 path.probing.begin_again(now)
@@ -329,11 +330,12 @@ class Link:
         recovery = path.recovery
         timers = (
             path.probe_at if self._may_probe else None,
-            path.mtu.timer if self._may_probe else None,
+            path.mtu_probe_at if self._may_probe else None,
+            path.gives_up_address_at,
             path.control_at,
             recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
             path.silence_timer,
-            path.control.next_release(recovery.in_flight) if len(path.queue) else None,
+            path.control.next_release(recovery.in_flight) if len(path.queue) and not path.address.is_blocked else None,
         )
         due = min(timer for timer in timers if timer is not None)
         self._timers.arm(path.id, due if due < NEVER else None)

@@ -280,6 +280,14 @@ class PeerClosed:
     session: SessionId
 
 
+@dataclass(frozen=True, slots=True)
+class PeerLied:
+    """The peer acknowledged what was never sent: it wants more sent than it receives, or to where it is not."""
+
+    peer: NodeName
+    session: SessionId
+
+
 LinkEvent = (
     FragmentsReceived
     | FragmentsLost
@@ -293,4 +301,5 @@ LinkEvent = (
     | PeerRestarted
     | PeerRenewed
     | PeerClosed
+    | PeerLied
 )

@@ -50,7 +50,7 @@ class LinkMtu:
     def moved(self, path: Path, source: Address, now: float) -> None:
         """The peer's datagrams come from elsewhere: another route, unless only a NAT gave it another port."""
         elsewhere = path.remote is not None and source[0] != path.remote[0]
-        path.remote = source
+        path.address.move(source, now)
         if elsewhere:
             path.source = None
         if elsewhere and path.mtu.timer is not None:

@@ -134,13 +134,14 @@ class LinkOpener:
         path = table.introduced(peer, header.sender_interface, now)
         if path is None:
             return None  # counted
-        if header.packet_number <= path.received.largest:
+        if header.packet_number <= max(path.received.largest, path.keys.introduced):
             return "duplicate"
+        path.keys.introduced = header.packet_number
         if table.closing:
             return None  # an answer would bring us back to life over there
         if len(path.introductions) >= MAX_INTRODUCTIONS:
             return "introductions_full"
-        path.note_introduction(source, probe_id)
+        path.note_introduction(source, probe_id, now)
         if path.state is PathState.DOWN:
             path.hasten_probe(now)
         table.dirty[path.id] = path

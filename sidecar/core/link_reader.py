@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from protos.model import Role
 from sidecar.core import frame
+from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import (
     FRAGMENT_HEAD,
     FRAGMENT_HEAD_BYTES,
     FRAGMENT_TYPE,
+    HEADER_BYTES,
     MAX_MESSAGE_BYTES,
     MAX_SYMBOL_BYTES,
     MIN_SYMBOL_BYTES,
@@ -36,6 +38,10 @@ if TYPE_CHECKING:
     from sidecar.core.path_keeper import PathKeeper
     from sidecar.core.path_table import PathTable
     from sidecar.core.paths import Path
+
+
+DATAGRAM_BYTES = HEADER_BYTES + TAG_BYTES
+"""Of a datagram beside its frames."""
 
 
 class LinkReader:
@@ -107,6 +113,9 @@ class LinkReader:
         if fragments:
             received.add_run(low, high, now)
             self._heard(path, source, now, newest=True)
+            if not path.address.is_proven:
+                size = sum(DATAGRAM_BYTES + len(plain) for _, _, plain in opened[position : position + len(fragments)])
+                self._unproven(path, source, size, now)
             self._used(path, now)
             self._stats.datagrams["received", "data"] += len(fragments)
             self._hand_up(path, fragments)
@@ -118,6 +127,13 @@ class LinkReader:
         if newest and source != path.remote and not (self._leads and path.keeps_address(source)):
             self._mtu.moved(path, source, now)
         self._table.dirty[path.id] = path
+
+    @staticmethod
+    def _unproven(path: Path, source: Address, size: int, now: float) -> None:
+        """So many bytes came over a path that leads to where the peer has not proven to be: ask whether it is there."""
+        path.address.came(source, size)
+        if path.state is not PathState.DOWN:
+            path.probing.challenge(now)
 
     @staticmethod
     def _used(path: Path, now: float) -> None:
@@ -145,6 +161,8 @@ class LinkReader:
             self._stats.dropped["malformed"] += 1
             return
         self._heard(path, source, now, newest=newest)
+        if not path.address.is_proven:
+            self._unproven(path, source, DATAGRAM_BYTES + len(plain), now)
         self._receive_frames(path, frames, now)
 
     def _receive_frames(self, path: Path, frames: list[frame.Frame], now: float) -> None:

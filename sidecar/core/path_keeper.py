@@ -8,6 +8,7 @@ from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
     PathChanged,
+    PeerLied,
 )
 from sidecar.core.path_id import PathState
 
@@ -42,6 +43,7 @@ class PathKeeper:
         newly = recovery.on_ack(ack, now)
         if newly is None:
             self._table.stats.dropped["acks_the_unsent"] += 1
+            self._events.append(PeerLied(path.peer, path.session))
             return
         # What was declared lost in haste proves life as well as what was not: where round trips grow faster than the
         # timeouts, all of it is such. Each datagram counts once: what an acknowledgement repeats proves nothing.
@@ -87,12 +89,24 @@ class PathKeeper:
         elif recovery.pto_timer is not None and recovery.pto_timer <= now:
             path.control.on_probe_timeout(now)
             self._lost(path, recovery.on_probe_timeout(now), now, timed_out=True)
+        gives_up_at = path.gives_up_address_at
+        if gives_up_at is not None and gives_up_at <= now:
+            self._lead_back(path, now)
         state = path.check_silence(now)
         if state is not None:
             if state is PathState.DOWN:
                 self._hand_back(path, "silent", forget=False)
             else:
                 self._events.append(PathChanged(path.id, state, "silent"))
+
+    def _lead_back(self, path: Path, now: float) -> None:
+        """Nobody answers where the newest datagrams came from."""
+        before = path.address.before()
+        if before is not None:
+            self._table.stats.dropped["address_unproven"] += 1
+            self._mtu.moved(path, before, now)
+            path.hasten_probe(now)
+            self._table.dirty[path.id] = path
 
     def _detect_lost(self, path: Path, now: float) -> None:
         recovery = path.recovery

@@ -128,19 +128,30 @@ class OpeningKeys:
 class PathKeys:
     """What is known of one path for as long as its peer's session, whatever becomes of the path."""
 
-    __slots__ = ("incarnation", "opening", "received", "sealing")
+    __slots__ = ("incarnation", "introduced", "opening", "received", "sealing")
 
-    def __init__(self, sealing: SealingKeys, opening: OpeningKeys, received: ReceivedPackets, incarnation: int) -> None:
+    def __init__(
+        self,
+        sealing: SealingKeys,
+        opening: OpeningKeys,
+        received: ReceivedPackets,
+        incarnation: int,
+        introduced: int = -1,
+    ) -> None:
         self.sealing = sealing
         self.opening = opening
         self.received = received
         """The packet numbers that came: none is accepted twice."""
         self.incarnation = incarnation
         """Of the peer's session: a later session's is larger."""
+        self.introduced = introduced
+        """The largest packet number of the peer's introductions: a smaller one is a replay, or overtaken."""
 
     def copy(self) -> PathKeys:
         """Return the same, apart from these from now on."""
-        return PathKeys(copy(self.sealing), copy(self.opening), deepcopy(self.received), self.incarnation)
+        return PathKeys(
+            copy(self.sealing), copy(self.opening), deepcopy(self.received), self.incarnation, self.introduced
+        )
 
 
 def make_path_keys(

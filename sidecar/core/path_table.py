@@ -6,6 +6,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from protos.model import Role
+from protos.token_bucket import TokenBucket
 from sidecar.core.introduction import hello_id
 from sidecar.core.link_memory import LinkMemory
 from sidecar.core.path_id import PathId, PathState
@@ -14,6 +15,7 @@ from sidecar.core.paths import Path
 from sidecar.core.stats import LinkStats
 
 if TYPE_CHECKING:
+    import random
     from collections.abc import Sequence
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
@@ -30,6 +32,10 @@ MAX_PATHS_OF_A_PEER = 32
 authentic followed; if there is none, it waits for the control plane's word."""
 HANGING_LINK_NUMBERS = 1 << 32
 """Packet numbers left to a link whose driver does not return, lest its next one seals with the same."""
+UNPROVEN_BYTES = 65_536
+"""What may go to all addresses together at which a peer has never proven to be: some 60 introductions, ..."""
+UNPROVEN_BYTES_PER_S = 1200.0
+"""... and one a second after that. Whoever announces or lists addresses of others gets no more out of each link."""
 MAX_INTRODUCTIONS = 4
 """Introductions on one path that wait for their answer; an honest peer repeats its own."""
 
@@ -38,13 +44,16 @@ class PathTable:
     """Paths, who may use them, and what came of them."""
 
     __slots__ = (
-        "_by_peer", "_limits", "_memory", "by_hello", "by_session", "closing", "dirty", "events", "identity", "paths",
-        "stats",
+        "_by_peer", "_limits", "_memory", "_rng", "_unproven", "by_hello", "by_session", "closing", "dirty", "events",
+        "identity", "paths", "stats",
     )  # fmt: skip
 
-    def __init__(self, identity: LinkIdentity, memory: LinkMemory, limits: KeyLimits) -> None:
+    def __init__(self, identity: LinkIdentity, memory: LinkMemory, limits: KeyLimits, rng: random.Random) -> None:
         self._memory = memory
         self._limits = limits
+        self._rng = rng
+        self._unproven: dict[NodeName, TokenBucket] = {}
+        """What may go to addresses of each peer at which it has never proven to be, in bytes."""
         self.identity = identity
         self.stats = LinkStats(identity.interface)
         self.events: deque[LinkEvent] = deque()
@@ -116,7 +125,18 @@ class PathTable:
             keys = make_path_keys(peer.keys, ours, remote, self._limits, now, peer.incarnation)
         path_id = PathId(self.identity.interface, peer.name, remote)
         leads = self.identity.role is Role.ROBOT
-        return Path(path_id, peer.session, keys, addresses, first_number, now, leads=leads)
+        unproven = self._unproven.get(peer.name) or self._new_budget(peer.name, now)
+        return Path(path_id, peer.session, keys, addresses, first_number, now, self._rng, unproven, leads=leads)
+
+    def _new_budget(self, peer: NodeName, now: float) -> TokenBucket:
+        bucket = TokenBucket(rate=UNPROVEN_BYTES_PER_S, burst=UNPROVEN_BYTES, now=now)
+        self._unproven[peer] = bucket
+        return bucket
+
+    def way_changed(self, now: float) -> None:
+        """Our own side of all paths is another: peers that could not be reached may be now."""
+        for bucket in self._unproven.values():
+            bucket.fill(now)
 
     def _drop(self, path: Path) -> None:
         del self.paths[path.peer, path.remote_id]
@@ -179,4 +199,5 @@ class PathTable:
                 self._enter(before.pop(key))
         for path in before.values():
             self._forget(path)
+        self._unproven = {name: bucket for name, bucket in self._unproven.items() if name in self._by_peer}
         return list(before.values())

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.congestion import CongestionController
 from sidecar.core.frame import Finished, encode_ack, encode_finished
 from sidecar.core.link_events import PathMeasured
+from sidecar.core.path_address import PathAddress
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
 from sidecar.core.probing import Probing
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
+    from protos.token_bucket import TokenBucket
     from sidecar.core.path_keys import PathKeys
 
 DOWN_FACTOR = 4.0
@@ -29,6 +31,8 @@ DOWN_FLOOR_S = 0.5
 """... but not before this."""
 DOWN_WAIT_S = 2.0
 """One whose answers take long is down so much after its next answer is overdue, or after the time that it takes."""
+INTRODUCER_S = 5.0
+"""Where a peer introduced itself from twice may be where it is to be found, for so long."""
 MAX_RTT_SAMPLES = 512
 """Round-trip times kept between two reports."""
 
@@ -37,11 +41,12 @@ class Path:
     """Sender's and receiver's state of one path. Owned by its link."""
 
     __slots__ = (
-        "_introduced",
+        "_introduced_at",
         "_introducer",
         "_oldest_at",
         "_rebound",
         "_waiting_since",
+        "address",
         "bytes_sent",
         "candidates",
         "control",
@@ -57,7 +62,6 @@ class Path:
         "queue",
         "received",
         "recovery",
-        "remote",
         "remote_id",
         "renewed_at",
         "reported_fates",
@@ -68,6 +72,7 @@ class Path:
         "session",
         "source",
         "state",
+        "unproven",
     )
 
     def __init__(
@@ -78,10 +83,15 @@ class Path:
         candidates: tuple[Address, ...],
         first_number: int,
         now: float,
+        rng: random.Random,
+        unproven: TokenBucket,
         *,
         leads: bool,
     ) -> None:
-        """`leads`: this end is the one that keeps the path alive (see `Probing`)."""
+        """`leads`: this end is the one that keeps the path alive (see `Probing`).
+
+        `unproven` holds what may go to where the peer has never proven to be, in bytes; all its paths share it.
+        """
         self.id = path_id
         self.remote_id: InterfaceId = path_id.remote
         self.session = session
@@ -90,12 +100,12 @@ class Path:
         self.opening = keys.opening
         self.received = keys.received
         self.candidates = candidates
-        self.remote: Address | None = None
-        """Where the newest authentic datagram came from."""
+        self.address = PathAddress()
+        self.unproven = unproven
         self.source: str | None = None
         """Which of our addresses the kernel sends from to there, as far as the driver knows."""
         self.state = PathState.DOWN
-        self.recovery = Recovery(first_number)
+        self.recovery = Recovery(first_number, rng)
         self.control = CongestionController()
         self.mtu = PathMtu()
         self.queue = SendQueue()
@@ -107,13 +117,13 @@ class Path:
         """... and messages to be reported FINISHED in it ..."""
         self.pending_by = NEVER
         """... which leaves at this moment (s) at the latest; NEVER when none waits."""
-        self.probing = Probing(now, leads=leads)
+        self.probing = Probing(now, rng, leads=leads)
         self.rtts: list[float] = []
         self.bytes_sent = 0
         self.reported_sent = 0
         self.reported_lost = 0
         self.reported_fates = (0, 0)
-        self._introduced = False
+        self._introduced_at = -NEVER
         self._introducer: Address | None = None
         self.renewed_at: float | None = None
         """When our credential was signed anew, until the peer answers an introduction with it."""
@@ -128,6 +138,11 @@ class Path:
         return self.id.peer
 
     @property
+    def remote(self) -> Address | None:
+        """Where it leads: to where the newest authentic datagram came from."""
+        return self.address.address
+
+    @property
     def family(self) -> int | None:
         """4 or 6: of the address that it leads to; None while none is known."""
         return None if self.remote is None else 6 if ":" in self.remote[0] else 4
@@ -140,15 +155,39 @@ class Path:
 
     @property
     def probe_at(self) -> float:
-        """When the next probe leaves (s)."""
-        return self.probing.at
+        """When the next probe leaves (s); NEVER while nothing may."""
+        return NEVER if self.goes_to_one and self.address.is_blocked else self.probing.at
 
-    def destinations(self) -> tuple[Address, ...]:
-        """Where a probe goes now: the known address, or all that may be it while the path is down or just rebound."""
-        if self.remote is not None and self.state is not PathState.DOWN and not self._rebound:
-            return (self.remote,)
-        others = dict.fromkeys((self.remote, self._introducer))
-        return (*(one for one in others if one and one not in self.candidates), *self.candidates)
+    @property
+    def mtu_probe_at(self) -> float | None:
+        """When the next probe of the path's MTU leaves (s): not to where the peer has not proven to be."""
+        return self.mtu.timer if self.address.is_proven else None
+
+    @property
+    def gives_up_address_at(self) -> float | None:
+        """When it leads to where it led before, unless the peer proves to be where it leads now (s)."""
+        if self.state is PathState.DOWN:
+            return None
+        return self.address.gives_up_at(self.recovery.rtt.next_answer())
+
+    @property
+    def goes_to_one(self) -> bool:
+        """Whether probes go to the known address, not to all that may be it: the path is down, or just rebound."""
+        return self.remote is not None and self.state is not PathState.DOWN and not self._rebound
+
+    def destinations(self, now: float, size: int) -> list[Address]:
+        """Where probes of `size` bytes go now that look for the peer."""
+        introducer = self._introducer if now < self._introduced_at + INTRODUCER_S else None
+        others = dict.fromkeys((self.remote, introducer))
+        all_of_them = (*(one for one in others if one and one not in self.candidates), *self.candidates)
+        return [one for one in all_of_them if self._may_look_at(one, now, size)]
+
+    def _may_look_at(self, address: Address, now: float, size: int) -> bool:
+        if self.address.proven(address):
+            return True
+        if address == self.remote:
+            return (self.address.allowance or 0) >= size
+        return self.unproven.take(now, size)
 
     def keeps_address(self, source: Address) -> bool:
         """Whether an authentic datagram from another of the peer's known addresses is no reason to go there as well.
@@ -159,7 +198,7 @@ class Path:
         known = source in self.candidates and self.remote in self.candidates
         return known and self.state is PathState.UP and not self._rebound
 
-    def note_introduction(self, source: Address, probe_id: int) -> None:
+    def note_introduction(self, source: Address, probe_id: int, now: float) -> None:
         """The peer introduced itself from here, and wants a probe answered.
 
         When it does so again although it was answered, it can not read the answer: it does not know yet that we were
@@ -167,20 +206,22 @@ class Path:
         """
         self.introductions.append((source, probe_id))
         if self.state is PathState.DOWN:
-            self._introducer = source if self._introduced else None
-            self._introduced = True
+            again = now < self._introduced_at + INTRODUCER_S
+            self._introducer, self._introduced_at = source if again else None, now
 
-    def next_probe(self, now: float, rng: random.Random) -> int:
-        """Return the id of a probe that leaves now, and plan the next one."""
-        probe_id = self.probing.ask(now, sealed=self.state is not PathState.DOWN)
+    def ask(self, now: float, to: Address) -> int:
+        """Return the id of a probe that leaves now to this address and to no other, by plan."""
         self.waits_for_answer(now)
-        if self.state is PathState.UP:
-            self.probing.plan_up(now, rng)
-        elif self.state is PathState.UNSTABLE:
-            self.probing.plan_unstable(now, self.recovery.rtt.smoothed, rng)
+        return self.probing.ask(now, to, sealed=self.state is not PathState.DOWN)
+
+    def plan_probe(self, now: float) -> None:
+        """A probe left: plan the next one."""
+        if self.state is PathState.DOWN:
+            self.probing.plan_down(now)
+        elif self.state is PathState.UNSTABLE or not self.address.is_proven:
+            self.probing.plan_unstable(now, self.recovery.rtt.smoothed)
         else:
-            self.probing.plan_down(now, rng)
-        return probe_id
+            self.probing.plan_up(now)
 
     def asked(self, now: float) -> None:
         """The peer probed the path."""
@@ -212,6 +253,8 @@ class Path:
         probe = self.probing.answered(probe_id, now)
         if probe is None:
             return None
+        if probe.to is not None:
+            self.address.prove(probe.to)
         self.recovery.rtt.sample(now - probe.sent_at, now)
         if probe.sealed:
             self.sealing.delivered(probe.sent_at)
@@ -222,7 +265,9 @@ class Path:
 
     @property
     def control_at(self) -> float:
-        """When control frames leave without company (s); NEVER when none wait."""
+        """When control frames leave without company (s); NEVER when none wait, or none may leave."""
+        if self.address.is_blocked:
+            return NEVER
         ack_at = self.received.ack_at
         return self.pending_by if ack_at is None else min(ack_at, self.pending_by)
 
@@ -290,7 +335,7 @@ class Path:
             self.probing.proven(now)
             return False
         self.state = PathState.UP
-        self._introduced, self._introducer = False, None
+        self._introduced_at, self._introducer = -NEVER, None
         self.probing.came_up(now)
         return True
 

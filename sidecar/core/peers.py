@@ -196,6 +196,10 @@ class Peers:
             self._own.admit(peer)
         return self._own.ends_at(peer.credential)
 
+    def condemn(self, session: SessionId) -> None:
+        """Whatever its credential: this session is not talked to any more, see `recheck`."""
+        self._own.condemn(session)
+
     def recheck(self) -> list[NodeName]:
         """Whom to trust has changed; returns those that are no peers any more. See `OwnSession.forget_admitted`."""
         gone = []

@@ -14,6 +14,8 @@ from sidecar.core.rtt import LONGEST_ANSWER_S
 if TYPE_CHECKING:
     import random
 
+    from protos.model import Address
+
 IDLE_PROBE_S = 0.5
 """A path that was in use a moment ago is probed this often, which finds a dead one within a second, ..."""
 IDLE_SHARE = 8.0
@@ -40,14 +42,17 @@ RETURN_BACKOFF = 1.02
 the time that it is down, 0.25 s after ten seconds. Both ends probe, so that the wait is mostly half of that or less."""
 DOWN_SPREAD = 0.1
 """As IDLE_SPREAD, for a path that is not up."""
-MAX_PROBES_OUT = 320
-"""Unanswered probes of either kind that are remembered: those of LONGEST_ANSWER_S, no two within FIRST_PROBE_S."""
+MAX_PROBES_OUT = 1024
+"""Unanswered probes of either kind that are remembered: those of LONGEST_ANSWER_S, no two within FIRST_PROBE_S, to some
+addresses each."""
 
 
 class Probe(NamedTuple):
     """One that was answered."""
 
     sent_at: float
+    to: Address | None
+    """Where it went, and nowhere else: so the peer is there."""
     sealed: bool
     """With this path's keys, so that the answer confirms those."""
 
@@ -55,10 +60,12 @@ class Probe(NamedTuple):
 class Probing:
     """The plan of one path's probes, and the memory of them. Times in seconds."""
 
-    __slots__ = ("_asked_at", "_asked_every", "_back", "_gap", "_leads", "_next_id", "_out", "_proven_at", "_used_at",
+    __slots__ = ("_asked_at", "_asked_every", "_back", "_gap", "_leads", "_out", "_proven_at", "_rng", "_used_at",
                  "_was_up", "at", "crowd", "last_at")  # fmt: skip
 
-    def __init__(self, now: float, *, leads: bool) -> None:
+    def __init__(self, now: float, rng: random.Random, *, leads: bool) -> None:
+        """`rng` must be one that nobody can foresee: who guesses an id could answer what he did not get."""
+        self._rng = rng
         self.at = now
         """When the next one leaves."""
         self.last_at = now - FIRST_PROBE_S
@@ -73,7 +80,6 @@ class Probing:
         self._asked_at = now
         self._asked_every = MAX_IDLE_PROBE_S
         """How often the peer asks."""
-        self._next_id = 0
         self._out: dict[int, Probe] = {}
         """What was asked by plan, the oldest first."""
         self._back: dict[int, Probe] = {}
@@ -83,18 +89,16 @@ class Probing:
 
     def take_id(self) -> int:
         """Return the id of the next probe, of liveness or of size."""
-        probe_id = self._next_id
-        self._next_id = (probe_id + 1) & 0xFFFFFFFF
-        return probe_id
+        return self._rng.getrandbits(64)
 
-    def ask(self, now: float, *, sealed: bool) -> int:
-        """Return the id of a probe that leaves now, by plan."""
+    def ask(self, now: float, to: Address | None, *, sealed: bool) -> int:
+        """Return the id of a probe that leaves now to this address, by plan."""
         self.last_at = now
-        return self._note(self._out, Probe(now, sealed))
+        return self._note(self._out, Probe(now, to, sealed))
 
-    def ask_back(self, now: float) -> int:
-        """Return the id of a sealed probe that leaves now with the answer to an introduction."""
-        return self._note(self._back, Probe(now, sealed=True))
+    def ask_back(self, now: float, to: Address) -> int:
+        """Return the id of a sealed probe that leaves now with the answer to an introduction, to where that was."""
+        return self._note(self._back, Probe(now, to, sealed=True))
 
     def _note(self, out: dict[int, Probe], probe: Probe) -> int:
         while out:
@@ -118,17 +122,17 @@ class Probing:
 
     # -- planning -------------------------------------------------------------------------------------------------
 
-    def plan_up(self, now: float, rng: random.Random) -> None:
+    def plan_up(self, now: float) -> None:
         """The path is up, and a probe left: plan the next one."""
-        self.at = now + self._pause(now) * rng.uniform(1 - IDLE_SPREAD, 1 + IDLE_SPREAD)
+        self.at = now + self._pause(now) * self._rng.uniform(1 - IDLE_SPREAD, 1 + IDLE_SPREAD)
 
-    def plan_unstable(self, now: float, smoothed_rtt_s: float, rng: random.Random) -> None:
-        """As `plan_up`, for a path that is silent."""
-        self.at = now + max(FIRST_PROBE_S, smoothed_rtt_s) * rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
+    def plan_unstable(self, now: float, smoothed_rtt_s: float) -> None:
+        """As `plan_up`, for a path that is silent, or leads to where the peer has not proven to be."""
+        self.at = now + max(FIRST_PROBE_S, smoothed_rtt_s) * self._rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
 
-    def plan_down(self, now: float, rng: random.Random) -> None:
+    def plan_down(self, now: float) -> None:
         """As `plan_up`, for a path that is down."""
-        self.at = now + self._gap * rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
+        self.at = now + self._gap * self._rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
         backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
         self._gap = min(self._gap * backoff, self._patience * (MAX_PROBE_S if self._leads else MAX_WATCH_PROBE_S))
 
@@ -181,6 +185,10 @@ class Probing:
     def hasten(self, now: float, smoothed_rtt_s: float) -> None:
         """It is time to ask again: but what was asked a round trip ago may still be answered, whoever wishes it."""
         self.at = min(self.at, max(now, self.last_at + max(self._patience * FIRST_PROBE_S, smoothed_rtt_s)))
+
+    def challenge(self, now: float) -> None:
+        """Ask at once, unless that was done a moment ago: the peer shows up where it has not proven to be."""
+        self.at = min(self.at, max(now, self.last_at + FIRST_PROBE_S))
 
     def begin_again(self, now: float) -> None:
         """The path may have come back: probe at once, and the first ones close together."""

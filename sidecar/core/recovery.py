@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
+from collections import deque
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
@@ -13,11 +15,18 @@ from sidecar.core.rtt import RttEstimator
 from sidecar.core.sent import Sent
 
 if TYPE_CHECKING:
+    import random
+
     from sidecar.core.frame import AckFrame
     from sidecar.core.outbound import OutboundMessage
 
 PTO_DATAGRAMS = 2
 """How many of the oldest datagrams a probe timeout gives up (RFC 9002 section 6.2.4 allows two probes)."""
+FIRST_SKIP, MAX_SKIP = 128, 1 << 17
+"""Among the first so many datagrams a packet number is left out, then among twice as many, up to this many: who
+acknowledges what never came, to be sent more than its path carries, names one of these (RFC 9000 section 21.4)."""
+MAX_SKIPPED = 16
+"""Numbers left out that are remembered, the newest."""
 MAX_PTO_BACKOFF = 6
 """Probe timeouts stop doubling here, or when they are as long as anybody waits on this path, or as an answer takes."""
 
@@ -31,6 +40,10 @@ class Recovery:
         "_lost_at",
         "_next_number",
         "_pto_count",
+        "_rng",
+        "_skip_at",
+        "_skip_every",
+        "_skipped",
         "in_flight",
         "largest_acked",
         "last_eliciting_at",
@@ -43,7 +56,8 @@ class Recovery:
         "total_sent",
     )
 
-    def __init__(self, first_number: int) -> None:
+    def __init__(self, first_number: int, rng: random.Random | None = None) -> None:
+        """Without `rng` no packet number is left out."""
         self.rtt = RttEstimator()
         self.reordering = Reordering()
         self.sent: list[Sent] = []
@@ -58,6 +72,11 @@ class Recovery:
         self.total_arrived = 0
         """Acknowledged datagrams, of those that are (ack-eliciting ones)."""
         self._next_number = first_number
+        self._rng = rng
+        self._skip_every = FIRST_SKIP
+        self._skipped: deque[int] = deque(maxlen=MAX_SKIPPED)
+        """Packet numbers that were left out, lately."""
+        self._skip_at = self._next_skip() if rng is not None else math.inf
         self._lost_at: float | None = None
         self._pto_count = 0
 
@@ -68,10 +87,19 @@ class Recovery:
 
     def take_numbers(self, count: int = 1) -> int:
         """Return the first of the packet numbers of the next `count` datagrams."""
+        if self._next_number + count > self._skip_at:
+            self._skipped.append(self._next_number)
+            self._next_number += 1
+            self._skip_every = min(2 * self._skip_every, MAX_SKIP)
+            self._skip_at = self._next_skip()
         number = self._next_number
         self._next_number += count
         self.total_sent += count
         return number
+
+    def _next_skip(self) -> float:
+        assert self._rng is not None
+        return self._next_number + self._rng.randrange(self._skip_every // 2, self._skip_every) + 1
 
     def on_run_sent(
         self,
@@ -100,9 +128,14 @@ class Recovery:
         self.last_eliciting_at = sent.at
 
     def on_ack(self, ack: AckFrame, now: float) -> list[Sent] | None:
-        """Take an acknowledgement and return what it newly acknowledges; None when it acknowledges the unsent."""
+        """Take an acknowledgement and return what it newly acknowledges; None when it acknowledges the unsent.
+
+        An honest peer never does.
+        """
         largest = ack.ranges[0][1]
         if largest >= self._next_number:
+            return None
+        if any(low <= skipped <= high for skipped in self._skipped for low, high in ack.ranges):
             return None
         newly: list[Sent] = []
         for low, high in ack.ranges:

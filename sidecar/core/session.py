@@ -14,11 +14,14 @@ from sidecar.core.key_schedule import pair_keys
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Peer
+    from protos.model import Peer, SessionId
     from sidecar.core.key_schedule import PairKeys
 
 MAX_ADMITTED = 8192
 """Credentials whose verification is remembered; beyond it all are verified anew."""
+
+MAX_CONDEMNED = 1024
+"""Sessions refused for what they did; the oldest are forgotten."""
 
 
 def public_key(private_key: bytes) -> bytes:
@@ -41,6 +44,7 @@ class OwnSession:
         self._verify = verify
         self._admitted: dict[bytes, tuple[PairKeys, float]] = {}
         """What is shared under each credential, and when that ends."""
+        self._condemned: dict[SessionId, None] = {}
 
     def admit(self, peer: Peer) -> PairKeys:
         """Return what we share with a peer, having judged its credential: about 0.3 ms, nothing when it is known.
@@ -48,6 +52,8 @@ class OwnSession:
         Raises:
             DecodeError: the credential is malformed, not of this peer, or refused by `verify`; the text says why.
         """
+        if peer.session in self._condemned:
+            raise DecodeError("it acknowledged what was never sent: not talked to until it is restarted")
         known = self._admitted.get(peer.credential)
         theirs = decode_credential(peer.credential)
         if (theirs.name, theirs.role, theirs.session, theirs.incarnation) != (
@@ -68,6 +74,12 @@ class OwnSession:
             self._admitted.clear()
         self._admitted[peer.credential] = keys, ends_at
         return keys
+
+    def condemn(self, session: SessionId) -> None:
+        """Refuse this session from now on, whatever its credential."""
+        self._condemned[session] = None
+        if len(self._condemned) > MAX_CONDEMNED:
+            self._condemned.pop(next(iter(self._condemned)), None)
 
     def has_admitted(self, credential: bytes) -> bool:
         """Whether this one was judged good: admitting it again costs nothing."""

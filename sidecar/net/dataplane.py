@@ -253,12 +253,16 @@ class ThreadedDataPlane:
         self._recheck_peers(self._judge(refused))
 
     def end_expired(self) -> None:
-        """Part with peers whose certificates have ended by now, at next to no cost while there are none."""
+        """Part with peers whose certificates have ended by now, at next to no cost while there are none.
+
+        Say who else is not talked to any more.
+        """
         if self._own.forget_ended(time.time()):
             with self._lock:
                 known = self._engine.peers.all()
             self._judge(known)
             self._recheck_peers([])
+        self._log_peers()
 
     def judge_again(self) -> None:
         """Time has passed, or our clock was set: refused peers may be good now."""

@@ -26,6 +26,7 @@ from sidecar.ros.cdr_walk import CdrError, check
 from sidecar.ros.errors import RosBridgeError
 
 _OK = 0
+_TIMEOUT = 2
 _CLIENT_TAKE_FAILED = 501
 _SERVICE_TAKE_FAILED = 601
 _ERROR_TEXT_BYTES = 1024
@@ -43,6 +44,10 @@ FIRST_BUFFER_BYTES = 4096
 
 class RclError(RosBridgeError):
     """rcl or rmw could not do what it was asked, for a reason other than the bytes."""
+
+
+class NewClientError(RclError):
+    """The client that asked is not wholly discovered: its answer can be sent later."""
 
 
 class RmwRequestId(ctypes.Structure):
@@ -311,8 +316,15 @@ def take_response(client: int, response_type: MessageType) -> tuple[int, bytes] 
 
 
 def send_response(service: int, request_id: RmwRequestId, response: Message) -> None:
-    """Answer a request; rmw may wait up to 0.1 s for a client it has only just discovered."""
+    """Answer a request; rmw may wait up to 0.1 s for a client it has only just discovered.
+
+    Raises:
+        NewClientError: that was not enough.
+        RclError: it can not be sent.
+    """
     status = _releasing.send_response(service, request_id, response.pointer)
+    if status == _TIMEOUT:
+        raise NewClientError(_take_error())
     if status != _OK:
         raise RclError(f"cannot send a response ({status}): {_take_error()}")
 

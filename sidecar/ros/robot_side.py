@@ -18,8 +18,10 @@ from sidecar.core.events import (
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.fallback_caller import FallbackCaller
+from sidecar.ros.new_clients import GIVE_UP_S, NewClients
 from sidecar.ros.notices import NoticePublisher
 from sidecar.ros.proxies import Proxies
+from sidecar.ros.rcl import NewClientError
 from sidecar.ros.reply_pacer import ReplyPacer
 from sidecar.ros.request_numbering import RequestNumbering
 from sidecar.ros.server_processes import ServerProcesses
@@ -52,7 +54,8 @@ class _Pending:
 
 
 @dataclass(frozen=True, slots=True)
-class _PacedAnswer:
+class _Answer:
+    client: bytes
     proxy: ServiceProxy
     rmw_request_id: RmwRequestId
     response: Message
@@ -80,7 +83,8 @@ class RobotSide:
         self._numbering = RequestNumbering(data_plane.session)
         self._processes = ServerProcesses(loop.domain_id, lambda: graph.participants(loop.node), loop.wake)
         """Of the fallbacks."""
-        self._pacer: ReplyPacer[_PacedAnswer] = ReplyPacer()
+        self._pacer: ReplyPacer[_Answer] = ReplyPacer()
+        self._new_clients: NewClients[_Answer] = NewClients()
         self._fallbacks = FallbackCaller(
             loop=loop,
             rules=rules,
@@ -194,25 +198,50 @@ class RobotSide:
             return error
         del self._pending[request_id]
         self._stats.pending = len(self._pending)
-        answer = _PacedAnswer(pending.proxy, pending.rmw_request_id, response)
+        answer = _Answer(pending.client, pending.proxy, pending.rmw_request_id, response)
         if self._pacer.offer(pending.client, answer, now, late=late):
             self._send(answer, now)
         else:
             self._stats.answers_paced += 1
         return None
 
-    def _send(self, answer: _PacedAnswer, now: float) -> None:
-        service = answer.proxy.name
+    def _send(self, answer: _Answer, now: float) -> None:
+        if self._new_clients.waits(answer.client) or not self._try_to_send(answer, now):
+            if not self._new_clients.keep(answer.client, answer, now):
+                self._lost(answer, "too many answers wait for new clients", now)
+
+    def _try_to_send(self, answer: _Answer, now: float) -> bool:
+        """False if its client is not wholly discovered yet."""
         if not answer.proxy.open:
             self._stats.dropped["response_without_request"] += 1
-            return
+            return True
         try:
             answer.proxy.answer(answer.rmw_request_id, answer.response)
+        except NewClientError:
+            return False
         except RosBridgeError as error:
-            self._limited.log(logging.ERROR, ("rmw_error", service), now, "%s: answer lost: %s", service, error)
-            self._stats.unanswered[service, "rmw_error"] += 1
+            self._lost(answer, str(error), now)
+            return True
+        self._stats.answers_sent[answer.proxy.name] += 1
+        return True
+
+    def _lost(self, answer: _Answer, why: str, now: float) -> None:
+        service = answer.proxy.name
+        self._limited.log(logging.ERROR, ("rmw_error", service), now, "%s: answer lost: %s", service, why)
+        self._stats.unanswered[service, "rmw_error"] += 1
+
+    def _try_new_client(self, now: float) -> None:
+        due = self._new_clients.take_due(now)
+        if due is None:
             return
-        self._stats.answers_sent[service] += 1
+        client, oldest = due
+        if self._try_to_send(oldest, now):
+            for answer in self._new_clients.known(client):
+                if self._pacer.offer(client, answer, now, late=False):
+                    self._send(answer, now)
+        else:
+            for answer in self._new_clients.unknown(client, time.monotonic()):
+                self._lost(answer, f"ROS has not found its client for {GIVE_UP_S:g} s", now)
 
     def _fail(self, event: RequestFailed, now: float) -> None:
         if self._fallbacks.network_failed(event, now):
@@ -303,7 +332,7 @@ class RobotSide:
 
     def next_due(self) -> float | None:
         """Return when `on_timer` has something to do, or None."""
-        dues = (self._pacer.next_due(), self._fallbacks.next_due())
+        dues = (self._pacer.next_due(), self._new_clients.next_due(), self._fallbacks.next_due())
         return min((due for due in dues if due is not None), default=None)
 
     def on_timer(self, now: float) -> None:
@@ -314,6 +343,7 @@ class RobotSide:
         if self._pacer.queued:
             for answer in self._pacer.take_due(now):
                 self._send(answer, now)
+        self._try_new_client(now)
 
     def close(self) -> None:
         """Withdraw every service."""

@@ -68,7 +68,7 @@ class ServiceProxy:
         return self.type.response.deserialize(payload)
 
     def answer(self, request_id: RmwRequestId, response: Message) -> None:
-        """Answer the request with this rmw id, or raise RosBridgeError."""
+        """Answer the request with this rmw id, or raise RosBridgeError; see `rcl.send_response`."""
         send_response(self._pointer, request_id, response)
 
     def close(self) -> int:

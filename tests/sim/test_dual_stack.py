@@ -35,7 +35,7 @@ def disagree(robot: Node, cloud: Node) -> None:
     for node, remote in ((robot, ("a.eth0", 1)), (cloud, ("robot.wlan0" + IPV6, 1))):
         for link in node.links.values():
             for path in link._paths.values():
-                path.remote = remote
+                path.address.move(remote, node.mesh.now)
                 path.probing.begin_again(node.mesh.now)
 
 

@@ -13,8 +13,8 @@ CLEAR = "d3 01 01 02 01 02 03 04 05 06 07 08 11 12 13 14 15 16 17 18"
 SYMBOL = bytes(range(256))
 
 GOLDENS = {
-    "probe": (frame.encode_probe(Probe(0xA1B2C3D4)), "01 a1b2c3d4", Probe(0xA1B2C3D4)),
-    "probe reply": (frame.encode_probe_reply(ProbeReply(5)), "02 00000005", ProbeReply(5)),
+    "probe": (frame.encode_probe(Probe(0xA1B2C3D4E5F60718)), "01 a1b2c3d4e5f60718", Probe(0xA1B2C3D4E5F60718)),
+    "probe reply": (frame.encode_probe_reply(ProbeReply(5)), "02 0000000000000005", ProbeReply(5)),
     "ack": (
         frame.encode_ack([(90, 100), (80, 85), (3, 3)], 0.001234),
         "03 0000000000000064 000004d2 03 000a 0000 0005 0003 0000 004b",

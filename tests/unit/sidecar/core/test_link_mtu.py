@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from sidecar.core import frame
 from sidecar.core.frame import Probe, ProbeReply
 from sidecar.core.link_events import FragmentsLost, PathMtuChanged, Send, SetMtu
@@ -9,6 +11,9 @@ from sidecar.core.outbound import OutboundMessage
 from sidecar.core.pmtu import BASE_BYTES, PROBE_TIMEOUT_S
 from tests.unit.sidecar.core.builders import PEER_ADDRESS, Bench, message, path
 from tests.unit.sidecar.core.test_link import up
+
+if TYPE_CHECKING:
+    from protos.model import Address
 
 PATH = path()
 
@@ -20,6 +25,14 @@ def size_probes(bench: Bench, datagrams: list[bytes]) -> list[tuple[int, int]]:
         frames = bench.opened(datagram)
         found += [(len(datagram), item.id) for item in frames if isinstance(item, Probe) and len(datagram) > BASE_BYTES]
     return found
+
+
+def prove(bench: Bench, asked: list[bytes], source: Address) -> None:
+    """Answer the probes among these datagrams from this address."""
+    for item in bench.frames(asked):
+        if isinstance(item, Probe):
+            reply = bench.datagram(frame.encode_probe_reply(ProbeReply(item.id)))
+            bench.receive_datagram(reply, source)
 
 
 def search(bench: Bench, mtu: int = 1500) -> list[int]:
@@ -92,6 +105,9 @@ def test_another_port_is_the_same_route_and_another_address_is_not() -> None:
     assert sizes(bench) == []
     bench.receive_datagram(bench.datagram(frame.encode_probe(Probe(2))), ("192.0.2.77", 9))
     assert sizes(bench) == [BASE_BYTES]
+    asked = bench.sent()
+    assert size_probes(bench, asked) == [], "nothing long goes to where the peer has not proven to be"
+    prove(bench, asked, ("192.0.2.77", 9))
     assert [length for length, _ in size_probes(bench, bench.sent())] == [1252]
 
 
@@ -104,6 +120,8 @@ def test_a_path_that_changes_again_and_again_is_not_filled_with_probes_of_the_si
         frames = frame.encode_probe(Probe(number))
         bench.receive_datagram(bench.datagram(frames), (f"192.0.2.{number + 100}", 9))
         bench.link.handle_timer(bench.now)
-        probes += size_probes(bench, bench.sent())
+        sent = bench.sent()
+        prove(bench, sent, (f"192.0.2.{number + 100}", 9))
+        probes += size_probes(bench, sent + bench.sent())
         bench.now += 0.01
     assert 1 <= len(probes) <= 2

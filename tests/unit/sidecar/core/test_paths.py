@@ -5,7 +5,8 @@ import random
 import pytest
 
 from protos.credential import Aead
-from protos.model import InterfaceId, SessionId
+from protos.model import Address, InterfaceId, SessionId
+from protos.token_bucket import TokenBucket
 from sidecar.core.key_schedule import PairKeys
 from sidecar.core.path_id import PathState
 from sidecar.core.path_keys import DEFAULT_LIMITS, make_path_keys
@@ -25,12 +26,24 @@ HERE, THERE, ELSEWHERE = ("192.0.2.1", 1), ("192.0.2.2", 2), ("192.0.2.3", 3)
 def new() -> Path:
     pair = PairKeys(bytes(32), Aead.AES_256_GCM, first=True)
     keys = make_path_keys(pair, InterfaceId(0), InterfaceId(0), DEFAULT_LIMITS, 100.0)
-    return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0, leads=True)
+    budget = TokenBucket(rate=1200.0, burst=65_536, now=100.0)
+    return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0, RNG, budget, leads=True)
+
+
+def ask(subject: Path, now: float) -> int:
+    """Return the id of a probe that leaves, by plan."""
+    probe = subject.ask(now, subject.remote or THERE)
+    subject.plan_probe(now)
+    return probe
+
+
+def destinations(subject: Path, now: float = 100.0) -> tuple[Address, ...]:
+    return (subject.remote,) if subject.goes_to_one and subject.remote else tuple(subject.destinations(now, 100))
 
 
 def up(now: float = 100.0, rtt_s: float = 0.01) -> Path:
     subject = new()
-    probe = subject.next_probe(now - rtt_s, RNG)
+    probe = ask(subject, now - rtt_s)
     assert subject.answered_probe(probe, now) == now - rtt_s
     assert subject.made_progress(now)
     return subject
@@ -43,7 +56,7 @@ def test_a_new_path_is_down_and_probes_with_growing_gaps() -> None:
     for _ in range(12):
         gaps.append(subject.probe_at - now)
         now = subject.probe_at
-        subject.next_probe(now, RNG)
+        ask(subject, now)
     assert gaps[0] == 0
     assert 0.9 * FIRST_PROBE_S <= gaps[1] <= 1.1 * FIRST_PROBE_S
     assert 0.9 * MAX_PROBE_S <= gaps[-1] <= 1.1 * MAX_PROBE_S
@@ -62,7 +75,7 @@ def test_up_unstable_down_up() -> None:
     assert subject.silence_timer == pytest.approx(down_at)
     assert subject.check_silence(down_at) is PathState.DOWN
     assert subject.check_silence(down_at + 100) is None
-    probe = subject.next_probe(down_at, RNG)
+    probe = ask(subject, down_at)
     assert subject.answered_probe(probe, down_at + 0.01)
     assert subject.made_progress(down_at + 0.01)
     assert subject.state is PathState.UP
@@ -95,7 +108,7 @@ def test_an_unstable_path_is_probed_fast() -> None:
     subject = up()
     subject.waits_for_answer(101.0)
     subject.check_silence(101.1)
-    subject.next_probe(101.1, RNG)
+    ask(subject, 101.1)
     assert subject.probe_at <= 101.1 + 1.1 * FIRST_PROBE_S
 
 
@@ -105,7 +118,7 @@ def test_a_path_that_was_up_is_asked_at_least_four_times_a_second_for_ten_second
     gaps: list[float] = []
     while sum(gaps) < 100.0:
         now = 101.0 + sum(gaps)
-        subject.next_probe(now, RNG)
+        ask(subject, now)
         gaps.append(subject.probe_at - now)
     within = [gap for count, gap in enumerate(gaps) if sum(gaps[:count]) < 10.0]
     assert max(within) < 0.3
@@ -117,11 +130,11 @@ def test_hearing_a_dead_path_hastens_its_probe_but_no_flood_does() -> None:
     subject = new()
     now = 100.0
     for _ in range(10):
-        subject.next_probe(now, RNG)
+        ask(subject, now)
         now += 2.0
     subject.hasten_probe(now)
     assert subject.probe_at <= now
-    subject.next_probe(now, RNG)
+    ask(subject, now)
     for _ in range(100):
         subject.hasten_probe(now + 0.001)
     assert subject.probe_at == pytest.approx(now + FIRST_PROBE_S)
@@ -153,12 +166,12 @@ def test_a_queue_that_is_in_use_is_dead_a_second_after_its_last_sign_of_life() -
 @pytest.mark.audit("dp-2")
 def test_only_what_was_asked_counts_as_an_answer_and_once() -> None:
     subject = new()
-    probe = subject.next_probe(100.0, RNG)
+    probe = ask(subject, 100.0)
     assert not subject.answered_probe(probe + 1, 100.1)
     assert subject.answered_probe(probe, 100.1)
     assert not subject.answered_probe(probe, 100.1)
     assert subject.made_progress(100.1)
-    late = subject.next_probe(100.2, RNG)
+    late = ask(subject, 100.2)
     subject.go_down()
     assert subject.answered_probe(late, 104.2) == 100.2, "a slow path is not a dead one"
     assert subject.recovery.rtt.latest == pytest.approx(4.0)
@@ -167,30 +180,30 @@ def test_only_what_was_asked_counts_as_an_answer_and_once() -> None:
 def test_unanswered_probes_and_samples_are_capped() -> None:
     subject = new()
     for step in range(1000):
-        subject.next_probe(100.0 + step, RNG)
+        ask(subject, 100.0 + step)
         subject.note_rtt()
     assert len(subject.rtts) == MAX_RTT_SAMPLES
 
 
 def test_probes_go_to_every_candidate_until_the_path_is_up() -> None:
     subject = new()
-    assert subject.destinations() == (HERE, THERE)
-    subject.remote = ELSEWHERE
-    assert subject.destinations() == (ELSEWHERE, HERE, THERE)
-    subject.remote = THERE
-    assert subject.destinations() == (HERE, THERE)
+    assert destinations(subject) == (HERE, THERE)
+    subject.address.move(ELSEWHERE, 100.0)
+    assert destinations(subject) == (ELSEWHERE, HERE, THERE)
+    subject.address.move(THERE, 100.0)
+    assert destinations(subject) == (HERE, THERE)
     subject.state = PathState.UP
-    assert subject.destinations() == (THERE,)
+    assert destinations(subject) == (THERE,)
 
 
 def test_after_a_rebinding_every_candidate_is_asked_until_one_answers() -> None:
     subject = up()
-    subject.remote = ELSEWHERE
-    assert subject.destinations() == (ELSEWHERE,)
+    subject.address.move(ELSEWHERE, 100.0)
+    assert destinations(subject) == (ELSEWHERE,)
     subject.start_afresh(101.0)
     assert subject.state is PathState.UNSTABLE
     assert not subject.recovery.rtt.has_sample
-    assert subject.destinations() == (ELSEWHERE, HERE, THERE)
-    assert subject.answered_probe(subject.next_probe(101.0, RNG), 101.02)
+    assert destinations(subject) == (ELSEWHERE, HERE, THERE)
+    assert subject.answered_probe(ask(subject, 101.0), 101.02)
     assert subject.made_progress(101.02)
-    assert subject.destinations() == (ELSEWHERE,)
+    assert destinations(subject) == (ELSEWHERE,)

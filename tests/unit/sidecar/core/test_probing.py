@@ -20,12 +20,13 @@ from sidecar.core.probing import (
 from sidecar.core.rtt import LONGEST_ANSWER_S
 
 RNG = random.Random(1)
+THERE = ("192.0.2.2", 2)
 NAT_S = 30.0
 """What the most forgetful NATs keep a binding for."""
 
 
 def up(*, leads: bool = True, now: float = 100.0) -> Probing:
-    subject = Probing(now, leads=leads)
+    subject = Probing(now, RNG, leads=leads)
     subject.came_up(now)
     return subject
 
@@ -36,39 +37,39 @@ def rest(subject: Probing, until: float) -> list[float]:
     while subject.at < until:
         now = subject.at
         asked.append(now)
-        assert subject.answered(subject.ask(now, sealed=True), now + 0.01)
-        subject.plan_up(now, RNG)
+        assert subject.answered(subject.ask(now, THERE, sealed=True), now + 0.01)
+        subject.plan_up(now)
         subject.proven(now + 0.01)
     return asked
 
 
 def test_an_answer_counts_once_as_long_as_the_slowest_path_takes_and_no_longer() -> None:
-    subject = Probing(100.0, leads=True)
-    ids = [subject.ask(100.0 + FIRST_PROBE_S * turn, sealed=turn % 2 == 0) for turn in range(200)]
-    assert subject.answered(ids[0], 110.0) == (100.0, True)
+    subject = Probing(100.0, RNG, leads=True)
+    ids = [subject.ask(100.0 + FIRST_PROBE_S * turn, THERE, sealed=turn % 2 == 0) for turn in range(200)]
+    assert subject.answered(ids[0], 110.0) == (100.0, THERE, True)
     assert subject.answered(ids[0], 110.0) is None
-    assert subject.answered(ids[1], 110.0) == (100.0 + FIRST_PROBE_S, False)
+    assert subject.answered(ids[1], 110.0) == (100.0 + FIRST_PROBE_S, THERE, False)
     assert subject.answered(ids[2], 100.0 + 2 * FIRST_PROBE_S + LONGEST_ANSWER_S) is None
     assert subject.answered(ids[-1] + 1, 110.0) is None
 
 
 def test_what_is_remembered_is_bounded_in_number_and_age() -> None:
-    subject = Probing(100.0, leads=True)
+    subject = Probing(100.0, RNG, leads=True)
     for turn in range(5 * MAX_PROBES_OUT):
-        subject.ask(100.0 + turn * 0.001, sealed=True)
-        subject.ask_back(100.0 + turn * 0.001)
+        subject.ask(100.0 + turn * 0.001, THERE, sealed=True)
+        subject.ask_back(100.0 + turn * 0.001, THERE)
     assert len(subject._out) == len(subject._back) == MAX_PROBES_OUT
-    subject.ask(100.0 + 3 * LONGEST_ANSWER_S, sealed=True)
+    subject.ask(100.0 + 3 * LONGEST_ANSWER_S, THERE, sealed=True)
     assert len(subject._out) == 1
 
 
 def test_who_makes_us_ask_back_does_not_make_us_forget_what_we_asked() -> None:
     """Introductions may be repeated by whoever knows the token of the peer."""
-    subject = Probing(100.0, leads=True)
-    mine = subject.ask(100.0, sealed=True)
+    subject = Probing(100.0, RNG, leads=True)
+    mine = subject.ask(100.0, THERE, sealed=True)
     for _ in range(5 * MAX_PROBES_OUT):
-        subject.ask_back(100.1)
-    assert subject.answered(mine, 100.2) == (100.0, True)
+        subject.ask_back(100.1, THERE)
+    assert subject.answered(mine, 100.2) == (100.0, THERE, True)
 
 
 def test_a_path_that_rests_is_asked_ever_less_often_but_before_any_nat_forgets_it() -> None:
@@ -97,7 +98,7 @@ def test_a_path_that_is_needed_is_asked_at_once_unless_it_just_answered() -> Non
     rest(subject, 1000.0)
     subject.needed(1000.0)
     assert subject.at == 1000.0
-    subject.plan_up(1000.0, RNG)
+    subject.plan_up(1000.0)
     subject.proven(1000.05)
     before = subject.at
     subject.needed(1000.1)
@@ -111,8 +112,8 @@ def test_who_does_not_lead_asks_along_with_its_answers_and_alone_only_when_nobod
         alone += watcher.at < now
         watcher.asked(now)
         if watcher.at == now:
-            assert watcher.answered(watcher.ask(now, sealed=True), now + 0.01)
-            watcher.plan_up(now, RNG)
+            assert watcher.answered(watcher.ask(now, THERE, sealed=True), now + 0.01)
+            watcher.plan_up(now)
             watcher.proven(now + 0.01)
     assert alone == 0
     assert watcher.at <= 1000.0 + WATCH_FACTOR * (1 + IDLE_SPREAD) * MAX_IDLE_PROBE_S
@@ -123,11 +124,11 @@ def test_who_does_not_lead_asks_along_with_its_answers_and_alone_only_when_nobod
 def test_what_is_down_is_looked_for_more_rarely_by_who_does_not_lead() -> None:
     for leads, slowest in ((True, MAX_PROBE_S), (False, MAX_WATCH_PROBE_S)):
         for was_up in (False, True):
-            subject = up(leads=leads) if was_up else Probing(100.0, leads=leads)
+            subject = up(leads=leads) if was_up else Probing(100.0, RNG, leads=leads)
             now = 100.0
             for _ in range(400):
-                subject.ask(now, sealed=False)
-                subject.plan_down(now, RNG)
+                subject.ask(now, THERE, sealed=False)
+                subject.plan_down(now)
                 now = subject.at
             assert subject.at - subject.last_at == pytest.approx(slowest, rel=0.11)
 
@@ -136,12 +137,12 @@ def test_what_is_down_is_looked_for_more_rarely_by_who_does_not_lead() -> None:
 @pytest.mark.parametrize("was_up", [False, True])
 def test_a_peer_of_many_addresses_gets_no_more_probes_than_one_of_some(was_up: bool) -> None:
     def asked(addresses: int) -> float:
-        subject = up() if was_up else Probing(100.0, leads=True)
+        subject = up() if was_up else Probing(100.0, RNG, leads=True)
         subject.crowd = addresses
         now, probes = 100.0, 0
         while now < 1100.0:
-            subject.ask(now, sealed=False)
-            subject.plan_down(now, RNG)
+            subject.ask(now, THERE, sealed=False)
+            subject.plan_down(now)
             subject.hasten(now, 0.0)
             probes += now > 600.0
             now = subject.at
@@ -151,10 +152,10 @@ def test_a_peer_of_many_addresses_gets_no_more_probes_than_one_of_some(was_up: b
 
 
 def test_no_wish_makes_it_ask_twice_in_a_round_trip() -> None:
-    subject = Probing(100.0, leads=True)
+    subject = Probing(100.0, RNG, leads=True)
     for _ in range(20):
-        subject.ask(100.0, sealed=False)
-        subject.plan_down(100.0, RNG)
+        subject.ask(100.0, THERE, sealed=False)
+        subject.plan_down(100.0)
     subject.hasten(100.01, 0.0)
     assert subject.at == pytest.approx(100.0 + FIRST_PROBE_S)
     subject.at = 101.0
