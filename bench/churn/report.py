@@ -48,7 +48,7 @@ class Outcome:
                 found.append(f"{client}: nothing was sent")
         for growth in self.growths:
             if growth.grows:
-                grown = f"{growth.rss_mb:.1f} MB and {growth.threads} threads"
+                grown = f"{growth.rss_mb:.1f} ± {growth.rss_error_mb:.1f} MB and {growth.threads} threads"
                 found.append(f"{growth.name} grew by {grown} in {growth.span_s:.0f} s")
         return found
 
@@ -143,7 +143,7 @@ def _processes(outcome: Outcome) -> Table:
         table.add_row(
             growth.name,
             *("-" if sample is None else f"{sample.rss_mb:.0f}/{sample.threads}" for sample in samples),
-            f"{growth.rss_mb:+.1f}/{growth.threads:+d}",
+            f"{growth.rss_mb:+.1f}±{growth.rss_error_mb:.1f}/{growth.threads:+d}",
             verdict,
         )
     return table

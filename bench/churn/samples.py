@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +15,10 @@ if TYPE_CHECKING:
     from bench.system import Part
 
 MAX_GROWTH_MB = 4.0
-"""Over the second half of a run, by a straight line through it: above what the allocator's steps amount to, far below
-a leak of one object for each request of ten minutes."""
+"""Over the second half of a run, by a straight line through the least of each minute, less twice its standard error:
+above what the allocator's steps amount to, far below a leak of one object for each request of ten minutes. Answers of
+16 MB come and go: what lies there between them is what adds up."""
+LEAST_OF_S = 60.0
 MAX_MORE_THREADS = 2
 """gRPC starts and ends threads of its own."""
 MIN_JUDGED_S = 120.0
@@ -54,7 +57,9 @@ class Growth:
     name: str
     span_s: float
     rss_mb: float
-    """By a straight line through its samples."""
+    """By a straight line through the least of each minute ..."""
+    rss_error_mb: float
+    """... and twice the standard error of that."""
     threads: int
     """By how much the most at once in the last quarter exceed those in the third."""
     judged: bool
@@ -63,7 +68,7 @@ class Growth:
     @property
     def grows(self) -> bool:
         """Whether it is judged to leak."""
-        return self.judged and (self.rss_mb > MAX_GROWTH_MB or self.threads > MAX_MORE_THREADS)
+        return self.judged and (self.rss_mb - self.rss_error_mb > MAX_GROWTH_MB or self.threads > MAX_MORE_THREADS)
 
 
 class Watch:
@@ -96,23 +101,38 @@ def growth(life: Life, length_s: float, every_s: float) -> Growth:
     """How one process grew over the second half of a run of `length_s`."""
     half = [sample for sample in life.samples if sample.at_s >= length_s / 2]
     if len(half) < 3:
-        return Growth(life.name, 0.0, 0.0, 0, judged=False)
+        return Growth(life.name, 0.0, 0.0, 0.0, 0, judged=False)
     span_s = half[-1].at_s - half[0].at_s
     whole = half[0].at_s <= length_s / 2 + 2 * every_s
-    slope = slope_of([(sample.at_s, sample.rss_mb) for sample in half])
+    least: dict[int, float] = {}
+    for sample in half:
+        minute = int(sample.at_s // LEAST_OF_S)
+        least[minute] = min(sample.rss_mb, least.get(minute, math.inf))
+    slope, error = slope_of([(minute * LEAST_OF_S, rss_mb) for minute, rss_mb in least.items()])
     # They come and go with connections: what adds up is a higher peak.
     middle = len(half) // 2
     threads = max(sample.threads for sample in half[middle:]) - max(sample.threads for sample in half[:middle])
-    return Growth(life.name, span_s, slope * span_s, threads, judged=whole and span_s >= MIN_JUDGED_S - 2 * every_s)
+    return Growth(
+        life.name,
+        span_s,
+        slope * span_s,
+        2 * error * span_s,
+        threads,
+        judged=whole and span_s >= MIN_JUDGED_S - 2 * every_s,
+    )
 
 
-def slope_of(points: Sequence[tuple[float, float]]) -> float:
-    """Slope of the straight line of least squares."""
+def slope_of(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Slope of the straight line of least squares, and its standard error."""
     count = len(points)
     mean_x = sum(x for x, _ in points) / count
     mean_y = sum(y for _, y in points) / count
     spread = sum((x - mean_x) ** 2 for x, _ in points)
-    return sum((x - mean_x) * (y - mean_y) for x, y in points) / spread if spread else 0.0
+    if not spread:
+        return 0.0, 0.0
+    slope = sum((x - mean_x) * (y - mean_y) for x, y in points) / spread
+    rest = sum((y - mean_y - slope * (x - mean_x)) ** 2 for x, y in points)
+    return slope, math.sqrt(rest / (count - 2) / spread) if count > 2 else 0.0
 
 
 def _read(pid: int) -> tuple[float, int] | None:
