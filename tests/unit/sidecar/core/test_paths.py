@@ -189,6 +189,8 @@ def test_probes_go_to_every_candidate_until_the_path_is_up() -> None:
     subject = new()
     assert destinations(subject) == (HERE, THERE)
     subject.address.move(ELSEWHERE, 100.0)
+    assert destinations(subject) == (HERE, THERE), "nothing came from there"
+    subject.address.came(ELSEWHERE, 50)
     assert destinations(subject) == (ELSEWHERE, HERE, THERE)
     subject.address.move(THERE, 100.0)
     assert destinations(subject) == (HERE, THERE)
@@ -199,6 +201,7 @@ def test_probes_go_to_every_candidate_until_the_path_is_up() -> None:
 def test_after_a_rebinding_every_candidate_is_asked_until_one_answers() -> None:
     subject = up()
     subject.address.move(ELSEWHERE, 100.0)
+    subject.address.came(ELSEWHERE, 50)
     assert destinations(subject) == (ELSEWHERE,)
     subject.start_afresh(101.0)
     assert subject.state is PathState.UNSTABLE
