@@ -185,7 +185,7 @@ class Path:
     def _may_look_at(self, address: Address, now: float, size: int) -> bool:
         if self.address.proven(address):
             return True
-        if address == self.remote:
+        if address == self.remote and address not in self.candidates:
             return (self.address.allowance or 0) >= size
         return self.unproven.take(now, size)
 
