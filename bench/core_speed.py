@@ -30,6 +30,7 @@ from protos.model import (
     ServiceOffer,
     Version,
 )
+from protos.pair_token import pair_token
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ExecuteRequest, RequestFailed, RequestId, ResponseArrived
@@ -70,13 +71,14 @@ class Side:
         self.answered = 0
         self.datagrams = 0
 
-    def as_peer(self) -> Peer:
+    def told_to(self, other: Side) -> Peer:
+        """What the control plane would tell the other one."""
         candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, self.address)
         return Peer(
             self.name,
             self.role,
             self.session,
-            self.token,
+            pair_token(self.token, other.name, other.role),
             1,
             (candidate,),
             self.offers,
@@ -120,7 +122,7 @@ class Pair:
         self.early: defaultdict[NodeName, list[Batch]] = defaultdict(list)
         """What left in the turns between two batches, and is still to be carried."""
         for side, other in ((self.robot, self.cloud), (self.cloud, self.robot)):
-            side.engine.apply_peers(PeerSet(Version(1), 1, (other.as_peer(),)), self.now)
+            side.engine.apply_peers(PeerSet(Version(1), 1, (other.told_to(side),)), self.now)
         while SERVICE not in {use.name for use in self._carried()}:
             self.step()
 

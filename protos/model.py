@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, NewType
 from protos.preferences import EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from protos.histogram import Histogram
     from protos.preferences import InterfaceLabel
 
@@ -40,7 +42,7 @@ Address = tuple[str, int]
 """IP address in its canonical text form and UDP port; IPv4-mapped IPv6 addresses are written as IPv4."""
 
 TOKEN_BYTES = 16
-"""Size of the stable secret of a sidecar."""
+"""Size of the stable secret of a sidecar, and of what each peer is told of it (`protos/pair_token.py`)."""
 
 POLICY_PENDING = 0
 """In place of a policy's fingerprint: nothing is to be judged by it yet, as peers may still be coming back."""
@@ -157,6 +159,7 @@ class Peer:
     role: Role
     session: SessionId
     token: bytes = field(repr=False)
+    """What it introduces itself with to whoever holds this; inside the control plane its own, which nobody is told."""
     incarnation: int
     candidates: tuple[Candidate, ...] = ()
     offers: tuple[ServiceOffer, ...] = ()
@@ -164,6 +167,21 @@ class Peer:
     credential: bytes = field(default=b"", repr=False)
     may_call: CallPermit = NO_CALLS
     """Of a robot, told to clouds; nothing unless said otherwise."""
+
+    def with_token(self, token: bytes) -> Peer:
+        """Return it with another token, three times as fast as `replace`: a control plane does it 100,000 times."""
+        return Peer(
+            self.name,
+            self.role,
+            self.session,
+            token,
+            self.incarnation,
+            self.candidates,
+            self.offers,
+            self.draining,
+            self.credential,
+            self.may_call,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +198,7 @@ class PeerSet:
 
     version: Version
     nonce: int
-    peers: tuple[Peer, ...] = ()
+    peers: Sequence[Peer] = ()
     removed: tuple[RemovedPeer, ...] = ()
     policy: int = POLICY_PENDING
     """Fingerprint of the access policy that this set follows, or POLICY_PENDING, or NO_POLICY."""
@@ -224,6 +242,7 @@ class Registration:
     role: Role
     session: SessionId
     token: bytes = field(repr=False)
+    """Its own, for the control plane alone."""
     incarnation: int
     software_version: str
     peers_version: Version = Version(0)

@@ -3,7 +3,7 @@
     offset  size
          0     8  magic: "plr-id\\0\\0" identity, "plr-last" last good messages of the control plane,
                   "plr-ctrl" addresses of the control plane that worked
-         8     2  format version, 1
+         8     2  format version: 2 of last good messages, 1 of the others
         10     4  length of the body
         14    32  SHA-256 of the body
         46        body
@@ -33,7 +33,10 @@ if TYPE_CHECKING:
     from protos.model import Address, ControlMessage
 
 FORMAT_VERSION = 1
-"""Of both files; an unknown one is refused."""
+"""Of a file; another one is refused."""
+
+LAST_GOOD_VERSION = 2
+"""Since 2 the tokens of peers are those for this sidecar alone."""
 
 MAX_FILE_BYTES = 64 << 20
 """Well above the largest peer set and mapping that the control stream can carry."""
@@ -107,12 +110,12 @@ def encode_last_good(last: LastGood) -> bytes:
         if message is not None:
             data = control_message_to_proto(message).SerializeToString(deterministic=True)
             parts += [_LENGTH.pack(len(data)), data]
-    return _seal(_LAST_GOOD_MAGIC, b"".join(parts))
+    return _seal(_LAST_GOOD_MAGIC, b"".join(parts), LAST_GOOD_VERSION)
 
 
 def decode_last_good(data: bytes, owner: NodeName) -> LastGood:
     """Read the file's content; raises DecodeError, also when another sidecar wrote it."""
-    body = _open(_LAST_GOOD_MAGIC, data)
+    body = _open(_LAST_GOOD_MAGIC, data, LAST_GOOD_VERSION)
     if not body:
         raise DecodeError("no owner")
     end = 1 + body[0]
@@ -176,18 +179,18 @@ def _pull_message(body: bytes, start: int) -> tuple[ControlMessage, int]:
     return parse_control_message(body[begin:end]), end
 
 
-def _seal(magic: bytes, body: bytes) -> bytes:
-    return _HEADER.pack(magic, FORMAT_VERSION, len(body), hashlib.sha256(body).digest()) + body
+def _seal(magic: bytes, body: bytes, version: int = FORMAT_VERSION) -> bytes:
+    return _HEADER.pack(magic, version, len(body), hashlib.sha256(body).digest()) + body
 
 
-def _open(magic: bytes, data: bytes) -> bytes:
+def _open(magic: bytes, data: bytes, known_version: int = FORMAT_VERSION) -> bytes:
     if len(data) < _HEADER.size:
         raise DecodeError(f"{len(data)} bytes are no header")
     found, version, length, digest = _HEADER.unpack_from(data)
     if found != magic:
         raise DecodeError("not a file of this kind")
-    if version != FORMAT_VERSION:
-        raise DecodeError(f"format version {version}, not {FORMAT_VERSION}")
+    if version != known_version:
+        raise DecodeError(f"format version {version}, not {known_version}")
     body = data[_HEADER.size :]
     if len(body) != length:
         raise DecodeError(f"body of {len(body)} bytes, not {length}")

@@ -20,6 +20,7 @@ from controlplane.core import reconcile
 from controlplane.core.control_events import Send
 from controlplane.core.registry import MAX_SIDECARS
 from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
+from controlplane.core.told_peers import ToldPeers
 from controlplane.core.views import Views
 from protos.model import POLICY_PENDING, ResourceKind, Role
 
@@ -152,8 +153,9 @@ class Publisher:
         judged = self.warm_until is None or not permits.restricted
         view = PeerView(views.peers_of(sidecar), permits.fingerprint if judged else POLICY_PENDING)
         if snapshots.peers.send_again or view != snapshots.peers.sent:
+            told = ToldPeers(view.peers, sidecar.name, sidecar.role)
             removed = views.removed(sidecar, snapshots.known_names)
-            yield Send(stream, snapshots.send_peers(view, removed, self._versions))
+            yield Send(stream, snapshots.send_peers(view, told, removed, self._versions))
 
     def _mapping(self, robot: Sidecar, stream: StreamId, views: Views, plan: Plan, picture: Picture) -> Iterator[Send]:
         snapshots = self._snapshots[robot.name]

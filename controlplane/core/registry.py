@@ -103,7 +103,7 @@ class Sidecar:
         return self.services.uses if self.services is not None else ()
 
     def as_peer(self) -> Peer:
-        """What its peers are told of it."""
+        """What its peers are told of it, but with its own token; each is told the one made for it (`ToldPeers`)."""
         return Peer(
             name=self.registration.name,
             role=self.registration.role,

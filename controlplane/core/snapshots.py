@@ -9,6 +9,7 @@ from protos.model import POLICY_PENDING, MappingSet, PeerSet, ResourceKind, Vers
 from protos.status import ResourceStatus, SyncState
 
 if TYPE_CHECKING:
+    from controlplane.core.told_peers import ToldPeers
     from protos.model import Ack, Nack, NodeName, Peer, RemovedPeer, ServiceMapping
 
 C = TypeVar("C")
@@ -130,11 +131,13 @@ class Snapshots:
         self.known_names: set[NodeName] = set()
         """Peers the sidecar may know: of the set it acknowledged last and of all sent since."""
 
-    def send_peers(self, view: PeerView, removed: tuple[RemovedPeer, ...], versions: VersionSource) -> PeerSet:
-        """Send the sidecar its peers."""
+    def send_peers(
+        self, view: PeerView, told: ToldPeers, removed: tuple[RemovedPeer, ...], versions: VersionSource
+    ) -> PeerSet:
+        """Send the sidecar its peers; `told` is the view's as this sidecar is told of them."""
         version = self.peers.send(view, versions)
         self.known_names.update(peer.name for peer in view.peers)
-        return PeerSet(version, self.peers.nonce, view.peers, removed, view.policy)
+        return PeerSet(version, self.peers.nonce, told, removed, view.policy)
 
     def send_mapping(self, services: tuple[ServiceMapping, ...], versions: VersionSource) -> MappingSet:
         """Send the sidecar its mapping."""

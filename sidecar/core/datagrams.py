@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
+from protos.model import Role
+from protos.pair_token import pair_token
 from sidecar.core import frame
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import (
@@ -27,7 +29,7 @@ from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
     from protos.credential import SessionCredential
-    from protos.model import Address, InterfaceId, InterfaceName, NodeName, Role, SessionId
+    from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.paths import Path
     from sidecar.core.send_queue import Run
@@ -58,6 +60,7 @@ class LinkIdentity:
     role: Role
     session: SessionId
     token: bytes = field(repr=False)
+    """Our own; each peer knows what follows from it for that peer (`protos/pair_token.py`)."""
     credential: bytes = field(repr=False)
     """Encoded."""
 
@@ -299,7 +302,8 @@ class DatagramBuilder:
     def _add_introduction(self, path: Path, address: Address, probe_id: int, burst: Burst) -> None:
         me = self.identity
         header = Header(me.interface_id, path.remote_id, me.session, path.recovery.take_numbers())
-        datagram = encode_introduction(header, me.token, path.peer, probe_id, me.credential)
+        token = pair_token(me.token, path.peer, Role.CLOUD if me.role is Role.ROBOT else Role.ROBOT)
+        datagram = encode_introduction(header, token, path.peer, probe_id, me.credential)
         self._add_alone(path, address, datagram, burst)
 
     def _answer_introductions(self, path: Path, burst: Burst, now: float) -> None:

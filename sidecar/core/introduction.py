@@ -6,15 +6,17 @@ Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
     sealed:  probe id (64), credential (protos/credential.py)
     tag (16 bytes)
 
-The token is stable, and known to the sender's peers from the control plane: a gate that costs a stranger's datagram a
-look into a table. Behind it stands ChaCha20-Poly1305 with a key from Expand(token, "plr 2 introduction" | session |
-sender's interface | receiver's interface | receiver's name), the clear bytes and the hello id as associated data, and
-the nonce of every datagram (frame.py): one key for each path of a session, on which packet numbers do not repeat.
+The token is the sender's for this receiver (`protos/pair_token.py`): stable, and known to these two and the control
+plane alone. It is a gate that costs a stranger's datagram a look into a table. Behind it stands ChaCha20-Poly1305 with
+a key from Expand(token, "plr 2 introduction" | session | sender's interface | receiver's interface | receiver's name),
+the clear bytes and the hello id as associated data, and the nonce of every datagram (frame.py): one key for each path
+of a session, on which packet numbers do not repeat.
 
-Every peer of the sender knows the token, so this proves little: the credential says who it is, by its signature, and
-the sealed datagrams that follow prove that it has the session's key. Until then nothing moves, nothing counts as
-received, and the answer is shorter than the question. Who repeats itself could not read the answer, since it does not
-know our session: while the path is down here as well, our own introductions, as rare as they are, go there too.
+The control plane knows the token too, and so does whoever reads the receiver's state folder. So this proves little: the
+credential says who it is, by its signature, and the sealed datagrams that follow prove that it has the session's key.
+Until then nothing moves, nothing counts as received, and the answer is shorter than the question. Who repeats itself
+could not read the answer, since it does not know our session: while the path is down here as well, our own
+introductions, as rare as they are, go there too.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ class Introduction(NamedTuple):
 
 @lru_cache(maxsize=8192)
 def hello_id(token: bytes) -> bytes:
-    """Return the name under which the owner of a token introduces itself."""
+    """Return the name under which a sidecar introduces itself to the one peer that holds this token of it."""
     return expand(token, b"plr 2 hello id", HELLO_BYTES)
 
 
@@ -71,14 +73,14 @@ def read_hello_id(datagram: memoryview) -> bytes:
 
 
 def encode_introduction(header: Header, token: bytes, receiver: NodeName, probe_id: int, credential: bytes) -> bytes:
-    """Return the whole datagram; `token` is ours, `credential` ours and encoded."""
+    """Return the whole datagram; `token` is ours for the receiver, `credential` ours and encoded."""
     clear = encode_header(header._replace(flags=INTRODUCTION_FLAGS)) + hello_id(token)
     plain = _PROBE_ID.pack(probe_id) + credential
     return clear + _cipher(header, token, receiver).encrypt(clear[NONCE_OFFSET:HEADER_BYTES], plain, clear)
 
 
 def open_introduction(header: Header, datagram: memoryview, token: bytes, receiver: NodeName) -> Introduction:
-    """Open and parse the datagram with this header; `token` is the sender's, `receiver` our name.
+    """Open and parse the datagram with this header; `token` is the sender's for us, `receiver` our name.
 
     Raises:
         UnauthenticError: it is not of one who knows the token.

@@ -21,6 +21,7 @@ class LinkPeer:
     name: NodeName
     session: SessionId
     token: bytes = field(repr=False)
+    """What it introduces itself to us with."""
     incarnation: int
     credential: bytes = field(repr=False)
     keys: PairKeys
@@ -255,7 +256,7 @@ class PathMeasured:
 
 @dataclass(frozen=True, slots=True)
 class PeerRestarted:
-    """Somebody who knows a peer's token introduced a newer session of it; the credential is not verified yet."""
+    """Somebody who knows a peer's token for us introduced a newer session of it; the credential is not verified yet."""
 
     peer: NodeName
     credential: SessionCredential

@@ -89,7 +89,7 @@ class PathTable:
             return path
         others = self.to(peer.name)
         if len(others) >= MAX_PATHS_OF_A_PEER:
-            # Whoever knows the token could fill the table with interfaces that do not exist.
+            # The peer, or whoever stole its token for us, could fill the table with interfaces that do not exist.
             unproven = next((path for path in others if path.remote is None and not path.candidates), None)
             if unproven is None:
                 self.stats.dropped["paths_full"] += 1

@@ -1,9 +1,9 @@
 """How often a credential that came in an introduction is looked at: each look is public-key work, some 0.3 ms.
 
-Whoever knows a peer's token, as every node that may talk to it does, can send as many credentials as it likes. So the
-looks are counted, apart from how often a peer may restart: what is forged costs looks, and the genuine one, which
-comes again several times a second, gets its turn among them. What comes from where the peer is known to be is counted
-apart from the rest: whoever forges must forge that address as well.
+Whoever knows a peer's token for us, as the control plane does, can send as many credentials as it likes. So the looks
+are counted, apart from how often a peer may restart: what is forged costs looks, and the genuine one, which comes again
+several times a second, gets its turn among them. What comes from where the peer is known to be is counted apart from
+the rest: whoever forges must forge that address as well.
 """
 
 from __future__ import annotations

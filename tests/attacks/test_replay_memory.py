@@ -51,7 +51,8 @@ class Flood:
         for number in PHANTOMS:
             interface = InterfaceId(number)
             head = Header(interface, InterfaceId(0), session, 1)
-            introduction = encode_introduction(head, self._evil.token, cloud.name, 7, credential.encode())
+            token = self._evil.told_to(cloud).token
+            introduction = encode_introduction(head, token, cloud.name, 7, credential.encode())
             self._mesh.inject(("evil.wlan0", 1), to, introduction)
             if self._proven:
                 sealing = make_path_keys(keys, interface, InterfaceId(0), DEFAULT_LIMITS, 0.0).sealing
@@ -74,7 +75,7 @@ def show_all_but(mesh: Mesh, *away: NodeName) -> None:
     mesh.version += 1
     for node in mesh.nodes.values():
         others = (other for other in mesh.nodes.values() if other.role is not node.role and other.name not in away)
-        peers = tuple(other.as_peer() for other in others)
+        peers = tuple(other.told_to(node) for other in others)
         assert node.engine.apply_peers(PeerSet(Version(mesh.version), mesh.version, peers), mesh.now) is None
         mesh.pump(node)
 
@@ -159,7 +160,7 @@ def test_a_forgotten_session_is_refused_and_a_newer_one_is_not() -> None:
     evil, cloud = mesh.add("evil", Role.ROBOT, ["wlan0"], (rule(),)), mesh.cloud("cloud-a")
     mesh.push_views()
     mesh.run(5)
-    old = evil.as_peer()
+    old = evil.told_to(cloud)
     cut(mesh, "evil.wlan0", off=True)
     Flood(mesh, evil, cloud, proven=True).run()
     mesh.run(30)
@@ -167,7 +168,7 @@ def test_a_forgotten_session_is_refused_and_a_newer_one_is_not() -> None:
     mesh.run(1)
     link = of_cloud(cloud)
     mesh.version += 1
-    views = (mesh.nodes["robot"].as_peer(), old)
+    views = (mesh.nodes["robot"].told_to(cloud), old)
     assert cloud.engine.apply_peers(PeerSet(Version(mesh.version), mesh.version, views), mesh.now) is None
     mesh.pump(cloud)
     assert not link._table.to(evil.name)

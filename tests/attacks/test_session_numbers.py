@@ -29,7 +29,7 @@ def test_a_living_robot_keeps_its_session_though_another_registered_with_its_num
     mesh.run(3)
     taken = session_of("evil", Role.ROBOT, robot.session, evil.incarnation + 5)
     squatter = replace(
-        evil.as_peer(),
+        evil.told_to(cloud),
         session=robot.session,
         incarnation=evil.incarnation + 5,
         credential=taken.credential.encode(),

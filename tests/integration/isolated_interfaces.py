@@ -138,7 +138,7 @@ class Robot:
                 "services": [{"name": service} for service in services],
             }
             offers = tuple(ServiceOffer(service, TYPE) for service in services if mapping[service][1] == name)
-            peers.append(dataclasses.replace(peer_of(cloud.ask("start", config=config)), offers=offers))
+            peers.append(dataclasses.replace(peer_of(cloud.ask("start", config=config), own.credential), offers=offers))
             cloud.ask("meet", peers=[me])
         self.plane.start()
         for thread in self.threads.values():

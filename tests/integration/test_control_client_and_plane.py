@@ -38,6 +38,7 @@ from protos.model import (
     SessionId,
     Welcome,
 )
+from protos.pair_token import pair_token
 from sidecar.control_client import ControlClient
 from sidecar.core import control_session
 from sidecar.core.control_session import ControlSession
@@ -190,7 +191,7 @@ def test_sidecars_learn_of_each_other_and_of_their_mapping(tmp_path: Path) -> No
     with control_plane.running(), mesh(control_plane.port) as (robot, cloud):
         seen = robot.expect_peers(lambda peers: names(peers) == {"cloud-a"} and bool(peers.peers[0].offers))
         assert seen.peers[0].candidates[0].address == ("192.0.2.2", 24700)
-        assert seen.peers[0].token == bytes([2] * 16)
+        assert seen.peers[0].token == pair_token(bytes([2] * 16), NodeName("robot-1"), Role.ROBOT)
         cloud.expect_peers(lambda peers: names(peers) == {"robot-1"})
         mapping = robot.expect_mapping_to("cloud-a")
         assert mapping.services[0].service == PLAN

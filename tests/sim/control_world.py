@@ -221,7 +221,7 @@ class World:
         if not refused:
             in_force = message.version
             if isinstance(message, PeerSet):
-                sidecar.peers, sidecar.peers_version = message.peers, message.version
+                sidecar.peers, sidecar.peers_version = tuple(message.peers), message.version
                 sidecar.removed = {removed.name: removed.reason for removed in message.removed}
             else:
                 sidecar.services, sidecar.mapping_version = message.services, message.version

@@ -113,7 +113,7 @@ class JoinedPlanes:
     def _believed(self, node: Node, told: PeerSet) -> PeerSet:
         if node.name not in self.rogues:
             return told
-        others = (other.as_peer() for other in self.mesh.nodes.values() if other.role is not node.role)
+        others = (other.told_to(node) for other in self.mesh.nodes.values() if other.role is not node.role)
         return dataclasses.replace(told, peers=tuple(others), removed=(), policy=0)
 
 

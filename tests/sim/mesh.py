@@ -25,6 +25,7 @@ from protos.model import (
     SessionId,
     Version,
 )
+from protos.pair_token import pair_token
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestId, ResponseArrived
@@ -142,7 +143,12 @@ class Node:
         """Of the destination's family."""
         return next(one for one in self.addresses(interface) if one[0].endswith(IPV6) == destination[0].endswith(IPV6))
 
+    def told_to(self, other: Node) -> Peer:
+        """What the control plane tells another sidecar of it."""
+        return replace(self.as_peer(), token=pair_token(self.token, other.name, other.role))
+
     def as_peer(self) -> Peer:
+        """With its own token, as it registers."""
         candidates = tuple(
             Candidate(InterfaceId(number), interface, CandidateKind.HOST, address)
             for number, interface in enumerate(self.interfaces)
@@ -241,7 +247,7 @@ class Mesh:
         self.version += 1
         for node in self.nodes.values():
             peers = tuple(
-                other.as_peer() for other in self.nodes.values() if other.role is not node.role and other.alive
+                other.told_to(node) for other in self.nodes.values() if other.role is not node.role and other.alive
             )
             assert node.engine.apply_peers(PeerSet(Version(self.version), self.version, peers), node.now) is None
             self.pump(node)

@@ -101,7 +101,10 @@ def test_keys_stay_while_nobody_confirms_them_and_go_on_after_the_outage() -> No
 @pytest.mark.parametrize("restarting", [("cloud-a",), ("robot",), ("cloud-a", "robot")])
 def test_restarts_are_introduced_and_proven_without_a_control_plane(restarting: tuple[str, ...]) -> None:
     mesh, robot, _ = pair()
-    views = {name: tuple(other.as_peer() for other in mesh.nodes.values() if other.name != name) for name in mesh.nodes}
+    views = {
+        name: tuple(other.told_to(node) for other in mesh.nodes.values() if other is not node)
+        for name, node in mesh.nodes.items()
+    }
     for name in restarting:
         node = mesh.nodes[name]
         node.alive = False
@@ -115,7 +118,7 @@ def test_restarts_are_introduced_and_proven_without_a_control_plane(restarting: 
 
 
 def test_a_restart_that_somebody_else_introduces_is_not_believed() -> None:
-    """Who knows the robot's token (another of its clouds) says that it restarted, with a key of its own."""
+    """Who knows what the robot introduces itself with (the control plane) says that it restarted, with another key."""
     mesh, robot, cloud = pair()
     forged = credential_of("robot", robot.role, 77, incarnation=robot.incarnation + 10**9)
 
@@ -128,7 +131,8 @@ def test_a_restart_that_somebody_else_introduces_is_not_believed() -> None:
     eth0, first = cloud.interfaces[0], InterfaceId(0)
     for number in range(10):
         header = frame.Header(first, first, forged.session, number)
-        data = encode_introduction(header, robot.token, cloud.name, 1, forged.encode())
+        token = robot.told_to(cloud).token
+        data = encode_introduction(header, token, cloud.name, 1, forged.encode())
         mesh.inject(("elsewhere", 666), cloud.address(eth0), data)
         robot.submit(bytes([number]))
         mesh.run(0.05)

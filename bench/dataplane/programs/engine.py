@@ -36,6 +36,7 @@ from protos.model import (
     SessionId,
     Version,
 )
+from protos.pair_token import pair_token
 from sidecar.config import SidecarConfig
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, RequestId, ResponseArrived
@@ -101,7 +102,8 @@ class EngineProgram:
         """Take these peers, and (robot) send every request over these (interface, server) pairs."""
         self._version += 1
         version = Version(self._version)
-        error = self._plane.apply_peers(PeerSet(version, self._version, tuple(peer_of(peer) for peer in peers)))
+        known = tuple(peer_of(peer, self._own.credential) for peer in peers)
+        error = self._plane.apply_peers(PeerSet(version, self._version, known))
         if error is None and mapping is not None:
             pairs = tuple(Assignment(InterfaceName(interface), NodeName(server)) for interface, server in mapping)
             services = (ServiceMapping(SERVICE, pairs),)
@@ -198,15 +200,15 @@ def described(credential: SessionCredential, token: bytes, candidates: Sequence[
     }
 
 
-def peer_of(fields: dict[str, Any]) -> Peer:
-    """Return the peer that was `described`."""
+def peer_of(fields: dict[str, Any], receiver: SessionCredential) -> Peer:
+    """Return the peer that was `described`, as the control plane tells this one of it."""
     role = Role(fields["role"])
     candidates = tuple(
         Candidate(c["interface_id"], c["interface"], CandidateKind(c["kind"]), (c["address"][0], c["address"][1]))
         for c in fields["candidates"]
     )
     offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
-    token = base64.b64decode(fields["token"])
+    token = pair_token(base64.b64decode(fields["token"]), receiver.name, receiver.role)
     return Peer(
         fields["name"],
         role,

@@ -150,6 +150,7 @@ class Register(_message.Message):
     role: _types_pb2.Role.ValueType
     session: _builtins.int
     token: _builtins.bytes
+    """Its own secret, for the control plane alone; peers are told what follows from it for each (protos/pair_token.py)."""
     incarnation: _builtins.int
     software_version: _builtins.str
     peers_version: _builtins.int

@@ -247,7 +247,7 @@ class Peer(_message.Message):
     session: _builtins.int
     """Identifies this run of the sidecar in the header of every datagram it sends."""
     token: _builtins.bytes
-    """Stable secret of the sidecar: proves a new session when the control plane is away."""
+    """What it introduces itself with to the sidecar that this is sent to, and to no other (protos/pair_token.py)."""
     incarnation: _builtins.int
     """Grows with every start of the sidecar."""
     draining: _builtins.bool

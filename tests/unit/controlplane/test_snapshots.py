@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from controlplane.core.snapshots import PeerView, Snapshots, Track, VersionSource
+from controlplane.core.told_peers import ToldPeers
 from protos.model import (
     Ack,
     Nack,
@@ -102,7 +103,7 @@ def test_a_refusal_for_the_same_reason_is_no_news_until_something_is_taken(versi
 
 def test_only_what_is_refused_is_sent_again(versions: VersionSource) -> None:
     snapshots = Snapshots()
-    snapshots.send_peers(PeerView((peer("a"),)), (), versions)
+    send_peers(snapshots, versions, "a")
     snapshots.send_mapping((), versions)
     snapshots.send_refused_again()
     assert not snapshots.peers.send_again
@@ -193,10 +194,15 @@ def peer(name: str) -> Peer:
     return Peer(NodeName(name), Role.CLOUD, SessionId(1), bytes(16), 1)
 
 
+def send_peers(snapshots: Snapshots, versions: VersionSource, *names: str) -> None:
+    peers = tuple(peer(name) for name in names)
+    snapshots.send_peers(PeerView(peers), ToldPeers(peers, NodeName("robot"), Role.ROBOT), (), versions)
+
+
 def test_names_a_sidecar_may_know_grow_until_it_acknowledges(versions: VersionSource) -> None:
     snapshots = Snapshots()
-    snapshots.send_peers(PeerView((peer("a"), peer("b"))), (), versions)
-    snapshots.send_peers(PeerView((peer("b"), peer("c"))), (), versions)
+    send_peers(snapshots, versions, "a", "b")
+    send_peers(snapshots, versions, "b", "c")
     assert snapshots.known_names == {"a", "b", "c"}
     stale = Ack(ResourceKind.PEERS, snapshots.peers.version_sent, snapshots.peers.nonce - 1)
     assert not snapshots.peers_acked(stale)

@@ -187,7 +187,7 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
         lambda data: data[:-1],
         lambda data: data + b"\0",
         lambda data: b"X" + data[1:],
-        lambda data: data[:8] + b"\0\2" + data[10:],
+        lambda data: data[:8] + b"\0\7" + data[10:],
         lambda data: data[:-3] + bytes([data[-3] ^ 1]) + data[-2:],
         lambda data: data[:20] + bytes([data[20] ^ 1]) + data[21:],
         lambda data: bytes(len(data)),
@@ -210,6 +210,24 @@ def test_a_spoilt_file_is_set_aside_and_counted_and_the_sidecar_starts(
     assert (tmp_path / f"{name}.refused").read_bytes() == spoilt
     assert (store.last_good == LastGood(OWNER)) == (name == LAST_GOOD_FILE)
     assert len(store.identity.token) == 16
+
+
+def test_what_an_earlier_format_holds_is_set_aside_and_the_identity_stays(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = StateStore(tmp_path, OWNER)
+    store.remember(PEERS)
+    store.close()
+    path = tmp_path / LAST_GOOD_FILE
+    data = path.read_bytes()
+    path.write_bytes(data[:8] + (1).to_bytes(2, "big") + data[10:])
+    token = store.identity.token
+    store = StateStore(tmp_path, OWNER)
+    assert store.last_good == LastGood(OWNER)
+    assert store.identity.token == token
+    assert dict(store.failures) == {"last_good_refused": 1}
+    assert "format version 1, not 2" in caplog.text
+    store.close()
 
 
 def test_another_sidecars_state_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

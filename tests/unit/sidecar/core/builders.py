@@ -20,6 +20,7 @@ from protos.model import (
     ServiceOffer,
     SessionId,
 )
+from protos.pair_token import pair_token
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.events import RequestId
@@ -215,7 +216,7 @@ class Bench:
         """What the peer reads in a datagram of the link: frames, or an introduction."""
         header = decode_header(datagram)
         if header.flags & INTRODUCTION_FLAG:
-            return [open_introduction(header, memoryview(datagram), OUR_TOKEN, A)]
+            return [open_introduction(header, memoryview(datagram), pair_token(OUR_TOKEN, A, Role.CLOUD), A)]
         return [*decode_frames(memoryview(self.plain(datagram)))]
 
     def plain(self, datagram: bytes) -> bytes:

@@ -31,6 +31,7 @@ from protos.model import (
     SessionId,
     Version,
 )
+from protos.pair_token import pair_token
 from sidecar.core.datagrams import Batch, LinkIdentity
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import (
@@ -96,9 +97,10 @@ class Node:
             self.events.append(event)
             self.news.notify_all()
 
-    def as_peer(self) -> Peer:
+    def told_to(self, other: Node) -> Peer:
         candidate = Candidate(InterfaceId(0), InterfaceName("lo"), CandidateKind.HOST, ("127.0.0.1", self.thread.port))
-        peer = Peer(self.name, self.role, self.session, self.token, 1, (candidate,), self.offers, may_call=ALL_CALLS)
+        token = pair_token(self.token, other.name, other.role)
+        peer = Peer(self.name, self.role, self.session, token, 1, (candidate,), self.offers, may_call=ALL_CALLS)
         return replace(peer, credential=self.own.credential.encode())
 
     def start(self, other: Node) -> None:
@@ -107,7 +109,7 @@ class Node:
         self.plane.set_links({InterfaceName("lo"): self.thread})
         self.thread.post(SetReady(ready=True))
         self.plane.set_offers(self.offers)
-        assert self.plane.apply_peers(PeerSet(Version(1), 1, (other.as_peer(),))) is None
+        assert self.plane.apply_peers(PeerSet(Version(1), 1, (other.told_to(self),))) is None
 
     def stop(self) -> None:
         self.plane.stop()
@@ -279,9 +281,9 @@ def test_tells_when_interfaces_or_peers_are_others(nodes: tuple[Node, Node], mon
     told()
     robot.plane.set_links({InterfaceName("lo"): robot.thread})
     assert told()
-    robot.plane.apply_peers(PeerSet(Version(2), 1, (cloud.as_peer(),)))
+    robot.plane.apply_peers(PeerSet(Version(2), 1, (cloud.told_to(robot),)))
     assert told()
-    robot.plane.apply_peers(PeerSet(Version(3), 1, (cloud.as_peer(),) * (MAX_PEERS + 1)))
+    robot.plane.apply_peers(PeerSet(Version(3), 1, (cloud.told_to(robot),) * (MAX_PEERS + 1)))
     assert not told(), "refused"
     robot.plane.trust_changed()
     assert told()
@@ -299,7 +301,7 @@ def test_requests_go_on_while_the_credential_is_signed_anew(nodes: tuple[Node, N
         for node in (robot, cloud):
             renewed = replace(node.own.credential, certificate=bytes([number]), signature=b"again")
             node.plane.renew_credential(renewed)
-        robot.plane.apply_peers(PeerSet(Version(number + 2), 1, (cloud.as_peer(),)))
+        robot.plane.apply_peers(PeerSet(Version(number + 2), 1, (cloud.told_to(robot),)))
         submit(robot, number, b"still here")
     assert len(robot.wait_for(ResponseArrived, 10)) == 10
     assert "unauthentic" not in cloud.thread.link.stats.dropped
