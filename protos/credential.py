@@ -40,7 +40,7 @@ _FORMAT = 1
 _HEAD = struct.Struct(f">BBBBQQ{PUBLIC_KEY_BYTES}sH")
 _LABEL = b"plr session credential\0"
 _NUMBER_LABEL = b"plr session number\0"
-_ALGORITHM = ec.ECDSA(hashes.SHA256())
+SIGNATURE_ALGORITHM = ec.ECDSA(hashes.SHA256())
 
 
 class Aead(enum.Enum):
@@ -80,7 +80,7 @@ class SessionCredential:
 
     def sign(self, private_key: ec.EllipticCurvePrivateKey) -> SessionCredential:
         """Return it signed with the key of its certificate."""
-        return replace(self, signature=private_key.sign(_LABEL + self._signed(), _ALGORITHM))
+        return replace(self, signature=private_key.sign(_LABEL + self._signed(), SIGNATURE_ALGORITHM))
 
     def _signed(self) -> bytes:
         return _head(self) + self.name.encode() + self.certificate
@@ -148,16 +148,27 @@ def verify(credential: SessionCredential, check: Callable[[bytes], Identity]) ->
     if identity.name != credential.name or identity.role is not IdentityRole(credential.role.value):
         raise CertificateError(WRONG_ROLE, f"a certificate of {identity.role.value} {identity.name} signs for another")
     try:
-        key = load_der_x509_certificate(credential.certificate).public_key()
-    except Exception as error:
-        # As in identity.py: what is wrong inside DER shows as a dozen kinds of errors.
-        raise CertificateError(MALFORMED, f"the credential's certificate: {type(error).__name__}") from error
-    if not isinstance(key, ec.EllipticCurvePublicKey):
-        raise CertificateError(MALFORMED, "the credential's certificate holds no key on P-256")
-    try:
-        key.verify(credential.signature, _LABEL + credential._signed(), _ALGORITHM)
+        signer_key(credential.certificate).verify(
+            credential.signature, _LABEL + credential._signed(), SIGNATURE_ALGORITHM
+        )
     except InvalidSignature:
         raise CertificateError(UNTRUSTED, "the credential's signature is wrong") from None
     if credential.session != session_number(credential.name, credential.role, credential.public_key):
         raise CertificateError(MALFORMED, "the credential's session number is not that of its key")
     return identity
+
+
+def signer_key(certificate: bytes) -> ec.EllipticCurvePublicKey:
+    """Return the key of a credential's certificate (DER).
+
+    Raises:
+        CertificateError: it has none that signs.
+    """
+    try:
+        key = load_der_x509_certificate(certificate).public_key()
+    except Exception as error:
+        # As in identity.py: what is wrong inside DER shows as a dozen kinds of errors.
+        raise CertificateError(MALFORMED, f"the credential's certificate: {type(error).__name__}") from error
+    if not isinstance(key, ec.EllipticCurvePublicKey):
+        raise CertificateError(MALFORMED, "the credential's certificate holds no key on P-256")
+    return key

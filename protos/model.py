@@ -53,6 +53,12 @@ NO_POLICY = 1
 MAX_CREDENTIAL_BYTES = 2048
 """Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
 
+MAX_SIGNATURE_BYTES = 72
+"""Longest signature: ECDSA on P-256 in DER."""
+
+MAX_CANDIDATES_OF_INTERFACE = 8
+"""Addresses under which peers look for one interface: IPv4, some of IPv6, what a NAT makes of each, one advertised."""
+
 MAX_LATENCIES = 4096
 """Pairs (interface, server) in one report, counted anew for each service and size class that they carried."""
 
@@ -167,6 +173,9 @@ class Peer:
     credential: bytes = field(default=b"", repr=False)
     may_call: CallPermit = NO_CALLS
     """Of a robot, told to clouds; nothing unless said otherwise."""
+    candidates_serial: int = 0
+    candidates_signature: bytes = field(default=b"", repr=False)
+    """As in `CandidateSet`."""
 
     def with_token(self, token: bytes) -> Peer:
         """Return it with another token, three times as fast as `replace`: a control plane does it 100,000 times."""
@@ -181,6 +190,8 @@ class Peer:
             self.draining,
             self.credential,
             self.may_call,
+            self.candidates_serial,
+            self.candidates_signature,
         )
 
 
@@ -258,6 +269,10 @@ class CandidateSet:
 
     candidates: tuple[Candidate, ...] = ()
     labels: tuple[InterfaceLabel, ...] = ()
+    serial: int = 0
+    """Grows within a session (64 bits)."""
+    signature: bytes = field(default=b"", repr=False)
+    """Over candidates, serial and session, for the peers (`protos/candidate_signature.py`); none in insecure mode."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ import grpc
 from protos import tls_advice
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
 from protos.errors import DecodeError
-from protos.model import CandidateSet, PeerSet, Report, ResourceKind, ServiceSet, Welcome
+from protos.model import PeerSet, Report, ResourceKind, ServiceSet, Welcome
 from protos.names import clean_text
 from protos.plr.v1 import control_pb2_grpc
 from sidecar.control_channel import REFUSALS, open_channel
@@ -33,9 +33,8 @@ from sidecar.refusal_log import RefusalLog
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Candidate, ServiceOffer, ServiceUse
+    from protos.model import CandidateSet, ServiceOffer, ServiceUse
     from protos.plr.v1 import control_pb2
-    from protos.preferences import InterfaceLabel
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
     from sidecar.core.control_session import ControlSession, ControlStats
@@ -114,9 +113,9 @@ class ControlClient:
         self._thread.start()
         self._running.wait()
 
-    def set_candidates(self, candidates: tuple[Candidate, ...], labels: tuple[InterfaceLabel, ...] = ()) -> None:
+    def set_candidates(self, candidates: CandidateSet) -> None:
         """Tell the control plane under which addresses we are reached now, and what is known of our interfaces."""
-        self._post(lambda: self._session.set_candidates(CandidateSet(candidates, labels)))
+        self._post(lambda: self._session.set_candidates(candidates))
 
     def set_services(self, offers: tuple[ServiceOffer, ...], uses: tuple[ServiceUse, ...]) -> None:
         """Tell the control plane what we offer and carry now."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import random
+import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from protos.config_fields import split_host_port
 from protos.errors import ConfigError
 from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Version
 from protos.tls_files import TlsWatch, load_tls_files
+from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import Apply, ControlSession
 from sidecar.core.control_ways import ControlInterface
@@ -59,6 +61,9 @@ class Sidecar:
             config.node_name, config.role, identity.incarnation, None if tls is None else lambda: tls.current
         )
         self._own = own
+        self._announcer = Announcer(own.credential.session, None if tls is None else lambda: tls.current, config.labels)
+        self._announcing = threading.Lock()
+        """Interfaces' threads and the control client's have news; serials go out in order."""
         rules = config.service_rules()
         self._bridge = RosBridge(name=config.node_name, role=config.role, rules=rules)
         self._data_plane = ThreadedDataPlane(
@@ -195,8 +200,8 @@ class Sidecar:
         self._interfaces.on_stun_event(interface, event)
 
     def _tell_candidates(self, candidates: tuple[Candidate, ...]) -> None:
-        labels = self._config.labels(candidate.interface for candidate in candidates)
-        self._control.set_candidates(candidates, labels)
+        with self._announcing:
+            self._control.set_candidates(self._announcer.announce(candidates))
         own: dict[InterfaceName, list[str]] = {}
         for candidate in candidates:
             if candidate.kind is CandidateKind.HOST:
@@ -261,6 +266,8 @@ class Sidecar:
         credential = signed(self._own.credential, files)
         self._data_plane.renew_credential(credential)
         self._control_session.set_credential(credential.encode())
+        with self._announcing:
+            self._control.set_candidates(self._announcer.again())
         self._data_plane.trust_changed()
         log.info("took new certificate files from %s", files.directory)
 

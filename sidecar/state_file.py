@@ -36,7 +36,7 @@ FORMAT_VERSION = 1
 """Of a file; another one is refused."""
 
 LAST_GOOD_VERSION = 2
-"""Since 2 the tokens of peers are those for this sidecar alone."""
+"""Since 2 the tokens of peers are those for this sidecar alone, and their addresses are signed."""
 
 MAX_FILE_BYTES = 64 << 20
 """Well above the largest peer set and mapping that the control stream can carry."""

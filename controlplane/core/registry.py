@@ -76,6 +76,10 @@ class Sidecar:
     """Services it has offered since it registered, at most MAX_OFFERED."""
     labels: tuple[InterfaceLabel, ...] = ()
     """What a robot says of its interfaces."""
+    candidates_serial: int = 0
+    candidates_signature: bytes = field(default=b"", repr=False)
+    signed_under: bytes = field(default=b"", repr=False)
+    """The credential in whose session, and with whose certificate, the candidates were signed."""
 
     @property
     def name(self) -> NodeName:
@@ -104,16 +108,21 @@ class Sidecar:
 
     def as_peer(self) -> Peer:
         """What its peers are told of it, but with its own token; each is told the one made for it (`ToldPeers`)."""
+        # A signature of the run before, or of the certificate before, is none under this credential: they say it anew
+        # in a moment, and until then each peer goes on with what it has.
+        stale = bool(self.candidates_signature) and self.signed_under != self.registration.credential
         return Peer(
             name=self.registration.name,
             role=self.registration.role,
             session=self.registration.session,
             token=self.registration.token,
             incarnation=self.registration.incarnation,
-            candidates=self.candidates or (),
+            candidates=() if stale else self.candidates or (),
             offers=self.offers,
             draining=self.draining,
             credential=self.registration.credential,
+            candidates_serial=self.candidates_serial,
+            candidates_signature=b"" if stale else self.candidates_signature,
         )
 
 
@@ -215,7 +224,14 @@ class Registry:
     def set_candidates(self, name: NodeName, told: CandidateSet) -> bool:
         """Replace its addresses and what it says of its interfaces; True if they changed."""
         known = self._sidecars[name]
-        changed = replace(known, candidates=told.candidates, labels=told.labels)
+        changed = replace(
+            known,
+            candidates=told.candidates,
+            labels=told.labels,
+            candidates_serial=told.serial,
+            candidates_signature=told.signature,
+            signed_under=known.registration.credential if told.signature else b"",
+        )
         self._sidecars[name] = changed
         return changed != known
 

@@ -63,7 +63,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
 
 def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
     return admin_pb2.SidecarStatus(
-        peer=peer_to_proto(dataclasses.replace(status.peer, token=b"", credential=b"")),
+        peer=peer_to_proto(dataclasses.replace(status.peer, token=b"", credential=b"", candidates_signature=b"")),
         connected=status.connected,
         lease_left_us=microseconds(status.lease_left_s),
         software_version=clean_text(status.software_version),

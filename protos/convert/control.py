@@ -22,8 +22,8 @@ from protos.convert.fields import (
 from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
 from protos.convert.reports import report_from_proto, report_to_proto
 from protos.convert.types import (
+    announced_from_proto,
     candidate_to_proto,
-    candidates_from_proto,
     credential_from_proto,
     label_to_proto,
     labels_from_proto,
@@ -34,6 +34,7 @@ from protos.convert.types import (
     role_from_proto,
     role_to_proto,
     session_from_proto,
+    signature_from_proto,
     use_from_proto,
     use_to_proto,
 )
@@ -99,8 +100,7 @@ def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMe
         case "register":
             return _registration_from_proto(message.register)
         case "candidates":
-            candidates = candidates_from_proto(message.candidates.candidates)
-            return CandidateSet(candidates, labels_from_proto(message.candidates.labels, candidates))
+            return _candidate_set_from_proto(message.candidates)
         case "services":
             uses = each(message.services.uses, MAX_USES, "uses", use_from_proto)
             unique((use.name for use in uses), "uses")
@@ -133,11 +133,8 @@ def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessag
     match value:
         case Registration():
             return control_pb2.SidecarMessage(register=_registration_to_proto(value))
-        case CandidateSet(candidates=candidates, labels=labels):
-            message = control_pb2.Candidates(
-                candidates=map(candidate_to_proto, candidates), labels=map(label_to_proto, labels)
-            )
-            return control_pb2.SidecarMessage(candidates=message)
+        case CandidateSet():
+            return control_pb2.SidecarMessage(candidates=_candidate_set_to_proto(value))
         case ServiceSet(offers=offers, uses=uses):
             services = control_pb2.Services(offers=map(offer_to_proto, offers), uses=map(use_to_proto, uses))
             return control_pb2.SidecarMessage(services=services)
@@ -192,6 +189,25 @@ def control_message_to_proto(value: ControlMessage) -> control_pb2.ControlMessag
             return control_pb2.ControlMessage(mapping=mapping_set_to_proto(value))
         case _:
             assert_never(value)
+
+
+def _candidate_set_from_proto(message: control_pb2.Candidates) -> CandidateSet:
+    candidates = announced_from_proto(message.candidates)
+    return CandidateSet(
+        candidates,
+        labels_from_proto(message.labels, candidates),
+        message.serial,
+        signature_from_proto(message.signature),
+    )
+
+
+def _candidate_set_to_proto(value: CandidateSet) -> control_pb2.Candidates:
+    return control_pb2.Candidates(
+        candidates=map(candidate_to_proto, value.candidates),
+        labels=map(label_to_proto, value.labels),
+        serial=value.serial,
+        signature=value.signature,
+    )
 
 
 def _registration_from_proto(message: control_pb2.Register) -> Registration:

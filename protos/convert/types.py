@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,9 @@ from protos.errors import DecodeError
 from protos.histogram import LAYOUT, Histogram
 from protos.model import (
     ALL_CALLS,
+    MAX_CANDIDATES_OF_INTERFACE,
     MAX_CREDENTIAL_BYTES,
+    MAX_SIGNATURE_BYTES,
     TOKEN_BYTES,
     Address,
     CallPermit,
@@ -103,6 +106,15 @@ def candidate_to_proto(candidate: Candidate) -> types_pb2.Candidate:
         kind=_CANDIDATE_KIND_NUMBERS[candidate.kind],
         address=address_to_proto(candidate.address),
     )
+
+
+def announced_from_proto(messages: Sequence[types_pb2.Candidate]) -> tuple[Candidate, ...]:
+    """Check what a sidecar announces: as `candidates_from_proto`, and no more of one interface than peers use."""
+    candidates = candidates_from_proto(messages)
+    for name, count in Counter(candidate.interface for candidate in candidates).items():
+        if count > MAX_CANDIDATES_OF_INTERFACE:
+            raise DecodeError(f"{name} has {count} candidates, more than {MAX_CANDIDATES_OF_INTERFACE}")
+    return candidates
 
 
 def candidates_from_proto(messages: Sequence[types_pb2.Candidate]) -> tuple[Candidate, ...]:
@@ -214,6 +226,8 @@ def peer_from_proto(message: types_pb2.Peer, *, with_token: bool = True) -> Peer
         draining=message.draining,
         credential=credential_from_proto(message.credential),
         may_call=permit_from_proto(message),
+        candidates_serial=message.candidates_serial,
+        candidates_signature=signature_from_proto(message.candidates_signature),
     )
 
 
@@ -242,6 +256,13 @@ def credential_from_proto(value: bytes) -> bytes:
     return value
 
 
+def signature_from_proto(value: bytes) -> bytes:
+    """Check the size of a signature; whether it is right is for the peers to judge."""
+    if len(value) > MAX_SIGNATURE_BYTES:
+        raise DecodeError(f"signature has {len(value)} bytes, more than {MAX_SIGNATURE_BYTES}")
+    return value
+
+
 def session_from_proto(value: int) -> SessionId:
     """Check a session number; 0 is what a field never written holds."""
     if value == 0:
@@ -263,6 +284,8 @@ def peer_to_proto(peer: Peer) -> types_pb2.Peer:
         credential=peer.credential,
         may_call=sorted(peer.may_call.services),
         may_call_everything=peer.may_call.everything,
+        candidates_serial=peer.candidates_serial,
+        candidates_signature=peer.candidates_signature,
     )
 
 

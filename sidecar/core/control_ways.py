@@ -154,7 +154,7 @@ class ControlWays:
         unique = list(dict.fromkeys(addresses))
         if len(unique) > MAX_ADDRESSES:
             self._drops[ADDRESSES_FULL] += len(unique) - MAX_ADDRESSES
-        self._addresses = _families_in_turn(unique)[:MAX_ADDRESSES]
+        self._addresses = families_in_turn(unique)[:MAX_ADDRESSES]
         self._prune()
 
     def set_paths(self, best: Mapping[InterfaceName, PathState], now: float) -> None:
@@ -326,7 +326,7 @@ class ControlWays:
         self._silent = {way: until for way, until in self._silent.items() if way in ways}
 
 
-def _families_in_turn(addresses: Sequence[Address]) -> tuple[Address, ...]:
+def families_in_turn(addresses: Sequence[Address]) -> tuple[Address, ...]:
     """IPv4 and IPv6 in turn (RFC 8305 section 4), the family of the first address first."""
     if not addresses:
         return ()

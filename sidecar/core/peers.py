@@ -1,8 +1,9 @@
 """The peers this sidecar may talk to: the control plane's view, corrected by what the paths themselves prove.
 
 A peer is known by its credential, which this sidecar judges itself (`OwnSession.admit`): one whose credential is bad
-is no peer, whatever the control plane says. It is kept for later judgements all the same: a clock that is set right
-or a new CA may prove it good, and the control plane, to which the view is in force, does not send it again.
+is no peer, whatever the control plane says. It is kept for later judgements all the same: a clock that is set right or
+a new CA may prove it good, and the control plane, to which the view is in force, does not send it again. The addresses
+of a peer are those that it signed itself (`announced.py`).
 
 A peer that merely vanished from the view (its lease ran out, or the control plane restarted with an empty registry)
 is kept while a path to it lives: a dead control plane must not cost a request. One that left, was revoked or is kept
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from protos.identity import CertificateError
 from protos.model import NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
+from sidecar.core.announced import Announced
 from sidecar.core.link_events import LinkPeer
 from sidecar.core.verification_budget import VerificationBudget
 
@@ -65,6 +67,7 @@ class Peers:
         """What is shared with each of them."""
         self.refused: dict[NodeName, Refusal] = {}
         """Of the view, so no more than `MAX_PEERS`."""
+        self._announced = Announced(own, dropped)
         self._unlisted: set[NodeName] = set()
         self._told: dict[NodeName, tuple[Peer, PairKeys, LinkPeer]] = {}
         """What links were told of each, and what that was made of."""
@@ -101,7 +104,7 @@ class Peers:
             peer = self._newer(listed)
             try:
                 keys[peer.name] = self._own.admit(peer)
-                known[peer.name] = peer
+                known[peer.name] = self._at_announced(peer, listed)
             except DecodeError as error:
                 refused[peer.name] = Refusal.of(peer, error)
         # Not of the refused: what they say is nobody's but the control plane's.
@@ -120,6 +123,7 @@ class Peers:
                 known[name], keys[name] = peer, self._keys[name]
                 unlisted.add(name)
         self._known, self._keys = known, keys
+        self._announced.forget_all_but(set(known))
         self._restarted_at = {name: at for name, at in self._restarted_at.items() if name in known}
         self._budget.keep(known)
         self._unlisted = unlisted
@@ -127,6 +131,16 @@ class Peers:
             self._policy = peer_set.policy
         self.version = peer_set.version
         return None
+
+    @property
+    def ignored_candidates(self) -> dict[NodeName, str]:
+        """Peers of which the view tells addresses that are not used, and why."""
+        return self._announced.ignored
+
+    def _at_announced(self, peer: Peer, told: Peer) -> Peer:
+        """The peer at the addresses to use, now that `told` is told of it."""
+        candidates = self._announced.candidates_of(told)
+        return peer if candidates == peer.candidates else dataclasses.replace(peer, candidates=candidates)
 
     def _newer(self, listed: Peer) -> Peer:
         """The view may be older than what the peer itself proved by its introduction."""
@@ -233,7 +247,7 @@ class Peers:
                 self._keys[peer.name] = self._own.admit(peer)
             except DecodeError:
                 continue
-            self._known[peer.name] = peer
+            self._known[peer.name] = self._at_announced(peer, peer)
             sessions.add(peer.session)
             del self.refused[peer.name]
             taken.append(peer.name)

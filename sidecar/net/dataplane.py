@@ -93,6 +93,7 @@ class ThreadedDataPlane:
         self._stopping = False
         self._logged_refusals: dict[NodeName, str] = {}
         """Their causes."""
+        self._logged_candidates: dict[NodeName, str] = {}
         self._logged_conflicts: frozenset[tuple[ServiceName, NodeName, str]] = frozenset()
         self._timer_thread = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
 
@@ -220,11 +221,16 @@ class ThreadedDataPlane:
         with self._lock:
             conflicts = self._engine.offer_conflicts
             refused = list(self._engine.peers.refused.values())
+            ignored = dict(self._engine.peers.ignored_candidates)
         for refusal in refused:
             if self._logged_refusals.get(refusal.peer.name) != refusal.cause:
                 name, why = refusal.peer.name, refusal.why
                 log.warning("%s is not talked to, whatever the control plane says: %s", name, why)
         self._logged_refusals = {refusal.peer.name: refusal.cause for refusal in refused}
+        for name, why in ignored.items():
+            if self._logged_candidates.get(name) != why:
+                log.warning("%s: what the control plane tells of its addresses is not used: %s", name, why)
+        self._logged_candidates = ignored
         for service, server, kind in sorted(conflicts - self._logged_conflicts):
             log.warning("%s at %s has type %s, unlike the other servers: it gets no requests", service, server, kind)
         self._logged_conflicts = conflicts
@@ -239,6 +245,7 @@ class ThreadedDataPlane:
             with contextlib.suppress(DecodeError):
                 self._own.admit(peer)
                 good.append(peer)
+                self._own.check_candidates(peer)
         return good
 
     def trust_changed(self) -> None:

@@ -11,6 +11,7 @@ import time
 from typing import TYPE_CHECKING
 
 from protos.model import Candidate, CandidateKind
+from sidecar.core.control_ways import families_in_turn
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetCarrier, SetMtu, SetReady
 from sidecar.core.stun_client import StunClient
@@ -105,18 +106,20 @@ class ManagedInterface:
         self.thread.wake()
 
     def candidates(self, advertised: Iterable[str]) -> list[Candidate]:
-        """Where peers may reach it; nowhere while it is suspended. `advertised` are further addresses."""
+        """Where peers may reach it; nowhere while it is suspended. `advertised` are further addresses.
+
+        The best first: what the operator says, what STUN saw, then its own, the families in turn.
+        """
         if self.suspended:
             return []
         number, port = self.thread.link.identity.interface_id, self.thread.port
-        hosts = [(address, port) for address in (*self.interface.addresses, *advertised)]
-        found = [Candidate(number, self.name, CandidateKind.HOST, address) for address in hosts]
-        found.extend(
-            Candidate(number, self.name, CandidateKind.SERVER_REFLEXIVE, address)
-            for address in self.reflexive.values()
-            if address not in hosts
-        )
-        return found
+        own = families_in_turn([(address, port) for address in self.interface.addresses])
+        kinds = dict.fromkeys(((address, port) for address in advertised), CandidateKind.HOST)
+        for address in self.reflexive.values():
+            if address not in own:
+                kinds.setdefault(address, CandidateKind.SERVER_REFLEXIVE)
+        kinds |= dict.fromkeys(own, CandidateKind.HOST)
+        return [Candidate(number, self.name, kind, address) for address, kind in kinds.items()]
 
     def stop(self) -> LinkMemory:
         """End the thread; returns what the interface's next link must know."""

@@ -9,6 +9,7 @@ import time
 from typing import TYPE_CHECKING
 
 from protos.model import (
+    CandidateSet,
     MappingSet,
     PeerSet,
     Report,
@@ -73,7 +74,7 @@ def test_a_client_registers_follows_and_outlives_a_restart(tmp_path: Path) -> No
     session = ControlSession(registration("robot", Role.ROBOT), random.Random(1))
     with ControlPlaneProcess(tmp_path, lease_ms=10_000) as plane:
         client = ControlClient(ControlDialer((plane.address,), session.stats), session, engine)
-        client.set_candidates(interfaces("wlan0", "wwan0"))
+        client.set_candidates(CandidateSet(interfaces("wlan0", "wwan0")))
         client.set_services((), (use(),))
         client.start()
         try:

@@ -145,7 +145,7 @@ def rig(server: ScriptedControlPlane) -> Iterator[Rig]:
 
 
 def test_registers_with_what_it_holds_then_says_everything(server: ScriptedControlPlane, rig: Rig) -> None:
-    rig.client.set_candidates((CANDIDATE,))
+    rig.client.set_candidates(CandidateSet((CANDIDATE,)))
     rig.client.start()
     registration = server.expect(Registration)
     assert registration.name == "robot-1"
@@ -348,7 +348,7 @@ def test_an_unreachable_control_plane_blocks_nobody(target: str, caplog: pytest.
     with caplog.at_level(logging.WARNING):
         rig = Rig(target.format(port=free_port()))
         rig.client.start()
-        rig.client.set_candidates((CANDIDATE,))
+        rig.client.set_candidates(CandidateSet((CANDIDATE,)))
         rig.client.set_services((), ())
         wait_for(lambda: rig.client.stats.attempts >= 2)
         wait_for(lambda: "going on without it" in caplog.text)
@@ -367,7 +367,7 @@ def test_stop_says_goodbye_last(server: ScriptedControlPlane, rig: Rig) -> None:
     assert heard[-2] == Drain()
     assert rig.hooks.expect_connection(False) == "stopped"
     rig.client.stop()
-    rig.client.set_candidates((CANDIDATE,))
+    rig.client.set_candidates(CandidateSet((CANDIDATE,)))
 
 
 def test_a_drained_sidecar_stays_connected(server: ScriptedControlPlane, rig: Rig) -> None:

@@ -22,6 +22,7 @@ from protos.model import (
     Assignment,
     Candidate,
     CandidateKind,
+    CandidateSet,
     InterfaceId,
     InterfaceName,
     MappingSet,
@@ -116,7 +117,8 @@ class Sidecar:
         self.refuse: str | None = None
         self.report = Report()
         address = (f"192.0.2.{number}", 24700)
-        self.client.set_candidates((Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, address),))
+        candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, address)
+        self.client.set_candidates(CandidateSet((candidate,)))
 
     def welcome(self, welcome: Welcome) -> None:
         assert welcome.lease_s == 1.5

@@ -63,7 +63,11 @@ class JoinedPlanes:
             stream = self.core.register(registration, self.mesh.now)
             assert not isinstance(stream, Refusal)
             self.streams[stream] = node
-            self.core.receive(stream, CandidateSet(peer.candidates), self.mesh.now)
+            self.core.receive(
+                stream,
+                CandidateSet(peer.candidates, (), peer.candidates_serial, peer.candidates_signature),
+                self.mesh.now,
+            )
 
     def leave(self, node: Node) -> None:
         """It does not talk to the control plane any more, which soon forgets it; its paths live on."""

@@ -26,6 +26,7 @@ from protos.model import (
     Version,
 )
 from protos.pair_token import pair_token
+from sidecar.announcement import Announcer
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestId, ResponseArrived
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
     from protos.model import Address
     from sidecar.core.budgets import Budget
+    from sidecar.core.session import OwnSession
 
 SERVICE = ServiceName("/echo")
 IPV6 = ":6"
@@ -108,10 +110,9 @@ class Node:
 
     def start(self) -> None:
         now = self.now
-        self.session = SessionId(self.mesh.rng.getrandbits(64))
         self.incarnation = int(now * 1e6) + 1
-        aead = self.mesh.aeads.get(self.name, Aead.AES_256_GCM)
-        self.own = session_of(self.name, self.role, self.session, self.incarnation, aead)
+        self.own, self.announcer = self.mesh.begin_session(self)
+        self.session = self.own.credential.session
         self.engine = Engine(EngineConfig(self.role, self.rules, self.mesh.budgets), self.own, now)
         self.links = {
             interface: Link(
@@ -154,15 +155,18 @@ class Node:
             for number, interface in enumerate(self.interfaces)
             for address in self.addresses(interface)
         )
+        said = self.announcer.announce(candidates)
         peer = Peer(
             self.name,
             self.role,
             self.session,
             self.token,
             self.incarnation,
-            candidates,
+            said.candidates,
             self.offers,
             may_call=ALL_CALLS,
+            candidates_serial=said.serial,
+            candidates_signature=said.signature,
         )
         return replace(peer, credential=self.own.credential.encode())
 
@@ -206,12 +210,20 @@ class Mesh:
         """Of robots; set it before they start."""
         self.aeads: dict[str, Aead] = {}
         """What nodes prefer other than AES; set it before they start."""
+        self.begin_session: Callable[[Node], tuple[OwnSession, Announcer]] = self._begin_session
+        """Without certificates, if the test has none."""
         self.dual_stack = False
         """Whether interfaces have an IPv6 address as well; set it before nodes start."""
         self.unreachable: set[str] = set()
         """Host parts of addresses that nothing gets to."""
         self.tap: Callable[[Address, Address, bytes], None] | None = None
         """Sees every datagram that leaves: from where, where to."""
+
+    def _begin_session(self, node: Node) -> tuple[OwnSession, Announcer]:
+        session = SessionId(self.rng.getrandbits(64))
+        aead = self.aeads.get(node.name, Aead.AES_256_GCM)
+        own = session_of(node.name, node.role, session, node.incarnation, aead)
+        return own, Announcer(session, None, lambda _: ())
 
     def add(self, name: str, role: Role, interfaces: list[str], rules: tuple[ServiceRule, ...]) -> Node:
         node = self.nodes[name] = Node(self, name, role, interfaces, rules)

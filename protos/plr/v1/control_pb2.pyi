@@ -185,10 +185,20 @@ Global___Register: _TypeAlias = Register  # noqa: Y015
 
 @_typing.final
 class Candidates(_message.Message):
+    """At most 8 candidates of one interface."""
+
     DESCRIPTOR: _descriptor.Descriptor
 
     CANDIDATES_FIELD_NUMBER: _builtins.int
     LABELS_FIELD_NUMBER: _builtins.int
+    SERIAL_FIELD_NUMBER: _builtins.int
+    SIGNATURE_FIELD_NUMBER: _builtins.int
+    serial: _builtins.int
+    """Grows with each message of a session."""
+    signature: _builtins.bytes
+    """Of the session's certificate, over candidates, serial and session, for the peers to check
+    (protos/candidate_signature.py). None in insecure mode.
+    """
     @_builtins.property
     def candidates(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.Candidate]: ...
     @_builtins.property
@@ -200,10 +210,12 @@ class Candidates(_message.Message):
         *,
         candidates: _abc.Iterable[_types_pb2.Candidate] | None = ...,
         labels: _abc.Iterable[_types_pb2.InterfaceLabel] | None = ...,
+        serial: _builtins.int = ...,
+        signature: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "labels", b"labels"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "labels", b"labels", "serial", b"serial", "signature", b"signature"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -242,6 +242,8 @@ class Peer(_message.Message):
     CREDENTIAL_FIELD_NUMBER: _builtins.int
     MAY_CALL_FIELD_NUMBER: _builtins.int
     MAY_CALL_EVERYTHING_FIELD_NUMBER: _builtins.int
+    CANDIDATES_SERIAL_FIELD_NUMBER: _builtins.int
+    CANDIDATES_SIGNATURE_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     role: Global___Role.ValueType
     session: _builtins.int
@@ -255,6 +257,9 @@ class Peer(_message.Message):
     """What this run says of itself, signed by itself (protos/credential.py); opaque to the control plane, which relays it."""
     may_call_everything: _builtins.bool
     """No policy is in force: it may call everything."""
+    candidates_serial: _builtins.int
+    """Of the candidates, as in Candidates; the receiver uses none that the peer itself did not sign."""
+    candidates_signature: _builtins.bytes
     @_builtins.property
     def candidates(self) -> _containers.RepeatedCompositeFieldContainer[Global___Candidate]: ...
     @_builtins.property
@@ -279,10 +284,12 @@ class Peer(_message.Message):
         credential: _builtins.bytes = ...,
         may_call: _abc.Iterable[_builtins.str] | None = ...,
         may_call_everything: _builtins.bool = ...,
+        candidates_serial: _builtins.int = ...,
+        candidates_signature: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "credential", b"credential", "draining", b"draining", "incarnation", b"incarnation", "may_call", b"may_call", "may_call_everything", b"may_call_everything", "name", b"name", "offers", b"offers", "role", b"role", "session", b"session", "token", b"token"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "candidates_serial", b"candidates_serial", "candidates_signature", b"candidates_signature", "credential", b"credential", "draining", b"draining", "incarnation", b"incarnation", "may_call", b"may_call", "may_call_everything", b"may_call_everything", "name", b"name", "offers", b"offers", "role", b"role", "session", b"session", "token", b"token"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

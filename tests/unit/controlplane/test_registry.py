@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from controlplane.core import registry as registry_module
@@ -60,6 +62,26 @@ def test_who_drained_has_left_when_its_stream_ends(registry: Registry) -> None:
     assert registry.removal_reason(ROBOT) is RemovalReason.LEFT
 
 
+@pytest.mark.audit("sec-5")
+def test_addresses_signed_by_the_run_before_are_not_told_under_the_credential_of_the_next(registry: Registry) -> None:
+    """Peers would have to refuse them; they go on with what they have until the new run has signed its own."""
+    for incarnation, told in ((1, b"first"), (2, b"second")):
+        credential = bytes([incarnation])
+        said = replace(registration("robot", incarnation=incarnation), credential=credential)
+        registry.register(said, stream(incarnation), 0.0)
+        known = registry.get(ROBOT)
+        assert known is not None
+        assert (known.as_peer().candidates, known.as_peer().candidates_signature) == ((), b"")
+        registry.set_candidates(ROBOT, CandidateSet(interfaces("wlan0"), (), incarnation, told))
+        known = registry.get(ROBOT)
+        assert known is not None
+        assert known.candidates == interfaces("wlan0"), "for the mapping they are what they were"
+        peer = known.as_peer()
+        assert (peer.candidates, peer.candidates_serial, peer.candidates_signature) == (
+            interfaces("wlan0"), incarnation, told,
+        )  # fmt: skip
+
+
 def test_a_newer_incarnation_replaces_the_older_stream(registry: Registry) -> None:
     registry.register(registration("robot", incarnation=1), stream(1), 0.0)
     registry.set_candidates(ROBOT, CandidateSet(interfaces("wlan0")))
@@ -71,6 +93,7 @@ def test_a_newer_incarnation_replaces_the_older_stream(registry: Registry) -> No
     # Its peers keep its addresses until it tells new ones, but know its new session at once.
     assert known.candidates == interfaces("wlan0")
     assert known.as_peer().session == registration("robot", incarnation=2).session
+    assert known.as_peer().candidates == interfaces("wlan0")
     assert not known.draining
     assert known.lease_end == 1.0 + LEASE_S
     assert not registry.touch(ROBOT, stream(1), 2.0)

@@ -21,6 +21,8 @@ PEER = Peer(
     draining=True,
     credential=b"signed",
     may_call=ALL_CALLS,
+    candidates_serial=3,
+    candidates_signature=b"signed",
 )
 OTHER = replace(PEER, name=NodeName("b"), token=bytes(16))
 

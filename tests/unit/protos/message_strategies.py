@@ -23,6 +23,7 @@ from protos.histogram import BUCKETS, MAX_COUNT, Histogram
 from protos.model import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
+    MAX_SIGNATURE_BYTES,
     PROTOCOL_VERSION,
     TOKEN_BYTES,
     Ack,
@@ -79,6 +80,7 @@ versions = st.integers(0, MAX_VERSION).map(Version)
 sessions = st.integers(1, (1 << 64) - 1).map(SessionId)
 tokens = st.binary(min_size=TOKEN_BYTES, max_size=TOKEN_BYTES)
 credentials = st.binary(max_size=MAX_CREDENTIAL_BYTES)
+signatures = st.binary(max_size=MAX_SIGNATURE_BYTES)
 durations = st.integers(1, round(MAX_DURATION_S * 1e6)).map(lambda us: us / 1_000_000)
 probabilities = st.floats(0.0, 1.0)
 events = st.integers(0, MAX_EVENTS)
@@ -175,9 +177,8 @@ def candidate_sets(draw: st.DrawFn) -> CandidateSet:
     candidates = draw(candidate_tuples())
     names = sorted({candidate.interface for candidate in candidates})
     labelled = draw(st.lists(st.sampled_from(names), unique=True)) if names else []
-    return CandidateSet(
-        candidates, tuple(InterfaceLabel(name, draw(domain_labels), draw(charges)) for name in labelled)
-    )
+    labels = tuple(InterfaceLabel(name, draw(domain_labels), draw(charges)) for name in labelled)
+    return CandidateSet(candidates, labels, draw(uint64), draw(signatures))
 
 
 counts_of = events.flatmap(lambda total: st.tuples(st.just(total), st.integers(0, total)))
@@ -264,7 +265,7 @@ control_messages: st.SearchStrategy[ControlMessage] = st.one_of(welcomes, peer_s
 resource_statuses = st.builds(ResourceStatus, versions, versions, st.sampled_from(SyncState), texts)
 statuses = st.builds(
     SidecarStatus,
-    peers.map(lambda peer: dataclasses.replace(peer, token=b"", credential=b"")),
+    peers.map(lambda peer: dataclasses.replace(peer, token=b"", credential=b"", candidates_signature=b"")),
     st.booleans(),
     durations | st.just(0.0),
     texts,

@@ -227,6 +227,8 @@ def test_the_samples_that_the_next_test_breaks_are_good() -> None:
         (candidates({"interface": "a/b"}), "interface"),
         (candidates({"kind": 0}), "candidate kind"),
         (candidates({}, {}), "candidates"),
+        (candidates(*(at(bytes((10, 0, 0, number))) for number in range(9))), "wlan0 has 9 candidates, more than 8"),
+        (control_pb2.SidecarMessage(candidates=control_pb2.Candidates(signature=bytes(73))), "signature"),
         (candidates({}, {"interface_id": 1, **at(b"\x0a\x00\x00\x02")}), "interface"),
         (candidates({}, {"interface": "wwan0", **at(b"\x0a\x00\x00\x02")}), "interface_id"),
         (candidates(at(b"")), "address"),

@@ -1,0 +1,68 @@
+"""What a sidecar announces of its addresses, signed with its certificate's key: a control plane can not add one.
+
+Every announcement of a session has a larger serial than the one before. The signature (ECDSA P-256 with SHA-256, DER)
+is over this, big-endian, texts in ASCII as the model has them::
+
+    "plr candidates" | 0 (8) | session (64) | serial (64) | number of candidates (16)
+    for each: interface's number (8) | kind (8): 1 host, 2 seen by STUN | port (16)
+              length (8) | interface's name | length (8) | IP address
+
+The session's number follows from its owner's name, role and key (`credential.py`), so nobody else's can be signed with
+it. It is never parsed: who verifies it writes it from the candidates it was told.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+from cryptography.exceptions import InvalidSignature
+
+from protos.credential import SIGNATURE_ALGORITHM, signer_key
+from protos.identity import UNTRUSTED, CertificateError
+from protos.model import CandidateKind
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    from protos.model import Candidate, SessionId
+
+_LABEL = b"plr candidates\0"
+_HEAD = struct.Struct(">QQH")
+_CANDIDATE = struct.Struct(">BBH")
+_KINDS = {CandidateKind.HOST: 1, CandidateKind.SERVER_REFLEXIVE: 2}
+
+
+def sign_candidates(
+    private_key: ec.EllipticCurvePrivateKey, session: SessionId, serial: int, candidates: tuple[Candidate, ...]
+) -> bytes:
+    """Return the signature, at most `MAX_SIGNATURE_BYTES`."""
+    return private_key.sign(signed_bytes(session, serial, candidates), SIGNATURE_ALGORITHM)
+
+
+def verify_candidates(
+    certificate: bytes, session: SessionId, serial: int, candidates: tuple[Candidate, ...], signature: bytes
+) -> None:
+    """Check the signature with the certificate (DER) of the session's credential, which is for the caller to judge.
+
+    Raises:
+        CertificateError: the certificate's key did not sign this.
+    """
+    if not signature:
+        raise CertificateError(UNTRUSTED, "its addresses are not signed")
+    try:
+        signer_key(certificate).verify(signature, signed_bytes(session, serial, candidates), SIGNATURE_ALGORITHM)
+    except InvalidSignature:
+        raise CertificateError(UNTRUSTED, "the signature of its addresses is wrong") from None
+
+
+def signed_bytes(session: SessionId, serial: int, candidates: tuple[Candidate, ...]) -> bytes:
+    """Return what is signed; other candidates are other bytes."""
+    parts = [_LABEL, _HEAD.pack(session, serial, len(candidates))]
+    for candidate in candidates:
+        host, port = candidate.address
+        parts.append(_CANDIDATE.pack(candidate.interface_id, _KINDS[candidate.kind], port))
+        # A zone (fe80::1%eth0) means nothing elsewhere and does not travel.
+        for text in (candidate.interface.encode(), host.partition("%")[0].encode()):
+            parts += (bytes([len(text)]), text)
+    return b"".join(parts)

@@ -1,0 +1,72 @@
+"""What this run announces of its addresses: no more than peers use, numbered, and signed with the certificate's key."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from protos.candidate_signature import sign_candidates
+from protos.convert.fields import MAX_CANDIDATES
+from protos.model import MAX_CANDIDATES_OF_INTERFACE, CandidateSet
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from protos.model import Candidate, InterfaceName, SessionId
+    from protos.preferences import InterfaceLabel
+    from protos.tls_files import TlsFiles
+
+log = logging.getLogger(__name__)
+
+
+class Announcer:
+    """Makes the announcements of one session; not for several threads at once.
+
+    `tls` returns the present certificate and key, None is the insecure mode. `labels` tells what is known of
+    interfaces.
+    """
+
+    def __init__(
+        self,
+        session: SessionId,
+        tls: Callable[[], TlsFiles] | None,
+        labels: Callable[[Iterable[InterfaceName]], tuple[InterfaceLabel, ...]],
+    ) -> None:
+        self._session = session
+        self._tls = tls
+        self._labels = labels
+        self._serial = 0
+        self._candidates: tuple[Candidate, ...] = ()
+        self._left_out: dict[InterfaceName, int] = {}
+
+    def announce(self, candidates: Iterable[Candidate]) -> CandidateSet:
+        """Return the announcement of these candidates, of each interface the best first: some 0.1 ms."""
+        found = tuple(candidates)
+        self._candidates = tuple(islice(_first_of_each(found), MAX_CANDIDATES))
+        self._log_left_out(found)
+        return self.again()
+
+    def again(self) -> CandidateSet:
+        """Return the last announcement, signed with the certificate of now."""
+        self._serial += 1
+        signature = b""
+        if self._tls is not None:
+            signature = sign_candidates(self._tls().private_key, self._session, self._serial, self._candidates)
+        labels = self._labels(candidate.interface for candidate in self._candidates)
+        return CandidateSet(self._candidates, labels, self._serial, signature)
+
+    def _log_left_out(self, found: tuple[Candidate, ...]) -> None:
+        left_out = Counter(one.interface for one in found) - Counter(one.interface for one in self._candidates)
+        for name in left_out.keys() - self._left_out.keys():
+            log.warning("%s: %d of its addresses are not announced: peers use few of each", name, left_out[name])
+        self._left_out.update(left_out)  # once in a run
+
+
+def _first_of_each(candidates: Iterable[Candidate]) -> Iterator[Candidate]:
+    counts: Counter[InterfaceName] = Counter()
+    for candidate in candidates:
+        counts[candidate.interface] += 1
+        if counts[candidate.interface] <= MAX_CANDIDATES_OF_INTERFACE:
+            yield candidate

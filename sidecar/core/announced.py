@@ -1,0 +1,95 @@
+"""Where peers may be looked for: the newest addresses that each of them has signed itself.
+
+The control plane relays them. What it adds, changes or plays again is not used, so that it can not aim a fleet at an
+address of its choosing; the addresses that the peer signed before stay in use. They are remembered for longer than the
+peer is known: taking it out of the view and putting it back brings no old ones into use.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from typing import TYPE_CHECKING, NamedTuple
+
+from protos.errors import DecodeError
+from protos.model import MAX_CANDIDATES_OF_INTERFACE
+
+if TYPE_CHECKING:
+    from protos.model import Candidate, InterfaceId, NodeName, Peer
+    from sidecar.core.session import OwnSession
+
+MAX_REMEMBERED = 8192
+"""Peers whose newest announcement is remembered; twice those of a view, so that it is the absent ones that go."""
+
+
+class _Announcement(NamedTuple):
+    incarnation: int
+    serial: int
+    told: tuple[Candidate, ...]
+    used: tuple[Candidate, ...]
+    signed: bool
+
+
+class Announced:
+    """The newest announcement of each peer."""
+
+    def __init__(self, own: OwnSession, dropped: Counter[str]) -> None:
+        self._own = own
+        self._dropped = dropped
+        self._newest: OrderedDict[NodeName, _Announcement] = OrderedDict()
+        self.ignored: dict[NodeName, str] = {}
+        """Why what was told last of a peer's addresses is not used; of peers that are remembered, or in the view."""
+
+    def candidates_of(self, told: Peer) -> tuple[Candidate, ...]:
+        """Return the addresses to use for a peer of which this is told now."""
+        newest = self._newest.get(told.name)
+        if newest is None or newest[:3] != (told.incarnation, told.candidates_serial, told.candidates):
+            fault, newest = self._judge(told, newest)
+        else:
+            fault = ""
+        if fault:
+            self.ignored[told.name] = fault
+        else:
+            self.ignored.pop(told.name, None)
+        if newest is None:
+            return ()
+        self._newest[told.name] = newest
+        self._newest.move_to_end(told.name)
+        if len(self._newest) > MAX_REMEMBERED:
+            self._newest.popitem(last=False)
+        return newest.used
+
+    def _judge(self, told: Peer, newest: _Announcement | None) -> tuple[str, _Announcement | None]:
+        """Return what is wrong with news of a peer's addresses, or nothing, and the announcement to go by."""
+        nothing_said = not told.candidates and not told.candidates_signature
+        if newest is not None and newest.signed:
+            if nothing_said:
+                return "", newest  # it has a new run or certificate, with which it signs them in a moment
+            if (told.incarnation, told.candidates_serial) <= (newest.incarnation, newest.serial):
+                self._dropped["old_candidates"] += 1
+                return "they are older than what it announced before", newest
+        try:
+            signed = self._own.check_candidates(told)
+        except DecodeError as error:
+            if nothing_said:
+                return "", newest
+            self._dropped["bad_candidates"] += 1
+            return str(error), newest
+        used = _cut(told.candidates)
+        if len(used) < len(told.candidates):
+            self._dropped["candidates_full"] += len(told.candidates) - len(used)
+        return "", _Announcement(told.incarnation, told.candidates_serial, told.candidates, used, signed)
+
+    def forget_all_but(self, names: set[NodeName]) -> None:
+        """Only these are peers now: nothing is said of others any more."""
+        self.ignored = {name: why for name, why in self.ignored.items() if name in names}
+
+
+def _cut(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
+    """Return the first ones of each interface."""
+    counts: Counter[InterfaceId] = Counter()
+    used = []
+    for candidate in candidates:
+        counts[candidate.interface_id] += 1
+        if counts[candidate.interface_id] <= MAX_CANDIDATES_OF_INTERFACE:
+            used.append(candidate)
+    return tuple(used)

@@ -1,0 +1,153 @@
+"""Which addresses of peers are used: the newest that each signed. In insecure mode, whatever is told."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from protos.candidate_signature import sign_candidates, verify_candidates
+from protos.identity import IdentityRole
+from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, NodeName, Peer, Role
+from sidecar.core import announced as module
+from sidecar.core import session
+from sidecar.core.announced import Announced
+from sidecar.start_session import start_session
+from tests.sessions import session_of
+from tests.unit.sidecar.core.builders import peer
+from tests.unit.sidecar.test_start_session import Fleet
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from protos.tls_files import TlsFiles
+
+pytestmark = pytest.mark.audit("sec-5")
+
+INSECURE = session_of("robot-1", Role.ROBOT, 99)
+
+
+def candidate(host: str, interface: int = 0) -> Candidate:
+    return Candidate(InterfaceId(interface), InterfaceName(f"eth{interface}"), CandidateKind.HOST, (host, 1))
+
+
+class Cloud:
+    """A cloud with a certificate, and a robot that hears of it."""
+
+    def __init__(self, folder: Path) -> None:
+        fleet = Fleet(folder)
+        self.files: TlsFiles = fleet.issue("cloud-a", IdentityRole.CLOUD)
+        self.own = fleet.session(self.files)
+        self.robot = fleet.session(fleet.issue("robot-1"))
+        self.dropped: Counter[str] = Counter()
+        self.announced = Announced(self.robot, self.dropped)
+
+    def told(self, serial: int, *hosts: str, signed: bool = True) -> Peer:
+        credential, candidates = self.own.credential, tuple(map(candidate, hosts))
+        return Peer(
+            credential.name,
+            credential.role,
+            credential.session,
+            bytes(16),
+            credential.incarnation,
+            candidates,
+            credential=credential.encode(),
+            candidates_serial=serial,
+            candidates_signature=sign_candidates(self.files.private_key, credential.session, serial, candidates)
+            if signed
+            else b"",
+        )
+
+    def hosts(self, told: Peer) -> list[str]:
+        return [used.address[0] for used in self.announced.candidates_of(told)]
+
+
+@pytest.fixture
+def cloud(tmp_path: Path) -> Cloud:
+    return Cloud(tmp_path)
+
+
+def test_the_newest_that_is_signed_is_used(cloud: Cloud) -> None:
+    assert cloud.hosts(cloud.told(1, "a")) == ["a"]
+    assert cloud.hosts(cloud.told(3, "c")) == ["c"]
+    assert cloud.hosts(cloud.told(2, "b")) == ["c"]
+    assert cloud.hosts(cloud.told(3, "another")) == ["c"]
+    assert cloud.dropped == {"old_candidates": 2}
+    assert "older" in cloud.announced.ignored[NodeName("cloud-a")]
+    assert cloud.hosts(cloud.told(3, "c")) == ["c"]
+    assert cloud.announced.ignored == {}
+    assert cloud.hosts(cloud.told(4)) == []
+
+
+def test_what_is_not_signed_is_not_used(cloud: Cloud) -> None:
+    assert cloud.hosts(cloud.told(1, "a", signed=False)) == []
+    assert cloud.announced.ignored == {"cloud-a": "its addresses are not signed"}
+    assert cloud.hosts(replace(cloud.told(1, "a"), candidates=(candidate("victim"),))) == []
+    assert cloud.announced.ignored == {"cloud-a": "the signature of its addresses is wrong"}
+    assert cloud.dropped == {"bad_candidates": 2}
+    assert cloud.hosts(cloud.told(1, "a")) == ["a"]
+    assert cloud.announced.ignored == {}
+
+
+def test_nothing_said_is_no_fault_and_changes_nothing(cloud: Cloud) -> None:
+    """A peer that has restarted, or renewed its certificate, signs its addresses a moment later."""
+    assert cloud.hosts(cloud.told(0, signed=False)) == []
+    assert cloud.hosts(cloud.told(1, "a")) == ["a"]
+    assert cloud.hosts(cloud.told(0, signed=False)) == ["a"]
+    assert not cloud.dropped
+    assert cloud.announced.ignored == {}
+
+
+def test_a_new_run_counts_from_the_start(cloud: Cloud) -> None:
+    assert cloud.hosts(cloud.told(9, "a")) == ["a"]
+    old = cloud.told(10, "old")
+    cloud.own = start_session(cloud.files.identity.name, Role.CLOUD, 2, lambda: cloud.files)
+    assert cloud.hosts(cloud.told(1, "b")) == ["b"]
+    assert cloud.hosts(old) == ["b"]
+    assert cloud.dropped == {"old_candidates": 1}
+
+
+def test_each_signature_is_looked_at_once(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Good or bad: judged before the engine's lock is taken, it costs nothing under it."""
+    looks = 0
+    verify = verify_candidates
+
+    def counting(*arguments: object) -> None:
+        nonlocal looks
+        looks += 1
+        verify(*arguments)  # type: ignore[arg-type]  # passed on
+
+    monkeypatch.setattr(session, "verify_candidates", counting)
+    good = cloud.told(1, "a")
+    bad = replace(good, candidates_serial=2)
+    for told in (good, good, bad, bad):
+        cloud.announced.candidates_of(told)
+    assert looks == 2
+
+
+def test_in_insecure_mode_the_last_word_counts() -> None:
+    announced = Announced(INSECURE, Counter())
+    told = peer("cloud-a")
+    assert announced.candidates_of(told) == told.candidates
+    assert announced.candidates_of(replace(told, candidates=(candidate("b"),))) == (candidate("b"),)
+    assert announced.candidates_of(replace(told, candidates=())) == ()
+    assert announced.candidates_of(told) == told.candidates
+
+
+def test_the_first_eight_of_an_interface_are_used() -> None:
+    dropped: Counter[str] = Counter()
+    announced = Announced(INSECURE, dropped)
+    many = [candidate(f"{interface}.{number}", interface) for number in range(9) for interface in range(2)]
+    used = announced.candidates_of(replace(peer("cloud-a"), candidates=tuple(many)))
+    assert used == tuple(many[:16])
+    assert dropped == {"candidates_full": 2}
+
+
+def test_the_absent_ones_are_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_REMEMBERED", 3)
+    announced = Announced(INSECURE, Counter())
+    for name in ("a", "b", "c", "a", "d"):
+        announced.candidates_of(peer(name))
+    assert list(announced._newest) == ["c", "a", "d"]
