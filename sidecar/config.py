@@ -117,7 +117,7 @@ class SidecarConfig(Section):
     """How the sidecar learns its addresses as seen from outside."""
     state_dir: Annotated[Path, converted] = Path("/var/lib/plr")
     """Absolute path of the folder for the identity and the last good mapping."""
-    rekey_after_s: Annotated[int, Field(ge=1, le=86_400)] = 3600
+    rekey_after_s: Annotated[int, Field(ge=1, le=86_400)] = 120
     """Seconds after which the keys that seal datagrams are changed; their volume changes them as well."""
     metrics_listen: ListenAddress | None = "127.0.0.1:9464"
     """address:port of the Prometheus metrics; null for none."""

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 from protos.credential import Aead, SessionCredential
 from protos.model import NodeName, Peer, Role, SessionId
 from sidecar.core.aead import NONCE_BYTES, TAG_BYTES
-from sidecar.core.frame import HEADER_BYTES, Header, encode_header
+from sidecar.core.frame import HEADER_BYTES, PHASE_FLAG, Header, encode_header
 from sidecar.core.session import OwnSession, public_key
 
 if TYPE_CHECKING:
-    from sidecar.core.path_keys import SealingKeys
+    import random
+
+    from sidecar.core.path_keys import PathKeys, SealingKeys
 
 
 @lru_cache(maxsize=65536)
@@ -37,14 +39,27 @@ def session_of(name: str, role: Role, session: int, incarnation: int = 1, aead: 
     )
 
 
-def with_credential(peer: Peer) -> Peer:
+def with_credential(peer: Peer, aead: Aead = Aead.AES_256_GCM) -> Peer:
     """The peer with a credential that fits it."""
-    return replace(peer, credential=credential_of(peer.name, peer.role, peer.session, peer.incarnation).encode())
+    credential = credential_of(peer.name, peer.role, peer.session, peer.incarnation, aead)
+    return replace(peer, credential=credential.encode())
+
+
+def agree(leader: PathKeys, follower: PathKeys, now: float, rng: random.Random) -> None:
+    """Both ends of a path exchange fresh keys, without a datagram."""
+    offer = leader.offer(now, rng)
+    assert offer is not None
+    answer = follower.answer(offer, now, rng)
+    assert answer is not None
+    assert leader.take(answer, now)
+    follower.opening.advance(0)
+    assert follower.follow(now)
+    leader.opening.advance(0)
 
 
 def seal(sealing: SealingKeys, header: Header, plain: bytes) -> bytes:
-    """Return a datagram sealed with a path's present keys, whose interfaces and phase may be the header's own."""
-    clear = encode_header(header)
+    """Return a datagram sealed with a path's present keys, whose interfaces may be the header's own."""
+    clear = encode_header(header._replace(flags=header.flags | sealing.phase % 2 * PHASE_FLAG))
     out = bytearray(len(plain) + TAG_BYTES)
     sealing.encrypt_into(clear[HEADER_BYTES - NONCE_BYTES :], plain, clear, out)
     return clear + out

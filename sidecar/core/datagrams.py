@@ -209,7 +209,7 @@ class DatagramBuilder:
         segment = FRAGMENT_OVERHEAD_BYTES + symbol
         first_number = path.recovery.take_numbers(count)
         sealing = path.sealing
-        sealing.use(count, now)
+        sealing.sealed += count
         head, seal_into = sealing.head, sealing.encrypt_into
         session = self.identity.session
         kind, counted = (FRAGMENT_TYPE, "data") if indices.start < message.count else (REPAIR_TYPE, "repair")
@@ -286,33 +286,42 @@ class DatagramBuilder:
         remote = path.remote
         # Each destination has a probe of its own: the answer tells which of them the peer is at.
         if remote is not None and path.goes_to_one:
-            probe = frame.encode_probe(frame.Probe(path.ask(now, remote)))
-            self._add_control(path, [probe, *path.take_control(now)], burst, now)
+            asked = [frame.encode_probe(frame.Probe(path.ask(now, remote)))]
+            if (offer := path.offer_keys(now)) is not None:
+                asked.append(frame.encode_key_offer(offer))
+            self._add_control(path, [*asked, *path.take_control(now)], burst, now)
             if path.renewed_at is not None and path.address.is_proven:
-                self._add_introduction(path, remote, path.probing.ask(now, remote, sealed=False), burst)
+                self._add_introduction(path, remote, path.probing.ask(now, remote, sealed=False), burst, now)
         elif path.state is PathState.DOWN:
             for address in path.destinations(now, INTRODUCTION_BYTES + len(self.identity.credential)):
-                self._add_introduction(path, address, path.ask(now, address), burst)
+                self._add_introduction(path, address, path.ask(now, address), burst, now)
         else:
             for address in path.destinations(now, LEAST_CREDIT_BYTES):
                 probe = frame.encode_probe(frame.Probe(path.ask(now, address)))
                 self._add_alone(path, address, self._sealed(path, path.recovery.take_numbers(), now, probe), burst)
         path.plan_probe(now)
 
-    def _add_introduction(self, path: Path, address: Address, probe_id: int, burst: Burst) -> None:
+    def _add_introduction(self, path: Path, address: Address, probe_id: int, burst: Burst, now: float) -> None:
         me = self.identity
         header = Header(me.interface_id, path.remote_id, me.session, path.recovery.take_numbers())
         token = pair_token(me.token, path.peer, Role.CLOUD if me.role is Role.ROBOT else Role.ROBOT)
-        datagram = encode_introduction(header, token, path.peer, probe_id, me.credential)
+        offer = path.offer_keys(now)
+        datagram = encode_introduction(header, token, path.peer, probe_id, me.credential, offer)
         self._add_alone(path, address, datagram, burst)
 
     def _answer_introductions(self, path: Path, burst: Burst, now: float) -> None:
         """Answer to where each came from, and ask back: the reply to that proves who it was, and moves the path."""
         introductions, path.introductions = path.introductions, []
-        for address, probe_id in introductions:
-            reply = frame.encode_probe_reply(frame.ProbeReply(probe_id))
-            probe = frame.encode_probe(frame.Probe(path.probing.ask_back(now, address)))
-            datagram = self._sealed(path, path.recovery.take_numbers(), now, reply, probe)
+        for address, probe_id, answer in introductions:
+            frames = [
+                frame.encode_probe_reply(frame.ProbeReply(probe_id)),
+                frame.encode_probe(frame.Probe(path.probing.ask_back(now, address))),
+            ]
+            if answer is not None:
+                frames.append(frame.encode_key_answer(answer))
+            elif (offer := path.offer_keys(now)) is not None:
+                frames.append(frame.encode_key_offer(offer))
+            datagram = self._sealed(path, path.recovery.take_numbers(), now, *frames)
             self._add_alone(path, address, datagram, burst)
 
     def _add_mtu_probe(self, path: Path, burst: Burst, now: float) -> None:
@@ -334,7 +343,7 @@ class DatagramBuilder:
     def _sealed(self, path: Path, number: int, now: float, *frames: bytes | memoryview) -> bytes:
         """Return a datagram of these encoded frames."""
         sealing = path.sealing
-        sealing.use(1, now)
+        sealing.sealed += 1
         clear = CLEAR.pack(sealing.head, self.identity.session, number)
         plain = b"".join(frames)
         sealed = bytearray(len(plain) + TAG_BYTES)

@@ -34,6 +34,8 @@ Frames, each a type byte and then::
     ABANDON      7  message (64)                             the sender will not send the rest
     CLOSE        8  the sidecar goes away
     FORGOTTEN   10  message (64)                             the receiver dropped what it had of it: send it anew
+    KEY_OFFER   11  phase (32) public key (32 bytes) proof (16 bytes)    new keys (key_exchange.py)
+    KEY_ANSWER  12  phase (32) public key (32 bytes) proof (16 bytes)
 
 A message of `total size` bytes is cut into symbols of `symbol size` bytes, the last one shorter; `index` counts them.
 `left` is how long the message is still of use when the datagram arrives, as far as its sender can tell: written when
@@ -80,10 +82,11 @@ MAX_FRAMES = 64
 """Frames in one datagram; an honest one holds a handful."""
 
 _PADDING, _PROBE, _PROBE_REPLY, _ACK, FRAGMENT_TYPE, REPAIR_TYPE, FINISHED_TYPE, _ABANDON = range(8)
-_CLOSE, _FORGOTTEN = 8, 10
+_CLOSE, _FORGOTTEN, _KEY_OFFER, _KEY_ANSWER = 8, 10, 11, 12
 
 _U64 = struct.Struct(">Q")
 _ACK_HEAD = struct.Struct(">QIB")
+_NEW_KEY = struct.Struct(">I32s16s")
 _ACK_RANGE = struct.Struct(">HH")
 _FRAGMENT_HEAD = struct.Struct(">QIHHI")
 FRAGMENT_HEAD = struct.Struct(">BQIHHI")
@@ -164,11 +167,27 @@ class Forgotten(NamedTuple):
     message: int
 
 
+class KeyOffer(NamedTuple):
+    """Asks for a KEY_ANSWER, for the phase after the one in use."""
+
+    phase: int
+    key: bytes
+    proof: bytes
+
+
+class KeyAnswer(NamedTuple):
+    """Completes new keys."""
+
+    phase: int
+    key: bytes
+    proof: bytes
+
+
 class Close(NamedTuple):
     """The sender goes away."""
 
 
-Frame = Probe | ProbeReply | AckFrame | Fragment | Finished | Abandon | Forgotten | Close
+Frame = Probe | ProbeReply | AckFrame | Fragment | Finished | Abandon | Forgotten | Close | KeyOffer | KeyAnswer
 
 
 class VersionError(DecodeError):
@@ -224,6 +243,16 @@ def encode_probe(frame: Probe) -> bytes:
 def encode_probe_reply(frame: ProbeReply) -> bytes:
     """Return the frame's bytes."""
     return b"\x02" + _U64.pack(frame.id)
+
+
+def encode_key_offer(frame: KeyOffer) -> bytes:
+    """Return the frame's bytes."""
+    return bytes([_KEY_OFFER]) + _NEW_KEY.pack(*frame)
+
+
+def encode_key_answer(frame: KeyAnswer) -> bytes:
+    """Return the frame's bytes."""
+    return bytes([_KEY_ANSWER]) + _NEW_KEY.pack(*frame)
 
 
 def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
@@ -317,6 +346,12 @@ def decode_frames(view: memoryview) -> list[Frame]:
                 position += 8
             elif kind == _CLOSE:
                 frames.append(Close())
+            elif kind == _KEY_OFFER:
+                frames.append(KeyOffer(*_NEW_KEY.unpack_from(view, position)))
+                position += _NEW_KEY.size
+            elif kind == _KEY_ANSWER:
+                frames.append(KeyAnswer(*_NEW_KEY.unpack_from(view, position)))
+                position += _NEW_KEY.size
             else:
                 raise DecodeError(f"unknown frame type {kind}")
             if len(frames) > MAX_FRAMES:

@@ -3,7 +3,8 @@
 Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
 
     hello id (8 bytes)        = Expand(token, "plr 2 hello id")
-    sealed:  probe id (64), credential (protos/credential.py)
+    sealed:  probe id (64), offer of keys (phase (32), public key (32 bytes), proof (16 bytes); all 0: none),
+             credential (protos/credential.py)
     tag (16 bytes)
 
 The token is the sender's for this receiver (`protos/pair_token.py`): stable, and known to these two and the control
@@ -16,7 +17,8 @@ The control plane knows the token too, and so does whoever reads the receiver's 
 credential says who it is, by its signature, and the sealed datagrams that follow prove that it has the session's key.
 Until then nothing moves, nothing counts as received, and the answer is shorter than the question. Who repeats itself
 could not read the answer, since it does not know our session: while the path is down here as well, our own
-introductions, as rare as they are, go there too.
+introductions, as rare as they are, go there too. The offer of keys has a proof of its own (key_exchange.py): who knows
+no more than the token can make none.
 """
 
 from __future__ import annotations
@@ -31,7 +33,15 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from protos.credential import decode_credential
 from protos.errors import DecodeError
 from sidecar.core.aead import TAG_BYTES
-from sidecar.core.frame import HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, SEALED_FLAG, Header, encode_header
+from sidecar.core.frame import (
+    HEADER_BYTES,
+    INTRODUCTION_FLAG,
+    NONCE_OFFSET,
+    SEALED_FLAG,
+    Header,
+    KeyOffer,
+    encode_header,
+)
 from sidecar.core.key_schedule import expand
 from sidecar.core.pmtu import BASE_BYTES
 
@@ -42,9 +52,10 @@ if TYPE_CHECKING:
 HELLO_BYTES = 8
 INTRODUCTION_FLAGS = SEALED_FLAG | INTRODUCTION_FLAG
 _SEALED_FROM = HEADER_BYTES + HELLO_BYTES
-_PROBE_ID = struct.Struct(">Q")
+_HEAD = struct.Struct(">QI32s16s")
+_NO_OFFER = KeyOffer(0, bytes(32), bytes(16))
 _KEY_HEAD = struct.Struct(">QBB")
-INTRODUCTION_BYTES = _SEALED_FROM + _PROBE_ID.size + TAG_BYTES
+INTRODUCTION_BYTES = _SEALED_FROM + _HEAD.size + TAG_BYTES
 """Of an introduction beside its credential."""
 MAX_INTRODUCED_BYTES = BASE_BYTES - INTRODUCTION_BYTES
 """Longest credential that can be introduced: every path carries BASE_BYTES."""
@@ -58,6 +69,7 @@ class Introduction(NamedTuple):
     """What an introduction says; the credential is not verified yet."""
 
     probe_id: int
+    offer: KeyOffer | None
     credential: SessionCredential
 
 
@@ -72,10 +84,12 @@ def read_hello_id(datagram: memoryview) -> bytes:
     return bytes(datagram[HEADER_BYTES:_SEALED_FROM])
 
 
-def encode_introduction(header: Header, token: bytes, receiver: NodeName, probe_id: int, credential: bytes) -> bytes:
+def encode_introduction(
+    header: Header, token: bytes, receiver: NodeName, probe_id: int, credential: bytes, offer: KeyOffer | None = None
+) -> bytes:
     """Return the whole datagram; `token` is ours for the receiver, `credential` ours and encoded."""
     clear = encode_header(header._replace(flags=INTRODUCTION_FLAGS)) + hello_id(token)
-    plain = _PROBE_ID.pack(probe_id) + credential
+    plain = _HEAD.pack(probe_id, *(offer or _NO_OFFER)) + credential
     return clear + _cipher(header, token, receiver).encrypt(clear[NONCE_OFFSET:HEADER_BYTES], plain, clear)
 
 
@@ -94,13 +108,14 @@ def open_introduction(header: Header, datagram: memoryview, token: bytes, receiv
         plain = cipher.decrypt(clear[NONCE_OFFSET:HEADER_BYTES], datagram[_SEALED_FROM:], clear)
     except InvalidTag:
         raise UnauthenticError("not of one who knows the token") from None
-    if len(plain) < _PROBE_ID.size:
+    if len(plain) < _HEAD.size:
         raise DecodeError("introduction cut off")
-    credential = decode_credential(plain[_PROBE_ID.size :])
+    credential = decode_credential(plain[_HEAD.size :])
     if credential.session != header.session:
         raise DecodeError("introduction with the credential of another session")
-    (probe_id,) = _PROBE_ID.unpack_from(plain)
-    return Introduction(probe_id, credential)
+    probe_id, *rest = _HEAD.unpack_from(plain)
+    offer = KeyOffer(*rest)
+    return Introduction(probe_id, offer if offer != _NO_OFFER else None, credential)
 
 
 def _cipher(header: Header, token: bytes, receiver: NodeName) -> ChaCha20Poly1305:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from sidecar.core import frame
 from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
+from sidecar.core.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.link_events import (
     Attend,
     CheckPaths,
@@ -39,7 +40,6 @@ from sidecar.core.link_mtu import LinkMtu
 from sidecar.core.link_reader import LinkReader
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keeper import PathKeeper
-from sidecar.core.path_keys import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.path_table import PathTable
 from sidecar.core.stats import PathStats
 from sidecar.core.timers import NEVER, Timers

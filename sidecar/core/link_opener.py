@@ -14,6 +14,7 @@ from sidecar.core.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAG
 from sidecar.core.introduction import UnauthenticError, open_introduction, read_hello_id
 from sidecar.core.link_events import PeerRenewed, PeerRestarted
 from sidecar.core.path_id import PathState
+from sidecar.core.path_keys import MAX_FAILED
 from sidecar.core.path_table import MAX_INTRODUCTIONS
 
 if TYPE_CHECKING:
@@ -66,11 +67,15 @@ class LinkOpener:
             body = start + HEADER_BYTES
             out = plain[start : stop - _OVERHEAD_BYTES]
             opening = path.opening
+            if opening.failed >= MAX_FAILED:
+                dropped["keys_worn_out"] += 1
+                continue
             open_into = opening.decrypt_into if head == opening.head else opening.open_other
             try:
                 open_into(data[start + NONCE_OFFSET : body], data[body:stop], data[start:body], out)
             except InvalidTag:
                 dropped["unauthentic"] += 1
+                opening.failed += 1
                 continue
             opened.append((path, number, out))
         return opened
@@ -121,7 +126,7 @@ class LinkOpener:
             return "unknown_introducer"
         if header.receiver_interface != table.identity.interface_id:
             return "wrong_interface"
-        probe_id, credential = open_introduction(header, datagram, peer.token, table.identity.name)
+        probe_id, offer, credential = open_introduction(header, datagram, peer.token, table.identity.name)
         if credential.name != peer.name:
             return "malformed"
         if header.session != peer.session:
@@ -141,7 +146,11 @@ class LinkOpener:
             return None  # an answer would bring us back to life over there
         if len(path.introductions) >= MAX_INTRODUCTIONS:
             return "introductions_full"
-        path.note_introduction(source, probe_id, now)
+        try:
+            answer = None if offer is None else path.answer_keys(offer, now)
+        except DecodeError:
+            return "bad_keys"
+        path.note_introduction(source, probe_id, answer, now)
         if path.state is PathState.DOWN:
             path.hasten_probe(now)
         table.dirty[path.id] = path

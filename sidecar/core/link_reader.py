@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from protos.errors import DecodeError
 from protos.model import Role
@@ -32,6 +32,8 @@ from sidecar.core.link_opener import LinkOpener
 from sidecar.core.path_id import PathState
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from protos.model import Address
     from sidecar.core.link_mtu import LinkMtu
     from sidecar.core.link_opener import Opened
@@ -40,8 +42,14 @@ if TYPE_CHECKING:
     from sidecar.core.paths import Path
 
 
+T = TypeVar("T")
+
 DATAGRAM_BYTES = HEADER_BYTES + TAG_BYTES
 """Of a datagram beside its frames."""
+
+
+_BEFORE_FRESH_KEYS = (frame.Probe, frame.ProbeReply, frame.KeyOffer, frame.KeyAnswer)
+"""What a path carries before the first exchange of keys: see `key_exchange`."""
 
 
 class LinkReader:
@@ -80,7 +88,7 @@ class LinkReader:
         """
         path, low, _ = opened[position]
         received = path.received
-        if low <= received.largest:
+        if low <= received.largest or not path.opening.phase:
             return position
         unpack, new = FRAGMENT_HEAD.unpack_from, tuple.__new__
         high = low - 1
@@ -126,6 +134,7 @@ class LinkReader:
         """An authentic datagram that is no duplicate came; `newest`: sent after all that came before."""
         if newest and source != path.remote and not (self._leads and path.keeps_address(source)):
             self._mtu.moved(path, source, now)
+        self._keeper.follow_keys(path, now)
         self._table.dirty[path.id] = path
 
     @staticmethod
@@ -171,6 +180,9 @@ class LinkReader:
         events = self._events
         kind = "control"
         for item in frames:
+            if not path.opening.phase and not isinstance(item, _BEFORE_FRESH_KEYS):
+                self._stats.dropped["before_fresh_keys"] += 1
+                continue
             match item:
                 case frame.Fragment():
                     eliciting = True
@@ -199,6 +211,10 @@ class LinkReader:
                     events.append(PeerClosed(path.peer, path.session))
                 case frame.Close():
                     pass
+                case frame.KeyOffer():
+                    self._exchange(self._keeper.keys_offered, path, item, now)
+                case frame.KeyAnswer():
+                    self._exchange(self._keeper.keys_answered, path, item, now)
         self._stats.datagrams["received", kind] += 1
         if path.state is PathState.DOWN and not replies:
             # It lives in this direction. A reply that fits nothing says only that it is slow: were it a reason to ask,
@@ -206,6 +222,12 @@ class LinkReader:
             path.hasten_probe(now)
         if eliciting:
             path.received.owe_ack(now)
+
+    def _exchange(self, step: Callable[[Path, T, float], None], path: Path, item: T, now: float) -> None:
+        try:
+            step(path, item, now)
+        except DecodeError:
+            self._stats.dropped["bad_keys"] += 1
 
     def _receive_reply(self, path: Path, probe_id: int, now: float) -> None:
         if self._mtu.answered(path, probe_id, now):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sidecar.core.frame import encode_key_answer
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
@@ -55,7 +56,6 @@ class PathKeeper:
         for run in arrived:
             if run.message is not None:
                 run.message.acked[run.symbol : run.symbol + run.datagrams] = b"\1" * run.datagrams
-        path.sealing.delivered(max(run.at for run in arrived))
         path.mtu.on_delivered(max(run.longest for run in arrived))
         if recovery.sample is not None:
             path.control.on_acked(recovery.sample, recovery.rtt, now)
@@ -72,6 +72,26 @@ class PathKeeper:
             if in_flight and in_flight[0].at <= sent_at:
                 # What left before the probe may be lost, and fill a window in which nothing else may leave.
                 path.recovery.ask_at_once(now)
+            self.path_up(path, now)
+
+    def keys_offered(self, path: Path, offer: frame.KeyOffer, now: float) -> None:
+        """The peer, who leads, offers new keys. Raises DecodeError."""
+        answer = path.answer_keys(offer, now)
+        if answer is not None:
+            self._table.owe(path, encode_key_answer(answer))
+
+    def keys_answered(self, path: Path, answer: frame.KeyAnswer, now: float) -> None:
+        """The peer answers our offer of new keys. Raises DecodeError."""
+        if path.keys.take(answer, now):
+            self._answers(path, now)
+
+    def follow_keys(self, path: Path, now: float) -> None:
+        """Something opened: go on with new keys, if it did with these."""
+        if path.keys.follow(now):
+            self._answers(path, now)
+
+    def _answers(self, path: Path, now: float) -> None:
+        if path.made_progress(now):
             self.path_up(path, now)
 
     def path_up(self, path: Path, now: float) -> None:
@@ -92,6 +112,9 @@ class PathKeeper:
         gives_up_at = path.gives_up_address_at
         if gives_up_at is not None and gives_up_at <= now:
             self._lead_back(path, now)
+        if path.state is not PathState.DOWN and not path.keys.are_fresh:
+            self.take_down(path, "keys worn out")
+            return
         state = path.check_silence(now)
         if state is not None:
             if state is PathState.DOWN:

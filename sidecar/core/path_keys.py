@@ -1,8 +1,8 @@
-"""Keys of one path: sealing what leaves, opening what comes, and their phases (in the spirit of RFC 9001 section 6).
+"""Keys of one path: sealing what leaves, opening what comes, and their phases.
 
-The sender goes to the next phase by age and by volume, once an answer showed that the peer has the present one; bit 1
-of the flags is the phase's parity. The receiver holds the keys before, in use and next, and follows with the first
-datagram that opens with the next: nothing pauses, nothing is negotiated.
+Bit 1 of the flags is the phase's parity. The receiver holds the keys in use, those before for what is late, and the
+next ones as soon as they are agreed on (key_exchange.py): it follows with the first datagram that opens with these, so
+that nothing pauses.
 
 The nonce is the last 12 of the 20 clear bytes: half of the sender's session, and the packet number, which never
 repeats within a session. A path's keys belong to one session, path and direction (`key_schedule.py`), so no nonce
@@ -11,156 +11,239 @@ repeats under a key. What a path numbered and opened outlives it (`link_memory.p
 
 from __future__ import annotations
 
+import math
 from copy import copy, deepcopy
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from cryptography.exceptions import InvalidTag
 
 from sidecar.core import aead as ciphers
 from sidecar.core.frame import PHASE_FLAG, clear_head
-from sidecar.core.key_schedule import next_phase, phase_key
+from sidecar.core.key_exchange import KeyExchange
 from sidecar.core.received import ReceivedPackets
 
 if TYPE_CHECKING:
+    import random
+
     from cryptography.utils import Buffer
 
     from protos.credential import Aead
     from protos.model import InterfaceId
     from sidecar.core.aead import Cipher
+    from sidecar.core.frame import KeyAnswer, KeyOffer
+    from sidecar.core.key_exchange import KeyLimits
     from sidecar.core.key_schedule import PairKeys
 
 _PHASE = PHASE_FLAG << 16
 """The phase bit in the first four clear bytes as one number."""
-MAX_SEALED_DATAGRAMS = 1 << 22
-"""Datagrams sealed with one key, unless the peer confirms none of them; AES-GCM bears 2^23 of the longest by RFC 9001
-section 6.6, and a path over which nothing is confirmed is down long before."""
-REKEY_AFTER_S = 3600.0
-"""Age of a key at which it is changed."""
-
-
-@dataclass(frozen=True, slots=True)
-class KeyLimits:
-    """When a sender changes a path's keys."""
-
-    datagrams: int = MAX_SEALED_DATAGRAMS
-    seconds: float = REKEY_AFTER_S
-
-
-DEFAULT_LIMITS = KeyLimits()
+LATE_S = 10.0
+"""The keys before are dropped so long after something opened with the next ones: what else was sealed with them has
+arrived, or never will."""
+MAX_FAILED = 1 << 36
+"""Datagrams that fail one phase's keys before these open nothing any more (RFC 9001 section 6.6, the lower limit)."""
 
 
 class SealingKeys:
     """The sender's end of one direction of a path."""
 
-    __slots__ = ("_aead", "_began_at", "_confirmed", "_limits", "_sealed", "_secret", "encrypt_into", "head", "phase")
+    __slots__ = ("_aead", "encrypt_into", "head", "phase", "sealed")
 
-    def __init__(self, aead: Aead, secret: bytes, head: int, limits: KeyLimits, now: float) -> None:
+    def __init__(self, aead: Aead, key: bytes, head: int) -> None:
         self._aead = aead
-        self._limits = limits
         self.phase = 0
         """Counts the changes of keys."""
         self.head = head
         """The first four clear bytes of what is sealed now, as one number."""
-        self._begin(secret, now)
+        self.sealed = 0
+        """Datagrams of this phase."""
+        self.encrypt_into = ciphers.make_cipher(aead, key).encrypt_into
 
-    def _begin(self, secret: bytes, now: float) -> None:
-        self._secret = secret
-        self.encrypt_into = ciphers.make_cipher(self._aead, phase_key(secret)).encrypt_into
-        self._began_at = now
-        self._sealed = 0
-        self._confirmed = False
-
-    def use(self, datagrams: int, now: float) -> None:
-        """So many datagrams are sealed next, with `head` and `encrypt_into` as they are after this call."""
-        if self._confirmed and (self._sealed >= self._limits.datagrams or now >= self._began_at + self._limits.seconds):
-            self.phase += 1
-            self.head ^= _PHASE
-            self._begin(next_phase(self._secret), now)
-        self._sealed += datagrams
-
-    def delivered(self, sent_at: float) -> None:
-        """The peer opened a datagram that left at this time (s)."""
-        # Not those of the very moment of the change: they may have left before it.
-        if sent_at > self._began_at:
-            self._confirmed = True
+    def advance(self, key: bytes) -> None:
+        """Go on with the next phase's key."""
+        self.phase += 1
+        self.head ^= _PHASE
+        self.sealed = 0
+        self.encrypt_into = ciphers.make_cipher(self._aead, key).encrypt_into
 
 
 class OpeningKeys:
     """The receiver's end of one direction of a path."""
 
-    __slots__ = ("_aead", "_current", "_first", "_next", "_next_secret", "_previous", "decrypt_into", "head", "phase")
+    __slots__ = ("_aead", "_current", "_next", "_previous", "decrypt_into", "failed", "first", "head", "phase")
 
-    def __init__(self, aead: Aead, secret: bytes, head: int) -> None:
+    def __init__(self, aead: Aead, key: bytes, head: int) -> None:
         self._aead = aead
         self.phase = 0
         self.head = head
         """The first four clear bytes of datagrams of the phase in use, as one number: `decrypt_into` opens these."""
-        self._current = self._cipher(secret)
+        self._current = ciphers.make_cipher(aead, key)
         self.decrypt_into = self._current.decrypt_into
-        self._first = 0
+        self.first = 0
         """The packet number that began the phase in use."""
         self._previous: Cipher | None = None
-        self._prepare(secret)
+        self._next: Cipher | None = None
+        self.failed = 0
+        """Datagrams that did not open, in this phase."""
 
-    def _cipher(self, secret: bytes) -> Cipher:
-        return ciphers.make_cipher(self._aead, phase_key(secret))
-
-    def _prepare(self, secret: bytes) -> None:
-        # Beforehand, so that the time it takes tells nobody that a datagram was of the next phase (RFC 9001, 6.3).
-        self._next_secret = next_phase(secret)
-        self._next = self._cipher(self._next_secret)
+    def expect(self, key: bytes) -> None:
+        """The next phase's key is agreed on."""
+        self._next = ciphers.make_cipher(self._aead, key)
 
     def open_other(self, nonce: Buffer, sealed: Buffer, associated_data: Buffer, out: Buffer, /) -> int:
         """As `decrypt_into`, for a datagram of the other parity than `head`: of the phase before, or of the next."""
         # The packet number.
         number = int.from_bytes(nonce[-8:], "big")
-        if self._previous is not None and number < self._first:
+        if number < self.first and self._previous is not None:
             return self._previous.decrypt_into(nonce, sealed, associated_data, out)
+        if self._next is None:
+            raise InvalidTag
         size = self._next.decrypt_into(nonce, sealed, associated_data, out)
+        self.advance(number)
+        return size
+
+    def advance(self, number: int) -> None:
+        """Go on with the key that is expected, from this packet number on."""
+        assert self._next is not None
+        # What was sealed in phase 0 was probes, and anybody with one of the sessions' keys could have sealed it.
+        self._previous = self._current if self.phase else None
         self.phase += 1
         self.head ^= _PHASE
-        self._first = number
-        self._previous, self._current = self._current, self._next
+        self.first = number
+        self._current, self._next = self._next, None
         self.decrypt_into = self._current.decrypt_into
-        self._prepare(self._next_secret)
-        return size
+        self.failed = 0
+
+    def forget_previous(self) -> None:
+        """What is still sealed with the keys before is not opened any more."""
+        self._previous = None
 
 
 class PathKeys:
     """What is known of one path for as long as its peer's session, whatever becomes of the path."""
 
-    __slots__ = ("incarnation", "introduced", "opening", "received", "sealing")
+    __slots__ = (
+        "_exchange",
+        "_forget_at",
+        "_most",
+        "_opened_phase",
+        "_pair",
+        "incarnation",
+        "introduced",
+        "opening",
+        "received",
+        "sealing",
+    )
 
     def __init__(
         self,
+        pair: PairKeys,
+        exchange: KeyExchange,
         sealing: SealingKeys,
         opening: OpeningKeys,
-        received: ReceivedPackets,
+        most: int,
         incarnation: int,
-        introduced: int = -1,
     ) -> None:
+        """`most`: datagrams that one phase seals."""
+        self._pair = pair
+        self._exchange = exchange
+        self._most = most
+        self._opened_phase = 0
+        """The last one that is known to have opened something."""
+        self._forget_at = math.inf
+        """When the keys before that are dropped (s)."""
         self.sealing = sealing
         self.opening = opening
-        self.received = received
+        self.received = ReceivedPackets()
         """The packet numbers that came: none is accepted twice."""
         self.incarnation = incarnation
         """Of the peer's session: a later session's is larger."""
-        self.introduced = introduced
+        self.introduced = -1
         """The largest packet number of the peer's introductions: a smaller one is a replay, or overtaken."""
 
     def copy(self) -> PathKeys:
         """Return the same, apart from these from now on."""
-        return PathKeys(
-            copy(self.sealing), copy(self.opening), deepcopy(self.received), self.incarnation, self.introduced
-        )
+        sealing, opening = copy(self.sealing), copy(self.opening)
+        other = PathKeys(self._pair, copy(self._exchange), sealing, opening, self._most, self.incarnation)
+        other.received, other.introduced = deepcopy(self.received), self.introduced
+        other._opened_phase, other._forget_at = self._opened_phase, self._forget_at
+        return other
+
+    @property
+    def are_fresh(self) -> bool:
+        """Whether we seal with keys that follow from an exchange and are not worn, so that requests may go."""
+        return self.sealing.phase > 0 and self.sealing.sealed < self._most
+
+    @property
+    def offers_at(self) -> float:
+        """When a probe leaves for the sake of an offer, if none does before (s)."""
+        if self.opening.phase < self.sealing.phase:
+            return math.inf
+        return self._exchange.offers_at(self._datagrams())
+
+    def offer(self, now: float, rng: random.Random) -> KeyOffer | None:
+        """Return what to offer with the next probe, if new keys are due."""
+        self._forget_previous(now)
+        if self.opening.phase < self.sealing.phase:
+            return None  # the peer has not followed yet
+        return self._exchange.offer(self._datagrams(), now, rng)
+
+    def _datagrams(self) -> int:
+        """Datagrams of this phase, either way: what the peer sealed is about as much as came."""
+        return max(self.sealing.sealed, self.received.largest - self.opening.first)
+
+    def answer(self, offer: KeyOffer, now: float, rng: random.Random) -> KeyAnswer | None:
+        """Return the answer to an offer, if there is one; raises DecodeError."""
+        answered = self._exchange.answer(offer, now, rng)
+        if answered is None:
+            return None
+        answer, root = answered
+        self.opening.expect(self._pair.opening_key(root))
+        return answer
+
+    def take(self, answer: KeyAnswer, now: float) -> bool:
+        """Go on with the keys that an answer completes; False if nothing is asked. Raises DecodeError."""
+        root = self._exchange.take(answer, now)
+        if root is None:
+            return False
+        self.opening.expect(self._pair.opening_key(root))
+        self.sealing.advance(self._pair.sealing_key(root))
+        return True
+
+    def follow(self, now: float) -> bool:
+        """If something opened with the keys that our answer agreed on, seal with these; True if that is news."""
+        if self.opening.phase != self._opened_phase:
+            self._opened_phase = self.opening.phase
+            self._forget_at = now + LATE_S
+        elif now >= self._forget_at:
+            self._forget_previous(now)
+        if self.opening.phase <= self.sealing.phase:
+            return False
+        self.sealing.advance(self._pair.sealing_key(self._exchange.confirmed(now)))
+        return True
+
+    def _forget_previous(self, now: float) -> None:
+        if now >= self._forget_at:
+            self.opening.forget_previous()
+            self._forget_at = math.inf
 
 
 def make_path_keys(
-    pair: PairKeys, ours: InterfaceId, theirs: InterfaceId, limits: KeyLimits, now: float, incarnation: int = 0
+    pair: PairKeys,
+    ours: InterfaceId,
+    theirs: InterfaceId,
+    limits: KeyLimits,
+    now: float,
+    incarnation: int = 0,
+    *,
+    leads: bool,
 ) -> PathKeys:
     """Return the keys of a path that neither end has used; `incarnation` is that of the peer's session."""
+    root = pair.root(ours, theirs)
     return PathKeys(
-        SealingKeys(pair.aead, pair.sending(ours, theirs), clear_head(ours, theirs), limits, now),
-        OpeningKeys(pair.aead, pair.receiving(ours, theirs), clear_head(theirs, ours)),
-        ReceivedPackets(),
+        pair,
+        KeyExchange(pair, root, limits, now, leads=leads),
+        SealingKeys(pair.aead, pair.sealing_key(root), clear_head(ours, theirs)),
+        OpeningKeys(pair.aead, pair.opening_key(root), clear_head(theirs, ours)),
+        limits.sealed,
         incarnation,
     )

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.datagrams import LinkIdentity
+    from sidecar.core.key_exchange import KeyLimits
     from sidecar.core.link_events import LinkEvent, LinkPeer
-    from sidecar.core.path_keys import KeyLimits
 
 MAX_PENDING_FRAMES = 256
 """Control frames waiting on one path besides FINISHED; a peer that makes us owe more is not honest."""
@@ -116,15 +116,15 @@ class PathTable:
         self, peer: LinkPeer, remote: InterfaceId, addresses: tuple[Address, ...], first_number: int, now: float
     ) -> Path | None:
         """None for a path of a session that this link has forgotten: what came over it once would count as new."""
+        leads = self.identity.role is Role.ROBOT
         keys = self._memory.take(peer.name, peer.session, remote)
         if keys is None:
             if self._memory.forgot(peer.name, peer.incarnation):
                 self.stats.dropped["forgotten_session"] += 1
                 return None
             ours = self.identity.interface_id
-            keys = make_path_keys(peer.keys, ours, remote, self._limits, now, peer.incarnation)
+            keys = make_path_keys(peer.keys, ours, remote, self._limits, now, peer.incarnation, leads=leads)
         path_id = PathId(self.identity.interface, peer.name, remote)
-        leads = self.identity.role is Role.ROBOT
         unproven = self._unproven.get(peer.name) or self._new_budget(peer.name, now)
         return Path(path_id, peer.session, keys, addresses, first_number, now, self._rng, unproven, leads=leads)
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from protos.token_bucket import TokenBucket
+    from sidecar.core.frame import KeyAnswer, KeyOffer
     from sidecar.core.path_keys import PathKeys
 
 DOWN_FACTOR = 4.0
@@ -45,6 +46,7 @@ class Path:
         "_introducer",
         "_oldest_at",
         "_rebound",
+        "_rng",
         "_waiting_since",
         "address",
         "bytes_sent",
@@ -95,6 +97,7 @@ class Path:
         self.id = path_id
         self.remote_id: InterfaceId = path_id.remote
         self.session = session
+        self._rng = rng
         self.keys = keys
         self.sealing = keys.sealing
         self.opening = keys.opening
@@ -109,8 +112,8 @@ class Path:
         self.control = CongestionController()
         self.mtu = PathMtu()
         self.queue = SendQueue()
-        self.introductions: list[tuple[Address, int]] = []
-        """Where the peer introduced itself from, and the probe that it wants answered there."""
+        self.introductions: list[tuple[Address, int, KeyAnswer | None]] = []
+        """Where the peer introduced itself from, the probe that it wants answered there, and what answers its offer."""
         self.pending: list[bytes] = []
         """Encoded control frames that wait for the next datagram ..."""
         self.finished: dict[int, None] = {}
@@ -156,7 +159,11 @@ class Path:
     @property
     def probe_at(self) -> float:
         """When the next probe leaves (s); NEVER while nothing may."""
-        return NEVER if self.goes_to_one and self.address.is_blocked else self.probing.at
+        if self.state is PathState.DOWN:
+            return self.probing.at
+        if self.goes_to_one and self.address.is_blocked:
+            return NEVER
+        return min(self.probing.at, self.keys.offers_at)
 
     @property
     def mtu_probe_at(self) -> float | None:
@@ -198,13 +205,13 @@ class Path:
         known = source in self.candidates and self.remote in self.candidates
         return known and self.state is PathState.UP and not self._rebound
 
-    def note_introduction(self, source: Address, probe_id: int, now: float) -> None:
-        """The peer introduced itself from here, and wants a probe answered.
+    def note_introduction(self, source: Address, probe_id: int, answer: KeyAnswer | None, now: float) -> None:
+        """The peer introduced itself from here, and wants a probe answered, and perhaps an offer of keys.
 
         When it does so again although it was answered, it can not read the answer: it does not know yet that we were
         restarted. Behind a NAT it may be reachable there only, so that our own introduction has to go there too.
         """
-        self.introductions.append((source, probe_id))
+        self.introductions.append((source, probe_id, answer))
         if self.state is PathState.DOWN:
             again = now < self._introduced_at + INTRODUCER_S
             self._introducer, self._introduced_at = source if again else None, now
@@ -213,6 +220,14 @@ class Path:
         """Return the id of a probe that leaves now to this address and to no other, by plan."""
         self.waits_for_answer(now)
         return self.probing.ask(now, to, sealed=self.state is not PathState.DOWN)
+
+    def offer_keys(self, now: float) -> KeyOffer | None:
+        """Return what to offer with what leaves now, if new keys are due and we lead."""
+        return self.keys.offer(now, self._rng)
+
+    def answer_keys(self, offer: KeyOffer, now: float) -> KeyAnswer | None:
+        """Return the answer to an offer, if there is one; raises DecodeError."""
+        return self.keys.answer(offer, now, self._rng)
 
     def plan_probe(self, now: float) -> None:
         """A probe left: plan the next one."""
@@ -256,9 +271,7 @@ class Path:
         if probe.to is not None:
             self.address.prove(probe.to)
         self.recovery.rtt.sample(now - probe.sent_at, now)
-        if probe.sealed:
-            self.sealing.delivered(probe.sent_at)
-        elif self.renewed_at is not None and probe.sent_at >= self.renewed_at:
+        if not probe.sealed and self.renewed_at is not None and probe.sent_at >= self.renewed_at:
             self.renewed_at = None
         self.note_rtt()
         return probe.sent_at
@@ -325,7 +338,12 @@ class Path:
             self._waiting_since = self._oldest_at = now
 
     def made_progress(self, now: float) -> bool:
-        """The peer proved that our datagrams arrive; True when that brings the path up."""
+        """The peer proved that our datagrams arrive; True when that brings the path up.
+
+        Not before there are fresh keys: who has but one end's session key could have seemed the other.
+        """
+        if not self.keys.are_fresh:
+            return False
         sent = self.recovery.sent
         self._waiting_since = None
         if sent:

@@ -73,10 +73,10 @@ class OwnSession:
             raise DecodeError("the credential is of a node with our own name and role")
         ends_at = self._verify(theirs)
         try:
-            shared = self._private_key.exchange(X25519PublicKey.from_public_bytes(theirs.public_key))
+            their_key = X25519PublicKey.from_public_bytes(theirs.public_key)
+            keys = pair_keys(self._private_key, their_key, self.credential, theirs)
         except ValueError:  # a point of small order (RFC 7748 section 6.1)
             raise DecodeError("the credential's public key is of small order") from None
-        keys = pair_keys(shared, self.credential, theirs)
         if len(self._admitted) >= MAX_ADMITTED:
             self._admitted.clear()
         self._admitted[peer.credential] = keys, ends_at

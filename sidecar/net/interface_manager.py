@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from protos.errors import ConfigError
 from protos.model import Candidate, InterfaceId
 from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.path_keys import KeyLimits
+from sidecar.core.key_exchange import KeyLimits
 from sidecar.core.readiness import Readiness
 from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.stun_events import Failed, Mapped, MappingChanged

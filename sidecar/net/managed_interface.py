@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceName
     from sidecar.core.datagrams import LinkIdentity
+    from sidecar.core.key_exchange import KeyLimits
     from sidecar.core.link_events import Rebind
     from sidecar.core.link_memory import LinkMemory
-    from sidecar.core.path_keys import KeyLimits
     from sidecar.net.interface_thread import LinkOwner
     from sidecar.net.interfaces import Interface
 

@@ -14,8 +14,9 @@ from protos.model import InterfaceId, InterfaceName, NodeName, PeerSet, Role, Se
 from sidecar.core import frame
 from sidecar.core.frame import Header
 from sidecar.core.introduction import encode_introduction
+from sidecar.core.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.link_memory import MAX_PATHS_OF_A_PEER
-from sidecar.core.path_keys import DEFAULT_LIMITS, KeyLimits, make_path_keys
+from sidecar.core.path_keys import make_path_keys
 from tests.sessions import credential_of, seal, session_of
 from tests.sim.mesh import Mesh, rule
 
@@ -55,7 +56,7 @@ class Flood:
             introduction = encode_introduction(head, token, cloud.name, 7, credential.encode())
             self._mesh.inject(("evil.wlan0", 1), to, introduction)
             if self._proven:
-                sealing = make_path_keys(keys, interface, InterfaceId(0), DEFAULT_LIMITS, 0.0).sealing
+                sealing = make_path_keys(keys, interface, InterfaceId(0), DEFAULT_LIMITS, 0.0, leads=True).sealing
                 probe = seal(sealing, head, frame.encode_probe(frame.Probe(1)))
                 self._mesh.inject(("evil.wlan0", 1), to, probe)
 

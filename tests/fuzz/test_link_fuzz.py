@@ -143,6 +143,7 @@ def test_a_batch_does_what_its_datagrams_do_one_by_one(seed: int) -> None:
     symbol = frame.MIN_SYMBOL_BYTES
     segment = frame.FRAGMENT_OVERHEAD_BYTES + symbol
     together, apart = Bench(), Bench()
+    apart.fresh_peer_keys()
     number = 0
     for _ in range(20):
         run: list[bytes] = []

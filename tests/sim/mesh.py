@@ -30,9 +30,9 @@ from sidecar.announcement import Announcer
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestId, ResponseArrived
+from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
-from sidecar.core.path_keys import DEFAULT_LIMITS
 from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.request_id import make_request_id
 from sidecar.core.rules import ServiceRule

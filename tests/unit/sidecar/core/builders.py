@@ -34,6 +34,7 @@ from sidecar.core.frame import (
     decode_header,
 )
 from sidecar.core.introduction import Introduction, encode_introduction, open_introduction
+from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.link import Link
 from sidecar.core.link_events import (
     LinkCommand,
@@ -47,11 +48,11 @@ from sidecar.core.link_memory import LinkMemory
 from sidecar.core.messages import Encoded, RequestMessage
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.path_id import PathId
-from sidecar.core.path_keys import DEFAULT_LIMITS, PathKeys, make_path_keys
+from sidecar.core.path_keys import PathKeys, make_path_keys
 from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4
 from sidecar.core.priority import Priority
 from sidecar.core.rules import ServiceRule
-from tests.sessions import credential_of, seal, session_of, with_credential
+from tests.sessions import agree, credential_of, seal, session_of, with_credential
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -114,6 +115,7 @@ def peer(
     *,
     session: int = 1,
     incarnation: int = 1,
+    role: Role = Role.CLOUD,
     offers: tuple[ServiceOffer, ...] = (ServiceOffer(ECHO, TYPE),),
     draining: bool = False,
 ) -> Peer:
@@ -121,7 +123,7 @@ def peer(
     token = NodeName(name).encode().ljust(16)[:16]
     subject = Peer(
         NodeName(name),
-        Role.CLOUD,
+        role,
         SessionId(session),
         token,
         incarnation,
@@ -141,6 +143,8 @@ class Bench:
     now: float = 1.0
     number: int = -1
     first_number: int = 0
+    exchanges_keys: bool = True
+    """Both ends have fresh keys as soon as there is a path; otherwise the test does it."""
 
     def __post_init__(self) -> None:
         self.own = session_of(OUR_NAME, Role.ROBOT, OUR_SESSION, OUR_INCARNATION)
@@ -178,8 +182,18 @@ class Bench:
             us = Peer(OUR_NAME, Role.ROBOT, OUR_SESSION, OUR_TOKEN, OUR_INCARNATION)
             theirs = session_of(A, Role.CLOUD, session, self._incarnations.get(session, 1))
             pair = theirs.admit(with_credential(us))
-            self._peer_keys[session, interface] = make_path_keys(pair, interface, OUR_ID, DEFAULT_LIMITS, self.now)
+            self._peer_keys[session, interface] = make_path_keys(
+                pair, interface, OUR_ID, DEFAULT_LIMITS, self.now, leads=False
+            )
         return self._peer_keys[session, interface]
+
+    def fresh_peer_keys(self, session: SessionId = PEER_SESSION, interface: InterfaceId = FIRST) -> PathKeys:
+        """The same, after an exchange if there was none and the test does not do it."""
+        keys = self.peer_keys(session, interface)
+        path = self.link._paths.get((A, interface)) if self.exchanges_keys else None
+        if path is not None and path.session == session and path.keys.sealing.phase == keys.sealing.phase == 0:
+            agree(path.keys, keys, self.now, random.Random(2))
+        return keys
 
     def datagram(
         self,
@@ -194,7 +208,7 @@ class Bench:
             self.number += 1
             number = self.number
         header = Header(interface, receiver, session, number)
-        return seal(self.peer_keys(session, interface).sealing, header, b"".join(frames))
+        return seal(self.fresh_peer_keys(session, interface).sealing, header, b"".join(frames))
 
     def introduction(
         self,

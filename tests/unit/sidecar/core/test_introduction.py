@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from protos.errors import DecodeError
 from protos.model import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.frame import Header
+from sidecar.core.frame import Header, KeyOffer
 from sidecar.core.introduction import (
     MAX_INTRODUCED_BYTES,
     Introduction,
@@ -32,7 +32,13 @@ def datagram(header: Header = HEADER, token: bytes = TOKEN, name: NodeName = NAM
 
 def test_an_introduction_comes_back() -> None:
     assert read_hello_id(datagram()) == hello_id(TOKEN)
-    assert open_introduction(HEADER, datagram(), TOKEN, NAME) == Introduction(5, CREDENTIAL)
+    assert open_introduction(HEADER, datagram(), TOKEN, NAME) == Introduction(5, None, CREDENTIAL)
+
+
+def test_an_offer_of_keys_comes_back() -> None:
+    offer = KeyOffer(1, bytes(range(32)), bytes(range(16)))
+    data = memoryview(encode_introduction(HEADER, TOKEN, NAME, 5, CREDENTIAL.encode(), offer))
+    assert open_introduction(HEADER, data, TOKEN, NAME) == Introduction(5, offer, CREDENTIAL)
 
 
 def test_the_longest_credential_fits_what_every_path_carries() -> None:

@@ -3,37 +3,51 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.credential import Aead, SessionCredential
 from protos.model import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.key_schedule import PairKeys, next_phase, pair_keys, phase_key
+from sidecar.core.key_schedule import PairKeys, next_root, pair_keys, proof
 from tests.sessions import session_of, with_credential
 from tests.unit.sidecar.core.builders import peer
 
+OURS, THEIRS = (X25519PrivateKey.from_private_bytes(bytes([number]) * 32) for number in (1, 2))
 ROBOT = SessionCredential(NodeName("robot-1"), Role.ROBOT, SessionId(1), 2, bytes(range(32)), Aead.AES_256_GCM)
 CLOUD = SessionCredential(NodeName("cloud-a"), Role.CLOUD, SessionId(3), 4, bytes(range(32, 64)), Aead.AES_256_GCM)
-SHARED = bytes(range(64, 96))
 LOW, HIGH = InterfaceId(1), InterfaceId(2)
+
+
+def keys_of(robot: SessionCredential = ROBOT, cloud: SessionCredential = CLOUD) -> PairKeys:
+    return pair_keys(OURS, THEIRS.public_key(), robot, cloud)
+
+
+def keys_of_cloud() -> PairKeys:
+    return pair_keys(THEIRS, OURS.public_key(), CLOUD, ROBOT)
 
 
 def test_the_layout_is_what_it_was() -> None:
     """Another layout is another PROTOCOL_VERSION."""
-    pair = pair_keys(SHARED, ROBOT, CLOUD)
-    path = pair.sending(LOW, HIGH)
-    assert [value.hex()[:16] for value in (pair.secret, path, phase_key(path), next_phase(path))] == [
-        "47a9bd22c844182b", "c2a53f130afca94e", "66e77e7b33d1474f", "537fc33f81882c44",
+    pair = keys_of()
+    root = pair.root(LOW, HIGH)
+    further = next_root(root, bytes(range(96)), 1, bytes(range(32)), bytes(range(32, 64)))
+    values = (pair.secret, root, pair.sealing_key(root), pair.opening_key(root), further, proof(further))
+    assert [value.hex()[:16] for value in values] == [
+        "1968e0e4d2913067", "455470c6d84f6b90", "555438d292da8c75", "7270987f7ec8323a", "fb809cb39a95f684",
+        "6f2e2ef050203a5d",
     ]  # fmt: skip
 
 
 @given(st.integers(0, 255).map(InterfaceId), st.integers(0, 255).map(InterfaceId))
 def test_both_ends_agree_and_the_directions_differ(ours: InterfaceId, theirs: InterfaceId) -> None:
-    robot, cloud = pair_keys(SHARED, ROBOT, CLOUD), pair_keys(SHARED, CLOUD, ROBOT)
-    assert robot.sending(ours, theirs) == cloud.receiving(theirs, ours)
-    assert robot.receiving(ours, theirs) == cloud.sending(theirs, ours)
-    assert robot.sending(ours, theirs) != robot.receiving(ours, theirs)
-    assert robot.sending(ours, theirs) != robot.receiving(theirs, ours)
+    robot, cloud = keys_of(), keys_of_cloud()
+    root = robot.root(ours, theirs)
+    assert root == cloud.root(theirs, ours)
+    assert robot.sealing_key(root) == cloud.opening_key(root)
+    assert robot.opening_key(root) == cloud.sealing_key(root)
+    assert robot.sealing_key(root) != robot.opening_key(root)
+    assert ours == theirs or robot.root(theirs, ours) != root
 
 
 def test_two_sessions_come_to_the_same_keys_from_their_own_private_keys() -> None:
@@ -56,23 +70,23 @@ CHANGES = {
 @pytest.mark.parametrize("what", CHANGES)
 def test_whatever_they_differ_in_gives_other_keys(what: str) -> None:
     changed: SessionCredential = replace(ROBOT, **CHANGES[what])  # type: ignore[arg-type]  # the table's values fit
-    assert pair_keys(SHARED, changed, CLOUD).secret != pair_keys(SHARED, ROBOT, CLOUD).secret
+    assert keys_of(changed).secret != keys_of().secret
 
 
 def test_a_credential_signed_anew_gives_the_same_keys() -> None:
     again = replace(ROBOT, certificate=b"renewed", signature=b"again")
-    assert pair_keys(SHARED, again, CLOUD) == pair_keys(SHARED, ROBOT, CLOUD)
+    assert keys_of(again) == keys_of()
 
 
 def test_the_secret_is_not_shown() -> None:
-    pair = PairKeys(b"s" * 32, Aead.AES_256_GCM, first=True)
+    pair = PairKeys(b"s" * 32, Aead.AES_256_GCM, first=True, own=OURS, theirs=THEIRS.public_key())
     assert "ss" not in repr(pair)
 
 
-@given(st.binary(min_size=32, max_size=32))
-def test_every_phase_has_another_key(secret: bytes) -> None:
-    keys, now = set(), secret
-    for _ in range(10):
-        keys |= {phase_key(now), now}
-        now = next_phase(now)
-    assert len(keys) == 20
+@given(st.binary(min_size=32, max_size=32), st.binary(min_size=96, max_size=96))
+def test_every_phase_has_other_keys(root: bytes, shared: bytes) -> None:
+    pair, found = keys_of(), set()
+    for phase in range(1, 11):
+        root = next_root(root, shared, phase, bytes(32), bytes(32))
+        found |= {root, pair.sealing_key(root), pair.opening_key(root), proof(root)}
+    assert len(found) == 40

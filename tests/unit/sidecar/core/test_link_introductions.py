@@ -45,9 +45,10 @@ def introduce(bench: Bench, number: int, **changes: Any) -> None:
 def test_a_peers_new_interface_is_known_by_its_introduction_before_any_view_names_it() -> None:
     bench = up()
     introduce(bench, 0)
-    reply, probe = bench.frames(bench.sent())
+    reply, probe, offer = bench.frames(bench.sent())
     assert reply == ProbeReply(77)
     assert isinstance(probe, Probe)
+    assert isinstance(offer, frame.KeyOffer)
     answer = bench.datagram(frame.encode_probe_reply(ProbeReply(probe.id)), number=1, interface=NEW_INTERFACE)
     bench.now += 0.01
     bench.receive_datagram(answer)

@@ -6,8 +6,9 @@ import pytest
 
 from protos.model import InterfaceId, NodeName, Role, SessionId
 from sidecar.core import link_memory
+from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.link_memory import MAX_PATHS_OF_A_PEER, LinkMemory
-from sidecar.core.path_keys import DEFAULT_LIMITS, PathKeys, make_path_keys
+from sidecar.core.path_keys import PathKeys, make_path_keys
 from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import peer
 
@@ -19,7 +20,7 @@ REMOTE = InterfaceId(0)
 
 def path_keys(incarnation: int = 1, *, opened: bool = True) -> PathKeys:
     pair = session_of("robot-1", Role.ROBOT, 9).admit(peer(session=1))
-    keys = make_path_keys(pair, InterfaceId(0), REMOTE, DEFAULT_LIMITS, 0.0, incarnation)
+    keys = make_path_keys(pair, InterfaceId(0), REMOTE, DEFAULT_LIMITS, 0.0, incarnation, leads=True)
     if opened:
         keys.received.add(3, 0.0)
     return keys

@@ -29,7 +29,7 @@ from tests.unit.sidecar.core.test_link import (
 
 
 def good(**changes: Any) -> bytes:
-    return Bench().datagram(PROBE, **{"number": 10, **changes})
+    return up().datagram(PROBE, **{"number": 10, **changes})
 
 
 def flipped(datagram: bytes, position: int) -> bytes:
@@ -46,14 +46,14 @@ BAD = {
     "another version": (b"\xd1" + good()[1:], "version"),
     "unsealed": (b"\xd3\x00" + good()[2:], "unsealed"),
     "unknown flags": (b"\xd3\x09" + good()[2:], "malformed"),
-    "a frame in clear": (b"\xd3\x01" + good()[2:20] + PROBE.ljust(40, b"\0"), "unauthentic"),
-    "another phase of the keys": (b"\xd3\x03" + good()[2:], "unauthentic"),
+    "a frame in clear": (good()[:20] + PROBE.ljust(40, b"\0"), "unauthentic"),
+    "another phase of the keys": (b"\xd3\x01" + good()[2:], "unauthentic"),
     "a changed packet number": (flipped(good(), 19), "unauthentic"),
     "a changed frame": (flipped(good(), 22), "unauthentic"),
     "a changed tag": (flipped(good(), -1), "unauthentic"),
     "cut short": (good()[:-1], "unauthentic"),
     "lengthened": (good() + b"\0", "unauthentic"),
-    "good frame then garbage": (Bench().datagram(PROBE, b"\xff", number=10), "malformed"),
+    "good frame then garbage": (up().datagram(PROBE, b"\xff", number=10), "malformed"),
     "wrong interface": (good(receiver=InterfaceId(4)), "wrong_interface"),
     "unknown interface of the peer": (good(interface=InterfaceId(8)), "unknown_path"),
     "unknown session": (good(session=OTHER_SESSION), "unknown_session"),

@@ -4,12 +4,11 @@ import random
 
 import pytest
 
-from protos.credential import Aead
-from protos.model import Address, InterfaceId, SessionId
+from protos.model import Address, InterfaceId, Role, SessionId
 from protos.token_bucket import TokenBucket
-from sidecar.core.key_schedule import PairKeys
+from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path_id import PathState
-from sidecar.core.path_keys import DEFAULT_LIMITS, make_path_keys
+from sidecar.core.path_keys import make_path_keys
 from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
 from sidecar.core.probing import (
     FIRST_PROBE_S,
@@ -17,15 +16,21 @@ from sidecar.core.probing import (
     MAX_PROBE_S,
 )
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
-from tests.unit.sidecar.core.builders import path
+from tests.sessions import agree, session_of, with_credential
+from tests.unit.sidecar.core.builders import path, peer
 
 RNG = random.Random(1)
 HERE, THERE, ELSEWHERE = ("192.0.2.1", 1), ("192.0.2.2", 2), ("192.0.2.3", 3)
 
 
 def new() -> Path:
-    pair = PairKeys(bytes(32), Aead.AES_256_GCM, first=True)
-    keys = make_path_keys(pair, InterfaceId(0), InterfaceId(0), DEFAULT_LIMITS, 100.0)
+    of_cloud = session_of("robot-1", Role.ROBOT, 9).admit(peer("cloud-a", session=1))
+    of_robot = session_of("cloud-a", Role.CLOUD, 1).admit(with_credential(peer("robot-1", session=9, role=Role.ROBOT)))
+    keys, theirs = (
+        make_path_keys(pair, InterfaceId(0), InterfaceId(0), DEFAULT_LIMITS, 100.0, leads=pair is of_cloud)
+        for pair in (of_cloud, of_robot)
+    )
+    agree(keys, theirs, 100.0, RNG)
     budget = TokenBucket(rate=1200.0, burst=65_536, now=100.0)
     return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0, RNG, budget, leads=True)
 

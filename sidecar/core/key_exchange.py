@@ -1,0 +1,190 @@
+"""Fresh keys for one path, again and again: the exchange behind each phase (in the spirit of Noise IK and WireGuard).
+
+The end that leads offers a new public key, with a proof that it knows the keys in use; the other answers with one of
+its own, and with a proof that it could compute what follows from both and from the two sessions' keys
+(key_schedule.py). The new private keys are forgotten with the exchange. So what is read from memory one day opens
+nothing that was sealed a phase earlier, and who stole one end's session key can not play the other end to it.
+
+The offer travels with the probes and introductions until it is answered, and is the same each time; the same offer has
+the same answer. The leader goes on with the new keys when it has the answer, the other end when something opens with
+them. A path has no phase before the first (`phase` 0) but the one that follows from the sessions' keys alone: it
+carries nothing but probes and this exchange.
+"""
+
+from __future__ import annotations
+
+import hmac
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+
+from protos.errors import DecodeError
+from sidecar.core.frame import KeyAnswer, KeyOffer
+from sidecar.core.key_schedule import next_root, proof, proof_of_offer
+
+if TYPE_CHECKING:
+    import random
+
+    from sidecar.core.key_schedule import PairKeys
+
+RENEW_AFTER_S = 120.0
+"""Age of a phase at which the next one is offered: as WireGuard does."""
+RENEW_AFTER_DATAGRAMS = 1 << 21
+"""Datagrams of one phase, either way, after which the next one is offered: by the next probe, half a second later."""
+MAX_SEALED = 1 << 23
+"""Datagrams that one phase seals (RFC 9001 section 6.6, for AES-GCM and the longest). A peer that agrees on no new keys
+until then gets nothing but probes."""
+WAITS_SHARE, WAITS_S = 8.0, 15.0
+"""Where requests prove that a path lives, no probe leaves: an offer that is due waits so much of a phase's age, and no
+longer than this, for a probe to ride on, and then has one of its own."""
+AGAIN_S = 1.0
+"""As long for one that was sent and not answered."""
+OTHER_OFFER_AFTER_S = 1.0
+"""An honest leader repeats its offer: another one before this costs us nothing, and it nothing but time."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeyLimits:
+    """When a path's keys are changed."""
+
+    datagrams: int = RENEW_AFTER_DATAGRAMS
+    seconds: float = RENEW_AFTER_S
+    sealed: int = MAX_SEALED
+
+
+DEFAULT_LIMITS = KeyLimits()
+
+
+@dataclass(slots=True)
+class _Exchange:
+    """One that is not over: the leader's offer, or the other end's answer to it."""
+
+    offer: KeyOffer
+    began_at: float
+    offered_at: float
+    private: X25519PrivateKey | None = field(default=None, repr=False)
+    """The leader's."""
+    answer: KeyAnswer | None = None
+    root: bytes = field(default=b"", repr=False)
+    """What the answer agrees on."""
+
+
+class KeyExchange:
+    """The phases of one path, at one of its ends."""
+
+    __slots__ = ("_changed_at", "_exchange", "_leads", "_limits", "_pair", "_root", "phase")
+
+    def __init__(self, pair: PairKeys, root: bytes, limits: KeyLimits, now: float, *, leads: bool) -> None:
+        self._pair = pair
+        self._limits = limits
+        self._root = root
+        self._leads = leads
+        self._changed_at = now
+        self._exchange: _Exchange | None = None
+        self.phase = 0
+        """The one that we seal with."""
+
+    @property
+    def changed_at(self) -> float:
+        """When the phase began (s)."""
+        return self._changed_at
+
+    # -- the end that leads ---------------------------------------------------------------------------------------
+
+    def offers_at(self, datagrams: int) -> float:
+        """Return when a probe leaves for an offer's sake (s); `datagrams`: of this phase, either way."""
+        if not self._leads:
+            return math.inf
+        if self._exchange is not None:
+            return self._exchange.offered_at + AGAIN_S
+        if datagrams >= self._limits.datagrams:
+            return self._changed_at
+        return self._changed_at + self._limits.seconds + min(self._limits.seconds / WAITS_SHARE, WAITS_S)
+
+    def offer(self, datagrams: int, now: float, rng: random.Random) -> KeyOffer | None:
+        """Return what to offer with the next probe, if new keys are due; `datagrams`: of this phase, either way."""
+        if not self._leads:
+            return None
+        if self._exchange is None:
+            due = now >= self._changed_at + self._limits.seconds or datagrams >= self._limits.datagrams
+            if self.phase and not due:
+                return None
+            private = X25519PrivateKey.from_private_bytes(rng.randbytes(32))
+            phase, key = self.phase + 1, private.public_key().public_bytes_raw()
+            offer = KeyOffer(phase, key, proof_of_offer(self._root, phase, key))
+            self._exchange = _Exchange(offer, now, now, private)
+        self._exchange.offered_at = now
+        return self._exchange.offer
+
+    def take(self, answer: KeyAnswer, now: float) -> bytes | None:
+        """Return the new root that an answer completes; None if it answers nothing that is asked.
+
+        Raises:
+            DecodeError: it is not of one who has the peer's session key.
+        """
+        exchange = self._exchange
+        if not self._leads or exchange is None or exchange.private is None or answer.phase != exchange.offer.phase:
+            return None
+        theirs = _public(answer.key)
+        shared = (
+            _shared(exchange.private, theirs)
+            + _shared(exchange.private, self._pair.theirs)
+            + _shared(self._pair.own, theirs)
+        )
+        root = next_root(self._root, shared, answer.phase, exchange.offer.key, answer.key)
+        if not hmac.compare_digest(proof(root), answer.proof):
+            raise DecodeError("the proof of new keys is wrong")
+        self._begin(root, now)
+        return root
+
+    # -- the other end --------------------------------------------------------------------------------------------
+
+    def answer(self, offer: KeyOffer, now: float, rng: random.Random) -> tuple[KeyAnswer, bytes] | None:
+        """Return the answer to an offer, and the root to expect from now on; None if it is not answered.
+
+        Raises:
+            DecodeError: it is not of one who knows the keys in use, or its key is of small order.
+        """
+        if self._leads or offer.phase != self.phase + 1:
+            return None
+        if not hmac.compare_digest(proof_of_offer(self._root, offer.phase, offer.key), offer.proof):
+            raise DecodeError("the proof of an offer of new keys is wrong")
+        before = self._exchange
+        if before is not None and before.answer is not None:
+            if before.offer == offer:
+                return before.answer, before.root
+            if now < before.began_at + OTHER_OFFER_AFTER_S:
+                return None
+        private, theirs = X25519PrivateKey.from_private_bytes(rng.randbytes(32)), _public(offer.key)
+        shared = _shared(private, theirs) + _shared(self._pair.own, theirs) + _shared(private, self._pair.theirs)
+        key = private.public_key().public_bytes_raw()
+        root = next_root(self._root, shared, offer.phase, offer.key, key)
+        answer = KeyAnswer(offer.phase, key, proof(root))
+        self._exchange = _Exchange(offer, now, now, answer=answer, root=root)
+        return answer, root
+
+    def confirmed(self, now: float) -> bytes:
+        """The leader seals with what our answer agreed on: return its root, and go on with it."""
+        assert self._exchange is not None
+        root = self._exchange.root
+        self._begin(root, now)
+        return root
+
+    def _begin(self, root: bytes, now: float) -> None:
+        self._root = root
+        self._exchange = None
+        self._changed_at = now
+        self.phase += 1
+
+
+def _public(key: bytes) -> X25519PublicKey:
+    return X25519PublicKey.from_public_bytes(key)
+
+
+def _shared(private: X25519PrivateKey, public: X25519PublicKey) -> bytes:
+    try:
+        return private.exchange(public)
+    except ValueError:  # RFC 7748 section 6.1
+        raise DecodeError("a public key of small order") from None
