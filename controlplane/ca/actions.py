@@ -75,7 +75,17 @@ def revoke(arguments: argparse.Namespace) -> None:
     with folder.locked() as authority:
         revoked = authority.revoke(arguments.name, x509.ReasonFlags(arguments.reason))
         folder.save(authority)
-    _say(f"revoked {len(revoked)} of {arguments.name}; copy to the control plane's tls_dir: {folder.path / CRL_FILE}")
+    where = "copy to the control plane's tls_dir, or any node's"
+    _say(f"revoked {len(revoked)} of {arguments.name}; {where}: {folder.path / CRL_FILE}")
+
+
+def publish(arguments: argparse.Namespace) -> None:
+    """Sign the revocation lists again."""
+    folder = _folder(arguments)
+    with folder.locked() as authority:
+        authority.publish()
+        folder.save(authority)
+    _say(f"signed revocation list {authority.crl_number}; copy to any node's tls_dir: {folder.path / CRL_FILE}")
 
 
 def show(arguments: argparse.Namespace) -> None:

@@ -53,10 +53,12 @@ class Authority:
         crl_number: int = 0,
         former: Iterable[Authority] = (),
         clock: Callable[[], float] = time.time,
+        published_at: float | None = None,
     ) -> None:
         self.own = own
         self.entries = list(entries)
         self.crl_number = crl_number
+        self.published_at = published_at
         self.former = list(former)
         self._clock = clock
 
@@ -79,7 +81,7 @@ class Authority:
 
     def record(self) -> Record:
         """Return what is to be remembered of this CA beside its key and certificate."""
-        return Record(self.own.certificate.serial_number, self.crl_number, tuple(self.entries))
+        return Record(self.own.certificate.serial_number, self.crl_number, tuple(self.entries), self.published_at)
 
     def all_entries(self) -> list[Entry]:
         """Return what the former CAs and this one have issued, oldest first."""
@@ -127,13 +129,19 @@ class Authority:
             self.crl_number += 1
         return revoked
 
+    def publish(self) -> None:
+        """Sign the revocation lists again, unchanged, so that nodes can see that they miss none."""
+        for authority in (self, *self.former):
+            authority.crl_number += 1
+            authority.published_at = self._clock()
+
     def rotate(self, name: str, *, days: float = DEFAULT_CA_DAYS) -> None:
         """Make a new CA that issues from now on; the one before it stays believed until `retire`.
 
         No node can show a certificate of the new CA before the others have its `ca_pem`.
         """
-        before = Authority(self.own, self.entries, self.crl_number, clock=self._clock)
-        self.own, self.entries, self.crl_number = _own(name, days, self._clock()), [], 0
+        before = Authority(self.own, self.entries, self.crl_number, clock=self._clock, published_at=self.published_at)
+        self.own, self.entries, self.crl_number, self.published_at = _own(name, days, self._clock()), [], 0, None
         self.former.insert(0, before)
 
     def retire(self) -> None:
@@ -158,7 +166,7 @@ class Authority:
     def crl_pem(self) -> bytes:
         """Return the revocation lists of this CA and the former ones; each stands as long as its CA.
 
-        The same bytes until something is revoked.
+        The same bytes until something is revoked, or `publish`.
         """
         return b"".join(authority._own_crl_pem() for authority in (self, *self.former))
 
@@ -167,7 +175,8 @@ class Authority:
             (entry.serial, entry.revoked_at, entry.reason) for entry in self.entries if entry.revoked_at is not None
         ]
         begin = self.own.certificate.not_valid_before_utc.timestamp()
-        validity = Validity(max((revoked_at for _, revoked_at, _ in revoked), default=begin), self.not_after)
+        signed_at = max((self.published_at or begin, *(revoked_at for _, revoked_at, _ in revoked)))
+        validity = Validity(signed_at, self.not_after)
         return build_revocation_list(self.own, self.crl_number, revoked, validity).public_bytes(Encoding.PEM)
 
     def write_tls_dir(

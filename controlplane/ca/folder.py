@@ -124,7 +124,8 @@ class AuthorityFolder:
             problem = "has a passphrase; give" if self._passphrase is None else "has no passphrase; leave out"
             raise ConfigError(str(path), "", f"the CA's key {problem} --passphrase-file")
         key = load_private_key(pem, self._passphrase, path)
-        return Authority(Issued(self.certificate(record), key), record.entries, record.crl_number)
+        issued = Issued(self.certificate(record), key)
+        return Authority(issued, record.entries, record.crl_number, published_at=record.published_at)
 
     def _own_folder(self, record: Record) -> Path:
         return self.path / AUTHORITIES / f"{record.serial:x}"

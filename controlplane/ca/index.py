@@ -44,6 +44,8 @@ class Record:
     serial: int
     crl_number: int
     entries: tuple[Entry, ...]
+    published_at: float | None = None
+    """When the list was signed without anything new in it; None: never."""
 
 
 def _number(text: object) -> int:
@@ -79,6 +81,7 @@ class _RecordRow(BaseModel):
 
     serial: _Serial
     crl_number: int = Field(ge=0)
+    published_at: float | None = None
     entries: tuple[_EntryRow, ...]
 
 
@@ -95,6 +98,7 @@ def encode_index(records: Iterable[Record]) -> bytes:
         {
             "serial": f"{record.serial:x}",
             "crl_number": record.crl_number,
+            "published_at": record.published_at,
             "entries": [
                 {
                     "name": entry.name,
@@ -121,5 +125,6 @@ def decode_index(data: bytes, path: Path) -> tuple[Record, ...]:
         first = error.errors(include_url=False)[0]
         raise ConfigError(str(path), key_path(first["loc"]), f"not what plr ca wrote: {first['msg']}") from error
     return tuple(
-        Record(row.serial, row.crl_number, tuple(entry.entry() for entry in row.entries)) for row in index.authorities
+        Record(row.serial, row.crl_number, tuple(entry.entry() for entry in row.entries), row.published_at)
+        for row in index.authorities
     )
