@@ -41,7 +41,7 @@ class CertificateKeeper:
         self._gate = gate
         self._loop = loop
         self._metrics = metrics
-        metrics.own_certificate(files.identity)
+        metrics.own_certificate(files.identity, files.trust.lists())
         self._relay_revocations(files)
 
     async def run(self) -> NoReturn:
@@ -67,7 +67,7 @@ class CertificateKeeper:
         except ssl.SSLError as error:
             log.error("the new certificate is not used, the old one stays: %s", error)
             return
-        self._metrics.own_certificate(files.identity)
+        self._metrics.own_certificate(files.identity, files.trust.lists())
         log.info("took new certificate files from %s", files.directory)
 
     def _relay_revocations(self, files: TlsFiles) -> None:

@@ -18,6 +18,7 @@ from controlplane import handshakes, limits, tls_gate
 from protos import identity
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind, Role
+from protos.revocation_gauges import revocation_gauges
 from protos.status import SyncState
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.control import ControlCore
     from controlplane.stun_server import StunServer
-    from protos.identity import Identity
+    from protos.identity import Identity, RevocationList
 
 SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 """A robot alone takes milliseconds, a hundred a quarter of a second, a thousand some seconds."""
@@ -94,7 +95,7 @@ class Metrics:
         )
         for reason in REFUSAL_REASONS:
             self._refused_connections.labels(reason)
-        self._own_certificate: Identity | None = None
+        self._own: tuple[Identity, Mapping[int, RevocationList | None]] | None = None
         self.policy_reloads = prometheus_client.Counter(
             "plr_policy_reloads_total",
             "Times the access policy was read again, by what came of it.",
@@ -107,9 +108,9 @@ class Metrics:
         """A connection or call was refused or ended; `reason` is one of REFUSAL_REASONS."""
         self._refused_connections.labels(reason).inc()
 
-    def own_certificate(self, identity: Identity) -> None:
-        """This is the certificate shown from now on."""
-        self._own_certificate = identity
+    def own_certificate(self, identity: Identity, lists: Mapping[int, RevocationList | None]) -> None:
+        """These are the certificate and the revocation lists (`Trust.lists`) in use from now on."""
+        self._own = identity, lists
 
     def start(self, host: str, port: int) -> tuple[str, int]:
         """Serve them over HTTP; returns where. Raises OSError if the address cannot be had."""
@@ -123,7 +124,7 @@ class Metrics:
             *_plan(core, now),
             *_drops(core, superseded),
             *_stun(stun_servers),
-            *_certificate(self._own_certificate),
+            *_certificate(self._own),
         )
 
 
@@ -263,9 +264,11 @@ def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
     )
 
 
-def _certificate(own: Identity | None) -> Iterable[Metric]:
-    if own is None:
+def _certificate(known: tuple[Identity, Mapping[int, RevocationList | None]] | None) -> Iterable[Metric]:
+    if known is None:
         return
+    own, lists = known
+    now_wall = time.time()
     yield _gauge(
         "plr_certificate_expiry_timestamp_seconds",
         "When the certificate in use ends, in seconds since 1970.",
@@ -276,8 +279,10 @@ def _certificate(own: Identity | None) -> Iterable[Metric]:
         "plr_certificate_days_left",
         "Days until the certificate in use ends; negative when it has.",
         [],
-        {(): (own.not_after - time.time()) / SECONDS_PER_DAY},
+        {(): (own.not_after - now_wall) / SECONDS_PER_DAY},
     )
+    for name, text, by_ca in revocation_gauges(lists, now_wall):
+        yield _gauge(name, text, ["ca"], by_ca)
 
 
 def _stun(servers: Sequence[StunServer]) -> Iterable[Metric]:

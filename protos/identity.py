@@ -13,6 +13,8 @@ given, nothing is read.
 from __future__ import annotations
 
 import enum
+import hashlib
+import math
 import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -20,6 +22,7 @@ from typing import TYPE_CHECKING
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, SignatureAlgorithmOID
 
 from protos.errors import DecodeError
@@ -39,12 +42,16 @@ MAX_CERTIFICATE_BYTES = 1536
 MAX_CA_CERTIFICATES = 16
 """CAs trusted at once; a rotation needs two."""
 
+MAX_REVOCATION_LISTS = 64
+"""Lists in one file or message: one for each CA; every one of them may cost a signature check."""
+
 MALFORMED = "malformed"
 UNTRUSTED = "untrusted"
 EXPIRED = "expired"
 NOT_YET_VALID = "not_yet_valid"
 WRONG_ROLE = "wrong_role"
 REVOKED = "revoked"
+LIST_TOO_OLD = "list_too_old"
 
 _SIGNATURES = frozenset(
     {
@@ -92,12 +99,32 @@ def identity_uri(name: str, role: IdentityRole) -> str:
     return f"{URI_SCHEME}://{role.value}/{name}"
 
 
+@dataclass(frozen=True, slots=True)
+class RevocationList:
+    """A list as its CA signed it; times are seconds since 1970."""
+
+    number: int
+    signed_at: float
+    next_at: float
+    """When the CA wants another to be there: the lists of `plr ca` name the CA's own end."""
+    pem: bytes = field(repr=False)
+
+
 @dataclass(slots=True)
 class _Authority:
     certificate: x509.Certificate
     key: ec.EllipticCurvePublicKey
-    crl_number: int = -1  # none
+    newest: RevocationList | None = None
     revoked: set[int] = field(default_factory=set)
+
+    @property
+    def crl_number(self) -> int:
+        """-1: none."""
+        return -1 if self.newest is None else self.newest.number
+
+    def digest(self) -> int:
+        """64 bits that stand for the CA."""
+        return int.from_bytes(hashlib.sha256(self.certificate.public_bytes(Encoding.DER)).digest()[:8], "big")
 
 
 class Trust:
@@ -121,15 +148,48 @@ class Trust:
             for authority in other._authorities
         )
 
+    def with_revocations(self, pem: bytes) -> Trust:
+        """Return this with further lists; nothing that was revoked is not any more. Raises as the constructor."""
+        wider = Trust.__new__(Trust)
+        wider._authorities = tuple(
+            _Authority(authority.certificate, authority.key, authority.newest, set(authority.revoked))
+            for authority in self._authorities
+        )
+        _load_revocations(pem, wider._authorities)
+        return wider
+
+    def lists(self) -> dict[int, RevocationList | None]:
+        """Return each CA's newest list; the CA as 64 bits of its digest."""
+        return {authority.digest(): authority.newest for authority in self._authorities}
+
+    def crl_pem(self) -> bytes:
+        """Return the newest list of each CA, PEM; empty if there is none."""
+        return b"".join(authority.newest.pem for authority in self._authorities if authority.newest is not None)
+
+    def too_old(self, now_wall: float, max_age_s: float) -> frozenset[int]:
+        """Return the CAs (digests) of which there is no list that was signed in the last `max_age_s`."""
+        return frozenset(
+            authority.digest() for authority in self._authorities if _list_age_s(authority, now_wall) > max_age_s
+        )
+
     def identify(self, certificate_der: bytes) -> Identity:
         """Return whom a certificate of these CAs names, whatever its age and revocation; raises CertificateError."""
         return self._identify(certificate_der)[0]
 
-    def check(self, certificate_der: bytes, now_wall: float) -> Identity:
-        """Return whom a certificate names that is good at `now_wall` (seconds since 1970); raises CertificateError."""
+    def check(self, certificate_der: bytes, now_wall: float, max_list_age_s: float = math.inf) -> Identity:
+        """Return whom a certificate names that is good at `now_wall` (seconds since 1970); raises CertificateError.
+
+        Not good either is one whose CA signed no list in the last `max_list_age_s`, as far as is known here.
+        """
         identity, issuer = self._identify(certificate_der)
         if identity.serial in issuer.revoked:
             raise CertificateError(REVOKED, f"the certificate of {identity.name} is revoked")
+        age_s = _list_age_s(issuer, now_wall)
+        if age_s > max_list_age_s:
+            known = "is not here" if math.isinf(age_s) else f"was signed {age_s:.0f} s ago by this clock"
+            raise CertificateError(
+                LIST_TOO_OLD, f"its CA's revocation list {known}, max_revocation_age_s is {max_list_age_s:.0f}"
+            )
         _check_time(*_validity(issuer.certificate), now_wall, "the CA's certificate")
         _check_time(identity.not_before, identity.not_after, now_wall, f"the certificate of {identity.name}")
         return identity
@@ -187,17 +247,25 @@ def _authority(certificate: x509.Certificate) -> _Authority:
     return _Authority(certificate, key)
 
 
+def _list_age_s(authority: _Authority, now_wall: float) -> float:
+    return math.inf if authority.newest is None else now_wall - authority.newest.signed_at
+
+
 def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
     """Note with each CA the serial numbers that it has revoked."""
     blocks: list[bytes] = _PEM_CRL.findall(pem)
     if not blocks:
         raise CertificateError(MALFORMED, "the revocation list is not PEM")
+    if len(blocks) > MAX_REVOCATION_LISTS:
+        raise CertificateError(MALFORMED, f"more than {MAX_REVOCATION_LISTS} revocation lists")
     known = False
     for block in blocks:
         try:
             crl = x509.load_pem_x509_crl(block)
             partial = any(extension.critical for extension in crl.extensions)
             number = crl.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
+            signed_at = crl.last_update_utc.timestamp()
+            next_at = math.inf if crl.next_update_utc is None else crl.next_update_utc.timestamp()
             serials = {entry.serial_number for entry in crl}
             issuers = [
                 authority
@@ -210,7 +278,8 @@ def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
             # RFC 5280 section 5.2: a list that is a delta, or about some certificates only, says so critically.
             raise CertificateError(MALFORMED, "the revocation list is not a complete one")
         for issuer in issuers:
-            issuer.crl_number = max(issuer.crl_number, number)
+            if number > issuer.crl_number:
+                issuer.newest = RevocationList(number, signed_at, next_at, block + b"\n")
             issuer.revoked.update(serials)
             known = True
     if not known:

@@ -188,23 +188,26 @@ class TlsWatch:
         return files if changed else None
 
     def take_revocations(self, crl_pem: bytes) -> bool:
-        """Believe this list too, which somebody relayed; whether it says anything new. It has to be of our CAs."""
-        before, trust = self._relayed, self.current.trust
-        self._relayed = crl_pem
-        files = self._with_relayed(self.current)
-        if not trust.forgets(files.trust) or files.trust.forgets(trust):
-            self._relayed = before
+        """Believe these lists too, which somebody relayed; whether they say anything new.
+
+        Raises:
+            CertificateError: they are malformed, or of no CA of ours.
+        """
+        before = self.current.trust
+        trust = before.with_revocations(crl_pem)
+        if not before.forgets(trust):
             return False
-        self.current = files
+        self._relayed = trust.crl_pem()
+        self.current = dataclasses.replace(self.current, trust=trust)
         return True
 
     def _with_relayed(self, files: TlsFiles) -> TlsFiles:
         if not self._relayed:
             return files
         try:
-            trust = Trust(files.ca_pem, (files.crl_pem or b"") + b"\n" + self._relayed)
+            trust = files.trust.with_revocations(self._relayed)
         except CertificateError as error:
-            _log.warning("a relayed revocation list is ignored: %s", error)
+            _log.warning("the revocation lists that were relayed are ignored: %s", error)
             return files
         return dataclasses.replace(files, trust=trust)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import fnmatch
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -117,6 +118,9 @@ class SidecarConfig(Section):
     """How the sidecar learns its addresses as seen from outside."""
     state_dir: Annotated[Path, converted] = Path("/var/lib/plr")
     """Absolute path of the folder for the identity and the last good mapping."""
+    max_revocation_age_s: Annotated[int, Field(ge=60, le=365 * 86_400)] | None = None
+    """Seconds: peers whose CA signed no revocation list in this time, as far as is known here, are not talked to; null:
+    a list does not age."""
     rekey_after_s: Annotated[int, Field(ge=1, le=86_400)] = 120
     """Seconds after which the keys that seal datagrams are changed; their volume changes them as well."""
     metrics_listen: ListenAddress | None = "127.0.0.1:9464"
@@ -133,6 +137,11 @@ class SidecarConfig(Section):
     def node_name(self) -> NodeName:
         """`name`, typed."""
         return NodeName(self.name)
+
+    @property
+    def max_revocation_age(self) -> float:
+        """`max_revocation_age_s`; infinite: a list does not age."""
+        return math.inf if self.max_revocation_age_s is None else float(self.max_revocation_age_s)
 
     def service_rules(self) -> tuple[ServiceRule, ...]:
         """The services as the cores want them, in order."""
@@ -223,6 +232,8 @@ def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
     """Yield what single fields cannot know; a key that would have no effect is refused, not ignored."""
     if not config.state_dir.is_absolute():
         yield ("state_dir",), f"expected an absolute path, got '{config.state_dir}'"
+    if config.max_revocation_age_s is not None and config.tls_dir is None:
+        yield ("max_revocation_age_s",), "expected beside tls_dir only: nothing is checked in insecure mode"
     for index, service in enumerate(config.services):
         for key, problem in service.problems(config.role):
             yield ("services", index, key), problem

@@ -47,11 +47,8 @@ log = logging.getLogger(__name__)
 GOODBYE_S = 0.5
 """How long `stop` waits for the control plane to take the goodbye."""
 
-WATCH_INTERVAL_S = 1.0
-"""How often to look for new certificate files: they are renewed weeks before they end."""
-
-END_EXPIRED_S = 1.0
-"""How often to look for peers whose certificates have ended."""
+LOOK_INTERVAL_S = 1.0
+"""How often to look for new certificate files and revocation lists, and for peers whose certificates have ended."""
 
 JUDGE_AGAIN_S = 10.0
 """Between two judgements on refused peers: a robot without a clock hears the time soon after its start, and 4096 peers
@@ -93,6 +90,7 @@ class ControlClient:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._main_task: asyncio.Task[None] | None = None
         self._wake = asyncio.Event()
+        self._new_files = asyncio.Event()
         self._running = threading.Event()
         self._thread = threading.Thread(target=self._run, name="plr-control", daemon=True)
 
@@ -164,7 +162,7 @@ class ControlClient:
         self._loop = asyncio.get_running_loop()
         self._main_task = asyncio.current_task()
         self._running.set()
-        judging = asyncio.create_task(self._judge_credentials())
+        judging = asyncio.create_task(self._look_at_credentials())
         self._dialer.start(self._network_changed)
         with contextlib.suppress(asyncio.CancelledError):
             while not self._stopping:
@@ -178,12 +176,16 @@ class ControlClient:
         self._session.network_changed(time.monotonic())
         self._wake.set()
 
-    async def _judge_credentials(self) -> None:
-        """Also without any stream: while our clock is wrong, the control plane's certificate is no good either."""
+    async def _look_at_credentials(self) -> None:
+        """Also without any stream: while our clock is wrong, the control plane's certificate is no good either, and an
+        operator's new revocation list counts also while the control plane is away."""
         again_at = time.monotonic() + JUDGE_AGAIN_S
         while True:
-            await asyncio.sleep(min(END_EXPIRED_S, JUDGE_AGAIN_S))
+            await asyncio.sleep(min(LOOK_INTERVAL_S, JUDGE_AGAIN_S))
             try:
+                if self._look_for_new_files():
+                    self._new_files.set()
+                self._hooks.look_at_revocations()
                 self._hooks.end_expired()
                 if time.monotonic() >= again_at:
                     again_at = time.monotonic() + JUDGE_AGAIN_S
@@ -211,6 +213,7 @@ class ControlClient:
     async def _one_stream(self) -> None:
         """Open a stream, serve it until it ends, and note why it did."""
         self._look_for_new_files()
+        self._new_files.clear()
         self._session.opened(time.monotonic())
         ended = _StreamEndedError("stopped")
         try:
@@ -222,8 +225,7 @@ class ControlClient:
                     tasks.create_task(self._write(call))
                     tasks.create_task(self._await_welcome(line))
                     tasks.create_task(self._await_end(line))
-                    if self._tls is not None:
-                        tasks.create_task(self._watch_files())
+                    tasks.create_task(self._watch_files())
         except* _StreamEndedError as group:
             ended = _most_telling(group)
         except* Exception:
@@ -254,10 +256,8 @@ class ControlClient:
 
     async def _watch_files(self) -> None:
         """End the stream when there is another certificate to show."""
-        while True:
-            await asyncio.sleep(WATCH_INTERVAL_S)
-            if self._look_for_new_files():
-                raise _StreamEndedError("new certificate files", wanted=True)
+        await self._new_files.wait()
+        raise _StreamEndedError("new certificate files", wanted=True)
 
     def _look_for_new_files(self) -> bool:
         files = self._tls.poll() if self._tls is not None else None

@@ -27,6 +27,9 @@ class ControlHooks(Protocol):
     def connection_changed(self, connected: bool, reason: str) -> None:
         """The control plane came within reach, or went out of it."""
 
+    def look_at_revocations(self) -> None:
+        """A second has passed: judge the revocation lists that peers sent, and how old those in use are."""
+
     def end_expired(self) -> None:
         """Part with peers whose certificates have ended by now."""
 

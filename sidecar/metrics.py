@@ -5,6 +5,7 @@ No code of prometheus_client runs where datagrams move: a scrape reads, on its o
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,8 +17,10 @@ from prometheus_client.registry import Collector
 from protos.config_fields import split_host_port
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind
+from protos.revocation_gauges import revocation_gauges
 from sidecar.core.control_watch import LEAVE_CAUSES
 from sidecar.core.control_ways import DIAL_DROPS
+from sidecar.core.revocation_exchange import EXCHANGES
 from sidecar.metric_families import by_one, counter, cumulative, gauge
 from sidecar.state_store import FAILURES
 
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from protos.model import ServiceName
     from sidecar.core.control_session import ControlStats
     from sidecar.core.stats import EngineStats, LinkStats
+    from sidecar.revocations import RevocationState
     from sidecar.ros.stats import BridgeStats
 
 SECONDS_PER_DAY = 86_400.0
@@ -53,6 +57,8 @@ class MetricSources:
     """Files of the state folder that could not be read or written, by what failed."""
     certificate: Callable[[], Identity | None]
     """Whose certificate is in use; None in insecure mode."""
+    revocations: Callable[[], RevocationState | None]
+    """The revocation lists in use; None in insecure mode."""
 
 
 class SidecarCollector(Collector):
@@ -73,6 +79,7 @@ class SidecarCollector(Collector):
         if sources.bridge is not None:
             yield from _bridge(sources.bridge())
         yield from _certificate(sources.certificate())
+        yield from _revocations(sources.revocations(), sources.engine())
         yield counter(
             "plr_state_failures",
             "Files of the state folder that could not be read or written.",
@@ -104,6 +111,32 @@ def _certificate(own: Identity | None) -> Iterator[Metric]:
         "Days until the certificate in use ends; negative when it has.",
         (),
         {(): (own.not_after - time.time()) / SECONDS_PER_DAY},
+    )
+
+
+def _revocations(own: RevocationState | None, stats: EngineStats) -> Iterator[Metric]:
+    if own is None:
+        return
+    for name, text, by_ca in revocation_gauges(own.lists, time.time()):
+        yield gauge(name, text, ("ca",), by_ca)
+    yield gauge(
+        "plr_revocation_lists_too_old",
+        "CAs whose list is older than max_revocation_age_s, so that their nodes are not talked to.",
+        (),
+        {(): len(own.too_old)},
+    )
+    if math.isfinite(own.max_age_s):
+        yield gauge(
+            "plr_revocation_list_max_age_seconds",
+            "max_revocation_age_s; not there if a list does not age.",
+            (),
+            {(): own.max_age_s},
+        )
+    yield counter(
+        "plr_revocation_lists",
+        "Revocation lists exchanged with peers.",
+        ("what",),
+        {(what,): stats.revocations[what] for what in EXCHANGES},
     )
 
 

@@ -6,6 +6,7 @@ import logging
 import random
 import threading
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import sdnotify
@@ -24,6 +25,7 @@ from sidecar.metrics import MetricSources, serve_metrics
 from sidecar.net.control_dialer import ControlDialer
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
+from sidecar.revocations import Revocations
 from sidecar.ros.bridge import RosBridge
 from sidecar.start_session import signed, start_session
 from sidecar.state_store import StateDirError, StateStore
@@ -32,7 +34,17 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from protos.metrics_server import MetricsServer
-    from protos.model import Assignment, Candidate, InterfaceName, MappingSet, PeerSet, Report, ServiceName, Welcome
+    from protos.model import (
+        Assignment,
+        Candidate,
+        InterfaceName,
+        MappingSet,
+        NodeName,
+        PeerSet,
+        Report,
+        ServiceName,
+        Welcome,
+    )
     from protos.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
     from sidecar.core.path_id import PathState
@@ -58,7 +70,11 @@ class Sidecar:
         identity = self._store.identity
         tls = self._tls
         own = start_session(
-            config.node_name, config.role, identity.incarnation, None if tls is None else lambda: tls.current
+            config.node_name,
+            config.role,
+            identity.incarnation,
+            None if tls is None else lambda: tls.current,
+            config.max_revocation_age,
         )
         self._own = own
         self._announcer = Announcer(own.credential.session, None if tls is None else lambda: tls.current, config.labels)
@@ -75,7 +91,13 @@ class Sidecar:
                 self._on_services_changed,
                 self._on_reach_changed,
                 self._on_paths_changed,
+                self._on_revocations,
             ),
+        )
+        self._revocations = (
+            None
+            if tls is None
+            else Revocations(tls, self._data_plane, self._store.remember_revocations, config.max_revocation_age)
         )
         last = self._store.last_good
         self._control_session = ControlSession(
@@ -125,8 +147,11 @@ class Sidecar:
         self._open_metrics()
         self._data_plane.start()
         last = self._store.last_good
-        if last.welcome is not None:
-            self._take_revocations(last.welcome)
+        if self._revocations is not None:
+            if self._store.revocations:
+                self._revocations.take_or_log(self._store.revocations, "an earlier run")
+            self._revocations.tell()
+            self._revocations.look(time.time())
         self._interfaces.set_stun_servers(self._stun_servers(last.welcome))
         self._interfaces.start()
         if last.peers is not None:
@@ -170,6 +195,7 @@ class Sidecar:
             bridge=lambda: self._bridge.stats,
             state_failures=lambda: self._store.failures,
             certificate=lambda: self._tls.current.identity if self._tls is not None else None,
+            revocations=lambda: None if self._revocations is None else self._revocations.state,
         )
         try:
             self._metrics = serve_metrics(listen, sources)
@@ -183,11 +209,6 @@ class Sidecar:
             self._control_session.not_restored(held)
         else:
             log.info("started from the %s kept on disk", held.resource.value)
-
-    def _take_revocations(self, welcome: Welcome) -> None:
-        if self._tls is not None and welcome.crl and self._tls.take_revocations(welcome.crl):
-            log.info("took a new revocation list of the control plane")
-            self._data_plane.trust_changed()
 
     def _stun_servers(self, welcome: Welcome | None) -> tuple[str, ...]:
         if welcome is not None and welcome.stun_servers:
@@ -219,12 +240,18 @@ class Sidecar:
     def _on_paths_changed(self, best: Mapping[InterfaceName, PathState]) -> None:
         self._dialer.set_paths(best)
 
+    def _on_revocations(self, peer: NodeName, pem: bytes) -> None:
+        if self._revocations is not None:
+            self._revocations.heard(peer, pem)
+
     # -- ControlHooks, on the control client's thread -------------------------------------------------------------
 
     def welcome(self, welcome: Welcome) -> None:
         """A stream is accepted, or the control plane has another revocation list."""
-        self._take_revocations(welcome)
-        self._store.remember(welcome)
+        if self._revocations is not None and welcome.crl:
+            self._revocations.take_or_log(welcome.crl, "the control plane")
+        # The list is kept on its own, wherever it came from.
+        self._store.remember(replace(welcome, crl=b""))
         self._interfaces.set_stun_servers(self._stun_servers(welcome))
 
     def apply_peers(self, peers: PeerSet) -> str | None:
@@ -253,6 +280,11 @@ class Sidecar:
         """Return what was measured since the last call."""
         return self._data_plane.take_report()
 
+    def look_at_revocations(self) -> None:
+        """A second has passed: judge the revocation lists that peers sent, and how old those in use are."""
+        if self._revocations is not None:
+            self._revocations.look(time.time())
+
     def end_expired(self) -> None:
         """Part with peers whose certificates have ended by now."""
         self._data_plane.end_expired()
@@ -269,6 +301,8 @@ class Sidecar:
         with self._announcing:
             self._control.set_candidates(self._announcer.again())
         self._data_plane.trust_changed()
+        if self._revocations is not None:
+            self._revocations.tell()
         log.info("took new certificate files from %s", files.directory)
 
     def connection_changed(self, connected: bool, reason: str) -> None:

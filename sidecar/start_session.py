@@ -17,6 +17,7 @@ from sidecar.core.session import OwnSession, public_key
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from protos.identity import Identity
     from protos.model import NodeName, Role
     from protos.tls_files import TlsFiles
 
@@ -24,8 +25,16 @@ PRIVATE_KEY_BYTES = 32
 CPUINFO = Path("/proc/cpuinfo")
 
 
-def start_session(name: NodeName, role: Role, incarnation: int, tls: Callable[[], TlsFiles] | None) -> OwnSession:
+def start_session(
+    name: NodeName,
+    role: Role,
+    incarnation: int,
+    tls: Callable[[], TlsFiles] | None,
+    max_revocation_age_s: float = math.inf,
+) -> OwnSession:
     """Return a new session. `tls` returns the present certificate, key and trust; None is the insecure mode.
+
+    No peer is believed whose CA signed no revocation list in the last `max_revocation_age_s`.
 
     Raises:
         ConfigError: the certificate is too long for introductions.
@@ -38,7 +47,10 @@ def start_session(name: NodeName, role: Role, incarnation: int, tls: Callable[[]
         return OwnSession(credential, private_key, _take_as_it_is)
 
     def judge(theirs: SessionCredential) -> float:
-        return verify(theirs, lambda certificate: tls().trust.check(certificate, time.time())).not_after
+        def check(certificate: bytes) -> Identity:
+            return tls().trust.check(certificate, time.time(), max_revocation_age_s)
+
+        return verify(theirs, check).not_after
 
     return OwnSession(signed(credential, tls()), private_key, judge)
 

@@ -2,7 +2,7 @@
 
     offset  size
          0     8  magic: "plr-id\\0\\0" identity, "plr-last" last good messages of the control plane,
-                  "plr-ctrl" addresses of the control plane that worked
+                  "plr-ctrl" addresses of the control plane that worked, "plr-crls" revocation lists
          8     2  format version: 2 of last good messages, 1 of the others
         10     4  length of the body
         14    32  SHA-256 of the body
@@ -11,6 +11,7 @@
     identity     token (16), incarnation (8)
     addresses    number of names (1), the configured host:port names, number of addresses (1), for each its host and
                  its port (2); texts have their length (1) before them
+    revocations  revocation lists, PEM
     last good    owner: length (1), name of the sidecar; then ControlMessages that hold a Welcome, a PeerSet, a
                  MappingSet (the last of a kind counts): length (4), protobuf
 
@@ -44,6 +45,7 @@ MAX_FILE_BYTES = 64 << 20
 _IDENTITY_MAGIC = b"plr-id\0\0"
 _LAST_GOOD_MAGIC = b"plr-last"
 _ADDRESSES_MAGIC = b"plr-ctrl"
+_REVOCATIONS_MAGIC = b"plr-crls"
 _HEADER = struct.Struct("!8sHI32s")
 _IDENTITY = struct.Struct(f"!{TOKEN_BYTES}sQ")
 _PORT = struct.Struct("!H")
@@ -126,6 +128,16 @@ def decode_last_good(data: bytes, owner: NodeName) -> LastGood:
         message, end = _pull_message(body, end)
         last = last.with_message(message)
     return last
+
+
+def encode_revocations(pem: bytes) -> bytes:
+    """Return the file's content."""
+    return _seal(_REVOCATIONS_MAGIC, pem)
+
+
+def decode_revocations(data: bytes) -> bytes:
+    """Read the file's content; raises DecodeError."""
+    return _open(_REVOCATIONS_MAGIC, data)
 
 
 def encode_addresses(known: ControlAddresses) -> bytes:

@@ -25,9 +25,11 @@ from sidecar.state_file import (
     decode_addresses,
     decode_identity,
     decode_last_good,
+    decode_revocations,
     encode_addresses,
     encode_identity,
     encode_last_good,
+    encode_revocations,
 )
 
 if TYPE_CHECKING:
@@ -41,10 +43,17 @@ log = logging.getLogger(__name__)
 IDENTITY_FILE = "identity"
 LAST_GOOD_FILE = "last-good"
 ADDRESSES_FILE = "control-addresses"
+REVOCATIONS_FILE = "revocations"
 LOCK_FILE = "lock"
 SET_ASIDE_SUFFIX = ".refused"
 
-FAILURES = ("identity_refused", "last_good_refused", "control_addresses_refused", "write_failed")
+FAILURES = (
+    "identity_refused",
+    "last_good_refused",
+    "control_addresses_refused",
+    "revocations_refused",
+    "write_failed",
+)
 """The keys of `StateStore.failures`."""
 
 CLOSE_TIMEOUT_S = 2.0
@@ -77,6 +86,8 @@ class StateStore:
         self.last_good = self._current
         """As found on disk when opened."""
         self._addresses = self._read(ADDRESSES_FILE, decode_addresses) or ControlAddresses(())
+        self.revocations = self._read(REVOCATIONS_FILE, decode_revocations) or b""
+        """Revocation lists (PEM) as found on disk when opened."""
         self._condition = threading.Condition()
         self._dirty: dict[str, bytes | LastGood] = {}
         """What to write, by file."""
@@ -102,6 +113,12 @@ class StateStore:
         with self._condition:
             self._addresses = ControlAddresses(names, addresses)
             self._dirty[ADDRESSES_FILE] = encode_addresses(self._addresses)
+            self._condition.notify()
+
+    def remember_revocations(self, pem: bytes) -> None:
+        """Keep the revocation lists that are in use; returns at once."""
+        with self._condition:
+            self._dirty[REVOCATIONS_FILE] = encode_revocations(pem)
             self._condition.notify()
 
     def close(self) -> None:

@@ -46,13 +46,22 @@ from sidecar.core.link_events import (
 )
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
-from sidecar.core.messages import CancelMessage, RequestMessage, ResponseMessage, decode_message
+from sidecar.core.messages import (
+    CancelMessage,
+    RequestMessage,
+    ResponseMessage,
+    RevocationLists,
+    RevocationsHeld,
+    RevocationsWanted,
+    decode_message,
+)
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.peers import MAX_PEERS, Peers
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
+from sidecar.core.revocation_exchange import RevocationExchange
 from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.serving import Serving, ServingParts
@@ -102,6 +111,7 @@ class Engine:
         self.mapping = MappingTable(self.routes)
         self._offers = Offers(self._rules)
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
+        self.revocations = RevocationExchange(self.routes, self._outbox, self.stats)
         self._measurements = Measurements(self.stats.dropped)
         self._serving = Serving(
             ServingParts(
@@ -386,6 +396,7 @@ class Engine:
         """Less is under way than before."""
         self._requests.on_room(now)
         self._serving.on_room(now)
+        self.revocations.on_room(now)
 
     def _is_current(self, path: PathId, session: SessionId) -> bool:
         if self.peers.session(path.peer) == session:
@@ -400,7 +411,9 @@ class Engine:
             self.stats.dropped["malformed_message"] += 1
             return
         robot = self._config.role is Role.ROBOT
-        if isinstance(message, RequestMessage):
+        if isinstance(message, RevocationsHeld | RevocationsWanted | RevocationLists):
+            self.revocations.on_message(path.peer, message, now)
+        elif isinstance(message, RequestMessage):
             if robot:
                 self.stats.dropped["request_to_a_robot"] += 1
             else:
@@ -432,6 +445,8 @@ class Engine:
             self._drop_unlisted((path.peer,), now)
         if self.routes.reaches(path.peer) is not reached:
             self._update_offers(now)
+            if not reached:
+                self.revocations.on_reached(path.peer, now)
         self._requests.on_path_changed(path, state, now)
 
     def _knows(self, path: PathId) -> bool:
@@ -480,6 +495,7 @@ class Engine:
             let_go = [*self._outbox.drop_peer(name), *self._serving.on_robot_gone(name)]
             self._backlog.add_steps(called_off + let_go, now)
         self._inbound.forget_peer(name)
+        self.revocations.forget_peer(name)
         self.routes.forget_peer(name)
 
     def _follow_gone(self, names: Collection[NodeName], now: float) -> None:
@@ -513,7 +529,7 @@ class Engine:
             self._serving.next_timer(),
             self._offers.next_timer(),
         )
-        return min((self._sweep_at, *(timer for timer in timers if timer is not None)))
+        return min((self._sweep_at, self.revocations.next_timer(), *(timer for timer in timers if timer is not None)))
 
     def handle_timer(self, now: float) -> None:
         """Do what is due by now, or as much of it as one turn has room for."""
@@ -521,6 +537,7 @@ class Engine:
         self._backlog.run(now, leave=SLICE // 2)  # deadlines must not wait until all is done
         self._requests.handle_timer(now)
         self._serving.handle_timer(now)
+        self.revocations.handle_timer(now)
         self._backlog.run(now)
         if now >= self._sweep_at:
             self._sweep_at = now + SWEEP_EVERY_S

@@ -5,6 +5,9 @@
     response   2  request id (16 bytes) copy (8) processing time in us (32), payload
     rejection  3  request id (16 bytes) copy (8) reason (8) n (16) text
     cancel     4  request id (16 bytes) 0 (8)
+    held       5  n (8), n times: CA (64) number of the newest revocation list that the sender has of it (64)
+    wanted     6  as held: the sender asks for newer ones
+    lists      7  revocation lists, PEM
 
 `copy` numbers the copies of one request; the answer repeats it, so that each copy's latency is known whichever path
 the answer takes. A deadline that is over has 0 left. A cancel is about all copies of its request.
@@ -12,6 +15,8 @@ the answer takes. A deadline that is over has 0 left. A cancel is about all copi
 What a request says to be left was so when its message was made. It waits before it leaves, and parts of it may leave
 again much later, so each datagram tells how much of the lifetime is left by then (frame.py); what is gone of that is
 gone of the deadline too.
+
+A CA is told by the first 64 bits of its certificate's SHA-256, and one of which there is no list is left out.
 """
 
 from __future__ import annotations
@@ -20,7 +25,9 @@ import struct
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+from protos.convert.fields import MAX_CRL_BYTES
 from protos.errors import DecodeError
+from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import ServiceName
 from protos.names import clean_text
 from sidecar.core.events import RejectReason, RequestId
@@ -38,7 +45,8 @@ _HEAD = struct.Struct(f">B{REQUEST_ID_BYTES}sB")
 _REQUEST_TIMES = struct.Struct(">BII")
 _U32 = struct.Struct(">I")
 _U16 = struct.Struct(">H")
-_REQUEST, _RESPONSE, _REJECTION, _CANCEL = 1, 2, 3, 4
+_LISTED = struct.Struct(">QQ")
+_REQUEST, _RESPONSE, _REJECTION, _CANCEL, _HELD, _WANTED, _LISTS = range(1, 8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +98,29 @@ class CancelMessage:
     request_id: RequestId
 
 
-Message = RequestMessage | ResponseMessage | RejectionMessage | CancelMessage
+@dataclass(frozen=True, slots=True)
+class RevocationsHeld:
+    """Which revocation lists the sender has: the newest one's number by CA."""
+
+    numbers: dict[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class RevocationsWanted:
+    """The sender has these, and wants newer ones."""
+
+    numbers: dict[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class RevocationLists:
+    """Revocation lists, PEM; nothing about them is known to be true."""
+
+    pem: bytes = field(repr=False)
+
+
+RevocationMessage = RevocationsHeld | RevocationsWanted | RevocationLists
+Message = RequestMessage | ResponseMessage | RejectionMessage | CancelMessage | RevocationMessage
 
 
 class Encoded(NamedTuple):
@@ -128,9 +158,19 @@ def encode_message(message: Message) -> Encoded:
         return Encoded(head, message.payload)
     if isinstance(message, CancelMessage):
         return Encoded(_HEAD.pack(_CANCEL, message.request_id, 0), b"")
+    if isinstance(message, RevocationsHeld | RevocationsWanted | RevocationLists):
+        return _encode_about_revocations(message)
     text = message.text.encode(errors="replace")[:MAX_TEXT_BYTES]
     head = _HEAD.pack(_REJECTION, message.request_id, message.copy) + bytes((message.reason,)) + _U16.pack(len(text))
     return Encoded(head, text)
+
+
+def _encode_about_revocations(message: RevocationMessage) -> Encoded:
+    if isinstance(message, RevocationLists):
+        return Encoded(bytes((_LISTS,)), message.pem)
+    kind = _HELD if isinstance(message, RevocationsHeld) else _WANTED
+    listed = [_LISTED.pack(ca, min(number, _MAX_NUMBER)) for ca, number in message.numbers.items()]
+    return Encoded(bytes((kind, len(listed))) + b"".join(listed), b"")
 
 
 def decode_message(view: memoryview) -> Message:
@@ -139,6 +179,8 @@ def decode_message(view: memoryview) -> Message:
     Raises:
         DecodeError: the bytes are not a message that we know.
     """
+    if len(view) and view[0] in _ABOUT_REVOCATIONS:
+        return _decode_about_revocations(view)
     try:
         kind, request_id, copy = _HEAD.unpack_from(view)
         decode = _DECODERS.get(kind)
@@ -182,6 +224,20 @@ def _decode_rejection(request_id: RequestId, copy: int, view: memoryview, positi
 def _decode_cancel(request_id: RequestId, _copy: int, _view: memoryview, _position: int) -> Message:
     return CancelMessage(request_id)
 
+
+def _decode_about_revocations(view: memoryview) -> Message:
+    if view[0] == _LISTS:
+        if len(view) > 1 + MAX_CRL_BYTES:
+            raise DecodeError("revocation lists over the limit")
+        return RevocationLists(bytes(view[1:]))
+    if len(view) < 2 or view[1] > MAX_CA_CERTIFICATES or len(view) != 2 + view[1] * _LISTED.size:
+        raise DecodeError("malformed numbers of revocation lists")
+    numbers = dict(_LISTED.iter_unpack(view[2:]))
+    return RevocationsHeld(numbers) if view[0] == _HELD else RevocationsWanted(numbers)
+
+
+_ABOUT_REVOCATIONS = frozenset((_HELD, _WANTED, _LISTS))
+_MAX_NUMBER = 0xFFFFFFFFFFFFFFFF
 
 _DECODERS: dict[int, Callable[[RequestId, int, memoryview, int], Message]] = {
     _REQUEST: _decode_request,

@@ -151,6 +151,10 @@ class Routes:
         """Whether any path to the peer is not down."""
         return peer in self._reached
 
+    def reached(self) -> list[NodeName]:
+        """Return the peers to which any path is not down."""
+        return list(self._reached)
+
     def reaches_any(self, peers: Iterable[NodeName]) -> bool:
         """Whether any path to any of these peers is not down."""
         return not self._reached.isdisjoint(peers)

@@ -76,6 +76,8 @@ class EngineStats:
     late_dropped: Counter[ServiceName] = field(default_factory=Counter)
     executions: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
     """Cloud: (service, result: run | coalesced | cached | cancelled | refused | abandoned)."""
+    revocations: Counter[str] = field(default_factory=Counter)
+    """Revocation lists exchanged with peers: asked | sent | received | taken."""
     dropped: Counter[str] = field(default_factory=Counter)
     """Messages and table entries by the reason they were dropped for."""
     mapping_version: int = 0

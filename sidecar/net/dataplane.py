@@ -74,6 +74,8 @@ class DataPlaneHooks:
     """Interfaces or peers may have come: a mapping that was refused for want of them may fit now."""
     paths_changed: Callable[[Mapping[InterfaceName, PathState]], None]
     """The best state of the paths over each interface that has some; called with the engine's lock held."""
+    revocations: Callable[[NodeName, bytes], None]
+    """A peer sent revocation lists (PEM), which nobody has judged; called with the engine's lock held."""
 
 
 class ThreadedDataPlane:
@@ -259,6 +261,17 @@ class ThreadedDataPlane:
         self._judge(known)
         self._recheck_peers(self._judge(refused))
 
+    def set_revocations(self, numbers: Mapping[int, int], pem: bytes) -> None:
+        """Tell peers of these lists, and have them when they ask; see `RevocationExchange.set_own`."""
+        with self._lock:
+            self._engine.revocations.set_own(numbers, pem, self._clock())
+            self._timer.arm_at_latest(self._engine.next_timer())
+
+    def judged_revocations(self, peer: NodeName, *, good: bool) -> None:
+        """What a peer sent is taken, or is no list of our CAs."""
+        with self._lock:
+            self._engine.revocations.on_judged(peer, self._clock(), good=good)
+
     def end_expired(self) -> None:
         """Part with peers whose certificates have ended by now, at next to no cost while there are none.
 
@@ -385,6 +398,8 @@ class ThreadedDataPlane:
                 woken.add(link)
         for event in self._engine.take_events():
             self._hooks.application.handle(event)
+        for peer, pem in self._engine.revocations.take_arrived():
+            self._hooks.revocations(peer, pem)
         best = self._engine.routes.best
         if best is not self._told_paths:
             self._told_paths = best

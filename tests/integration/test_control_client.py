@@ -96,6 +96,9 @@ class Recorder:
     def certificate_changed(self, files: TlsFiles) -> None:
         raise AssertionError("insecure here")
 
+    def look_at_revocations(self) -> None:
+        pass
+
     def end_expired(self) -> None:
         pass
 

@@ -137,6 +137,9 @@ class Sidecar:
     def certificate_changed(self, files: TlsFiles) -> None:
         raise AssertionError("insecure here")
 
+    def look_at_revocations(self) -> None:
+        pass
+
     def end_expired(self) -> None:
         pass
 

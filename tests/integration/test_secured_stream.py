@@ -74,6 +74,9 @@ class Robot:
     def take_report(self) -> Report:
         return Report()
 
+    def look_at_revocations(self) -> None:
+        pass
+
     def end_expired(self) -> None:
         pass
 
@@ -98,7 +101,7 @@ class Robot:
 def test_a_renewed_certificate_is_shown_on_a_new_stream(
     plane: SecuredControlPlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control_client, "WATCH_INTERVAL_S", 0.05)
+    monkeypatch.setattr(control_client, "LOOK_INTERVAL_S", 0.05)
     folder = tmp_path / "tls"
     plane.authority.write_tls_dir(folder, "robot-1", IdentityRole.ROBOT)
     with cloud(plane.address, "cloud-a", plane.member("cloud-a", IdentityRole.CLOUD)) as server:

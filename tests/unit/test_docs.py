@@ -18,12 +18,13 @@ from controlplane.config import ControlPlaneConfig
 from controlplane.core.control import ControlCore
 from controlplane.metrics import Metrics
 from protos.histogram import Histogram
-from protos.identity import Identity, IdentityRole
+from protos.identity import Identity, IdentityRole, RevocationList
 from protos.model import InterfaceName, NodeName, ServiceName
 from sidecar.config import SidecarConfig
 from sidecar.core.control_session import ControlStats
 from sidecar.core.stats import EngineStats, LinkStats
 from sidecar.metrics import MetricSources, SidecarCollector
+from sidecar.revocations import RevocationState
 from sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
+LISTS = {1: RevocationList(3, 0.0, 1.0, b"")}
 PAGES = sorted(
     path
     for pattern in ("README.md", "docs/**/*.md", "deploy/**/*.md", "examples/**/*.md")
@@ -125,6 +127,7 @@ def _sidecar_metrics() -> Iterator[Metric]:
         bridge=lambda: BridgeStats(unanswered=Counter({(ServiceName("/s"), "failed"): 1})),
         state_failures=dict,
         certificate=lambda: Identity(NodeName("robot"), IdentityRole.ROBOT, 1, 0.0, 1.0),
+        revocations=lambda: RevocationState(LISTS, frozenset(), 86_400.0),
     )
     yield from SidecarCollector(sources).collect()
 
@@ -133,7 +136,7 @@ def _control_metrics() -> Iterator[Metric]:
     from controlplane.core.control_events import Settings
 
     metrics = Metrics()
-    metrics.own_certificate(Identity(NodeName("control"), IdentityRole.CONTROL_PLANE, 1, 0.0, 1.0))
+    metrics.own_certificate(Identity(NodeName("control"), IdentityRole.CONTROL_PLANE, 1, 0.0, 1.0), LISTS)
     metrics.update(ControlCore(Settings(), version_epoch=1, now=0.0), (), 0, 0.0)
     yield from metrics.registry.collect()
 

@@ -247,16 +247,35 @@ def test_a_relayed_revocation_list_counts_beside_the_folders(folder: Path, ca: A
         watch.current.trust.check(robber.certificate_der, now)
 
 
+def test_what_was_relayed_before_is_not_lost_with_what_is_relayed_now(folder: Path, ca: Authority) -> None:
+    """A peer may hold a newer list of one CA and an older one of another."""
+    ca.rotate("second")
+    second = Authority(ca.own, clock=ca._clock)
+    (old,) = ca.former
+    lists = {number: authority_pem for number, authority_pem in enumerate([old.crl_pem(), second.crl_pem()])}
+    old.crl_number += 5
+    (folder / "ca.pem").write_bytes(ca.ca_pem)
+    watch = TlsWatch(load_tls_files(folder))
+    assert watch.take_revocations(old.crl_pem())
+    second.crl_number += 3
+    assert watch.take_revocations(lists[0] + second.crl_pem())
+    assert sorted(one.number for one in watch.current.trust.lists().values() if one) == [3, 5]
+    assert not watch.take_revocations(lists[1])
+    assert TlsWatch(load_tls_files(folder)).take_revocations(watch.current.trust.crl_pem())
+
+
 def test_a_relayed_list_that_our_cas_did_not_sign_changes_nothing(folder: Path) -> None:
     watch = TlsWatch(load_tls_files(folder))
     other = other_ca()
     other.issue("robot-1", IdentityRole.ROBOT)
     other.revoke("robot-1")
     for crl in (other.crl_pem(), b"junk", b""):
-        assert not watch.take_revocations(crl)
+        with pytest.raises(CertificateError):
+            watch.take_revocations(crl)
     (folder / "crl.pem").unlink()
     watch = TlsWatch(load_tls_files(folder))
     for crl in (other.crl_pem(), b"junk", b""):
-        assert not watch.take_revocations(crl)
+        with pytest.raises(CertificateError):
+            watch.take_revocations(crl)
     own = watch.current.identity
     assert watch.current.trust.check(watch.current.certificate_der, own.not_before) == own

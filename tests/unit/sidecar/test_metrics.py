@@ -63,6 +63,7 @@ class Counters:
             bridge=lambda: self.bridge,
             state_failures=lambda: self.state_failures,
             certificate=lambda: None,
+            revocations=lambda: None,
         )
 
 

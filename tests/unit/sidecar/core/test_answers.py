@@ -66,19 +66,24 @@ class Cloud:
         """(request, copy, path) of what was sent since the last look."""
         found = [(decoded(command.message), command.path) for command in self.commands if isinstance(command, Send)]
         self.commands.clear()
-        return [(int.from_bytes(message.request_id, "big"), copy_of(message), way) for message, way in found]
+        return [(number_of(message), copy_of(message), way) for message, way in found]
 
     def finish(self, number: int, copy: int = 0) -> None:
         """The robot got this, and what comes of it."""
         for message in list(self.outbox._messages.values()):
             content = decoded(message)
-            if content.request_id == request_id(number) and copy_of(content) == copy:
+            if number_of(content) == number and copy_of(content) == copy:
                 self.outbox.on_finished(ROBOT, message.number)
         self.answers.on_room(1.0)
 
 
 def decoded(message: OutboundMessage) -> Message:
     return decode_message(memoryview(b"".join(message.content)))
+
+
+def number_of(message: Message) -> int:
+    assert isinstance(message, (ResponseMessage, RejectionMessage))
+    return int.from_bytes(message.request_id, "big")
 
 
 def copy_of(message: Message) -> int:

@@ -71,7 +71,7 @@ class Node:
         self.reach_changes = 0
         self.news = threading.Condition()
         config = EngineConfig(role, (ServiceRule(SERVICE, 5.0, 20.0, idempotent=True),))
-        hooks = DataPlaneHooks(self, lambda *_: None, lambda: None, self.count_reach, lambda _: None)
+        hooks = DataPlaneHooks(self, lambda *_: None, lambda: None, self.count_reach, lambda _: None, lambda *_: None)
         own = self.own = session_of(name, role, session)
         self.plane = ThreadedDataPlane(config, own, hooks)
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

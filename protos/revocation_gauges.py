@@ -1,0 +1,40 @@
+"""What both programs show of their revocation lists: number, age, and when the CA wants another to be there."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from protos.identity import RevocationList
+
+
+class RevocationGauge(NamedTuple):
+    """A gauge: its name, what it says, and its value by CA."""
+
+    name: str
+    text: str
+    by_ca: dict[tuple[str, ...], float]
+
+
+def revocation_gauges(lists: Mapping[int, RevocationList | None], now_wall: float) -> Iterator[RevocationGauge]:
+    """Yield the gauges; `lists` as of `Trust.lists`, `now_wall` in seconds since 1970."""
+    held = {(f"{ca:016x}",): one for ca, one in lists.items()}
+    yield RevocationGauge(
+        "plr_revocation_list_number",
+        "Number of the newest revocation list of each CA, -1 for none.",
+        {ca: -1.0 if one is None else float(one.number) for ca, one in held.items()},
+    )
+    known = {ca: one for ca, one in held.items() if one is not None}
+    yield RevocationGauge(
+        "plr_revocation_list_age_seconds",
+        "Since the CA signed it, by this clock; negative: the clock is behind.",
+        {ca: now_wall - one.signed_at for ca, one in known.items()},
+    )
+    yield RevocationGauge(
+        "plr_revocation_list_left_seconds",
+        "Until the time at which the list says that there is another.",
+        {ca: one.next_at - now_wall for ca, one in known.items() if math.isfinite(one.next_at)},
+    )

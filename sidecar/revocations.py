@@ -1,0 +1,161 @@
+"""Keeps this sidecar's revocation lists, wherever they come from, and tells the data plane what they say.
+
+A list comes in the node's folder, from the control plane, from a peer, or from disk: each is judged by `TlsWatch`, in
+the control client's thread, and has the same effect.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from protos.convert.fields import MAX_CRL_BYTES
+from protos.identity import CertificateError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from protos.identity import RevocationList
+    from protos.model import NodeName
+    from protos.tls_files import TlsWatch
+
+log = logging.getLogger(__name__)
+
+MAX_HEARD = 16
+"""Lists of peers that wait to be judged, which happens every second; the exchange asks for one in 5 s."""
+CLOCK_SLACK_S = 300.0
+"""A list signed so much later than now says that this clock is behind: as much as certificates begin in the past."""
+
+
+class RevocationUser(Protocol):
+    """What the data plane does about revocations."""
+
+    def trust_changed(self) -> None:
+        """Judge all peers anew."""
+
+    def set_revocations(self, numbers: Mapping[int, int], pem: bytes) -> None:
+        """Tell peers of these lists, and have them when they ask."""
+
+    def judged_revocations(self, peer: NodeName, *, good: bool) -> None:
+        """What a peer sent is taken, or is no list of our CAs."""
+
+
+@dataclass(frozen=True, slots=True)
+class RevocationState:
+    """What metrics show."""
+
+    lists: Mapping[int, RevocationList | None]
+    """As `Trust.lists`."""
+    too_old: frozenset[int]
+    """CAs whose lists are older than may be: whom they certified is not talked to."""
+    max_age_s: float
+
+
+class Revocations:
+    """`heard` and `state` may be called from any thread, everything else from that of the control client only."""
+
+    def __init__(
+        self,
+        tls: TlsWatch,
+        data_plane: RevocationUser,
+        remember: Callable[[bytes], None],
+        max_age_s: float = math.inf,
+    ) -> None:
+        """`remember` keeps lists over a restart. `max_age_s`: beyond it nobody is believed (`Trust.check`)."""
+        self._tls = tls
+        self._data_plane = data_plane
+        self._remember = remember
+        self._max_age_s = max_age_s
+        self._heard: deque[tuple[NodeName, bytes]] = deque()
+        self._complained: set[NodeName] = set()
+        """Whose bad lists were logged; names of peers only, as many as there are."""
+        self._too_long = False
+        self._clock_behind = False
+        self._too_old: frozenset[int] = frozenset()
+
+    @property
+    def state(self) -> RevocationState:
+        """What is in use."""
+        return RevocationState(self._tls.current.trust.lists(), self._too_old, self._max_age_s)
+
+    def heard(self, peer: NodeName, pem: bytes) -> None:
+        """A peer sent lists: `look` judges them."""
+        if len(self._heard) == MAX_HEARD:
+            log.warning("a revocation list is dropped unseen: %d others wait to be judged", MAX_HEARD)
+            return
+        self._heard.append((peer, pem))
+
+    def take(self, pem: bytes, source: str) -> bool:
+        """Believe these lists too; whether they say anything new. Raises CertificateError."""
+        if not self._tls.take_revocations(pem):
+            return False
+        trust = self._tls.current.trust
+        shown = ", ".join(f"number {one.number}" for one in trust.lists().values() if one is not None)
+        log.info("took a new revocation list of %s: %s", source, shown)
+        self._remember(trust.crl_pem())
+        self._data_plane.trust_changed()
+        self.tell()
+        return True
+
+    def take_or_log(self, pem: bytes, source: str) -> None:
+        """The same, but bad ones are logged."""
+        try:
+            self.take(pem, source)
+        except CertificateError as error:
+            log.warning("a revocation list of %s is ignored: %s", source, error)
+
+    def tell(self) -> None:
+        """The lists in use may be others now."""
+        trust = self._tls.current.trust
+        pem = trust.crl_pem()
+        too_long = len(pem) > MAX_CRL_BYTES
+        if too_long and not self._too_long:
+            log.error("the revocation lists are longer than %d bytes: peers are not told of them", MAX_CRL_BYTES)
+        self._too_long = too_long
+        numbers = {ca: -1 if one is None else one.number for ca, one in trust.lists().items()}
+        self._data_plane.set_revocations(numbers, b"" if too_long else pem)
+
+    def look(self, now_wall: float) -> None:
+        """Judge what peers sent, and how old the lists are by now (seconds since 1970). To be called every second."""
+        while self._heard:
+            self._judge(*self._heard.popleft())
+        self._look_at_ages(now_wall)
+
+    def _judge(self, peer: NodeName, pem: bytes) -> None:
+        try:
+            taken = self.take(pem, peer)
+        except CertificateError as error:
+            self._data_plane.judged_revocations(peer, good=False)
+            if peer not in self._complained:
+                log.warning("a revocation list of %s is ignored, and it is not asked for an hour: %s", peer, error)
+                self._complained.add(peer)
+            return
+        if taken:
+            self._data_plane.judged_revocations(peer, good=True)
+
+    def _look_at_ages(self, now_wall: float) -> None:
+        trust = self._tls.current.trust
+        ahead_s = max((one.signed_at - now_wall for one in trust.lists().values() if one is not None), default=0.0)
+        behind = ahead_s > CLOCK_SLACK_S
+        if behind and not self._clock_behind:
+            log.error("a revocation list was signed %.0f s from now: this clock is behind, or the CA's ahead", ahead_s)
+        self._clock_behind = behind
+        too_old = trust.too_old(now_wall, self._max_age_s)
+        if too_old == self._too_old:
+            return
+        if too_old:
+            log.error(
+                "the revocation lists of %d of %d CAs are older than max_revocation_age_s (%.0f s) by this clock, or "
+                "not here: their nodes are not talked to until newer ones come (plr ca publish); if the lists are "
+                "newer than that, this clock is wrong",
+                len(too_old),
+                len(trust.lists()),
+                self._max_age_s,
+            )
+        else:
+            log.warning("the revocation lists are new enough again: peers are talked to")
+        self._too_old = too_old
+        self._data_plane.trust_changed()
