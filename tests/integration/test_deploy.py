@@ -17,17 +17,19 @@ from controlplane.config import load_config as load_controlplane_config
 from controlplane.core.control import ControlCore
 from controlplane.metrics import Metrics
 from protos.config_fields import split_host_port
-from protos.identity import Identity, IdentityRole
+from protos.identity import Identity, IdentityRole, RevocationList
 from protos.model import NodeName, Role
 from sidecar.config import SidecarConfig, load_config
 from sidecar.core.control_session import ControlStats
 from sidecar.core.stats import EngineStats
 from sidecar.metrics import MetricSources, SidecarCollector
+from sidecar.revocations import RevocationState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
+LISTS = {1: RevocationList(3, 0.0, 1.0, b"")}
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 DASHBOARDS = sorted((DEPLOY / "grafana").glob("*.json"))
 RULES = DEPLOY / "prometheus" / "plr-rules.yml"
@@ -54,7 +56,14 @@ CONTRACT: dict[str, set[str]] = {
 }
 """The metrics that users may rely on, with their labels."""
 
-BEYOND_CONTRACT: dict[str, set[str]] = {"plr_control_plane_connected": set(), "plr_certificate_days_left": set()}
+BEYOND_CONTRACT: dict[str, set[str]] = {
+    "plr_control_plane_connected": set(),
+    "plr_certificate_days_left": set(),
+    "plr_revocation_list_number": {"ca"},
+    "plr_revocation_list_age_seconds": {"ca"},
+    "plr_revocation_list_max_age_seconds": set(),
+    "plr_revocation_lists_too_old": set(),
+}
 """Further metrics of the programs that the rules and dashboards use."""
 
 METRICS = CONTRACT | BEYOND_CONTRACT
@@ -227,10 +236,11 @@ def exported_metrics() -> dict[str, set[str]]:
             bridge=None,
             state_failures=dict,
             certificate=lambda: identity,
+            revocations=lambda: RevocationState(LISTS, frozenset(), 86_400.0),
         )
     )
     control = Metrics()
-    control.own_certificate(identity)
+    control.own_certificate(identity, LISTS)
     config = load_controlplane_config(DEPLOY / "config" / "controlplane.yaml")
     control.update(ControlCore(config.settings(), version_epoch=1, now=0.0), (), 0, 0.0)
     families = [*sidecar.collect(), *control.registry.collect()]

@@ -1,0 +1,58 @@
+"""A revocation while no control plane runs: the list that one cloud is given reaches the others over the data plane."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+
+from controlplane.ca.files import write_atomically
+from protos.tls_files import CRL_FILE
+from tests.attacks.world import SERVICES
+
+if TYPE_CHECKING:
+    from tests.attacks.world import World
+
+pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(240), pytest.mark.audit("sec-12")]
+
+ROBOT_2 = "robot-2"
+SOON_S = 30.0
+"""Telling, asking, sending and judging take some 3 s from a sidecar to the next: generous for a busy machine."""
+
+
+def numbers(world: World, host: str) -> list[float]:
+    """The numbers of the revocation lists that a sidecar uses, one for each CA."""
+    metrics = world.system.metrics(host)
+    return [number for name, number in metrics.items() if name.startswith("plr_revocation_list_number")]
+
+
+def test_a_list_that_one_cloud_is_given_revokes_at_all(world: World) -> None:
+    system = world.system
+    system.start_robot(SERVICES, name=ROBOT_2, host="robot_2", interfaces=["eth9"])
+    clouds = ("cloud_a", "cloud_b")
+
+    def paths(cloud: str) -> float:
+        return world.counter(cloud, "plr_path_up", peer=ROBOT_2)
+
+    system.wait("both clouds to have paths", lambda: all(paths(cloud) == 1 for cloud in clouds))
+    with world.calls():
+        system.parts["controlplane"].kill()
+        system.authority.revoke(ROBOT_2)
+        (only,) = numbers(world, "cloud_b")
+        write_atomically(world.tls_dir("cloud-a") / CRL_FILE, system.authority.crl_pem(), 0o644)
+        system.wait("cloud_a to part with it", lambda: paths("cloud_a") == 0, SOON_S)
+        system.wait("cloud_b to part with it", lambda: paths("cloud_b") == 0, SOON_S)
+        for host in ("cloud_a", "cloud_b", "robot"):
+            system.wait(f"{host} to hold it", lambda host=host: numbers(world, host) == [only + 1], SOON_S)  # type: ignore[misc]
+        log = system.parts["cloud_b.sidecar"].log.read_text()
+        assert re.search(r"took a new revocation list of robot(-2)?: number", log)
+        assert re.search(f"{ROBOT_2} is not talked to, whatever the control plane says: .*revoked", log)
+        for cloud in clouds:
+            assert world.counter(cloud, "plr_path_up", peer="robot") == 1
+        # It holds over a restart, also without control plane and folder.
+        cloud_b = system.parts["cloud_b.sidecar"]
+        assert cloud_b.terminate() == 0
+        system.start_cloud("cloud_b", [{"name": "/echo"}, {"name": "/plan_path"}])
+        system.wait("cloud_b to hold it still", lambda: numbers(world, "cloud_b") == [only + 1], SOON_S)
+    assert world.end_calls() > 0
