@@ -27,7 +27,7 @@ class AdminService(admin_pb2_grpc.AdminServicer):
 
     async def GetStatus(self, request: admin_pb2.GetStatusRequest, context: Any) -> admin_pb2.GetStatusResponse:
         """Every registered sidecar and how far it follows."""
-        return status_to_proto(self._loop.status())
+        return status_to_proto(self._loop.status(), self._loop.revocations)
 
     async def Explain(self, request: admin_pb2.ExplainRequest, context: Any) -> admin_pb2.ExplainResponse:
         """Why a robot's requests for a service go where they go."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 from protos.convert.fields import MAX_CRL_BYTES
 from protos.errors import ConfigError
 from protos.identity import IdentityRole
+from protos.revocation_views import revocation_set
 from protos.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
 
 if TYPE_CHECKING:
@@ -75,4 +76,4 @@ class CertificateKeeper:
         if len(crl) > MAX_CRL_BYTES:
             log.error("%s/crl.pem is longer than %d bytes: sidecars are not told of it", files.directory, MAX_CRL_BYTES)
             return
-        self._loop.relay_revocations(crl)
+        self._loop.relay_revocations(crl, revocation_set(files.trust.lists()))

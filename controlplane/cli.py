@@ -21,6 +21,7 @@ import argparse
 import json
 import subprocess
 import sys
+import time
 from typing import TYPE_CHECKING
 
 from google.protobuf import json_format
@@ -29,7 +30,7 @@ from controlplane import explain_command, plan_command, policy_command, status_t
 from controlplane.admin_client import AskError, add_options, ask
 from controlplane.ca import commands as ca_commands
 from controlplane.config import ControlPlaneConfig
-from protos.convert import status_from_proto
+from protos.convert import own_revocations_from_proto, status_from_proto
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
@@ -76,10 +77,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def _status(arguments: argparse.Namespace) -> int:
     try:
-        answer, sidecars = ask(
+        answer, (sidecars, own) = ask(
             arguments,
             lambda stub, timeout_s: stub.GetStatus(admin_pb2.GetStatusRequest(), timeout=timeout_s),
-            status_from_proto,
+            lambda message: (status_from_proto(message), own_revocations_from_proto(message)),
         )
     except AskError as error:
         sys.stderr.write(f"plr: {error}\n")
@@ -87,7 +88,7 @@ def _status(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json_format.MessageToJson(answer, preserving_proto_field_name=True))
     else:
-        print(status_table.render(sidecars))
+        print(status_table.render(sidecars, own, time.time()))
     return EXIT_OK
 
 

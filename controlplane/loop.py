@@ -24,7 +24,7 @@ from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
 from controlplane.mailbox import Mailbox
 from protos.identity import EXPIRED, REVOKED, CertificateError
-from protos.model import RemovalReason
+from protos.model import NO_REVOCATIONS, RemovalReason
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from controlplane.tls_gate import Caller
     from protos.explanation import Explanation
     from protos.identity import Trust
-    from protos.model import NodeName, Registration, ServiceName, SidecarMessage
+    from protos.model import NodeName, Registration, RevocationSet, ServiceName, SidecarMessage
     from protos.status import SidecarStatus
 
 log = logging.getLogger(__name__)
@@ -96,6 +96,8 @@ class ControlLoop:
         self._mailboxes: dict[StreamId, Mailbox] = {}
         self._callers: dict[NodeName, Caller] = {}
         self._superseded = 0
+        self.revocations = NO_REVOCATIONS
+        """The lists in use here."""
         self._wake = asyncio.Event()
         self._ended_lines = TokenBucket(rate=ENDED_LINES_PER_S, burst=ENDED_LINES_BURST, now=self._loop.time())
         self._stopping = False
@@ -195,8 +197,9 @@ class ControlLoop:
                 self._part_with(name, error)
         self._dispatch()
 
-    def relay_revocations(self, crl: bytes) -> None:
-        """Tell every sidecar, now and later, what is revoked (PEM)."""
+    def relay_revocations(self, crl: bytes, held: RevocationSet) -> None:
+        """Tell every sidecar, now and later, what is revoked (PEM), and the operator which lists these are."""
+        self.revocations = held
         self._core.relay_revocations(crl)
         self._dispatch()
 

@@ -18,7 +18,7 @@ from controlplane import handshakes, limits, tls_gate
 from protos import identity
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind, Role
-from protos.revocation_gauges import revocation_gauges
+from protos.revocation_views import revocation_gauges
 from protos.status import SyncState
 
 if TYPE_CHECKING:

@@ -6,25 +6,35 @@ import math
 from typing import TYPE_CHECKING
 
 from controlplane.text_table import columns
-from protos.model import Role
+from protos.model import NO_REVOCATIONS, RevocationSet, Role
 from protos.status import SyncState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from protos.model import PathReport, ServiceMapping
     from protos.status import ResourceStatus, SidecarStatus
 
+_DAY_S = 86_400.0
+
 _HEADER = ("NAME", "ROLE", "STREAM", "LEASE", "PEERS", "MAPPING", "SERVICES", "SOFTWARE")
 
 
-def render(sidecars: Sequence[SidecarStatus]) -> str:
-    """One row a sidecar, then what each robot was told and on which paths it rests."""
+def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATIONS, now_wall: float = 0.0) -> str:
+    """One row a sidecar, then what each robot was told and on which paths it rests.
+
+    `own`: the revocation lists of the control plane; `now_wall`: seconds since 1970.
+    """
+    newest: dict[int, int] = {}
+    for one in (*own.lists, *(one for status in sidecars for one in status.revocations.lists)):
+        newest[one.ca] = max(one.number, newest.get(one.ca, 0))
+    about_own = _revocations(own, newest, now_wall)
+    lines = [f"control plane: {line}" for line in about_own]
     if not sidecars:
-        return "no sidecars"
-    lines = [*columns([_HEADER, *(_row(status) for status in sidecars)])]
+        return "\n".join([*lines, "no sidecars"])
+    lines += columns([_HEADER, *(_row(status) for status in sidecars)])
     for status in sidecars:
-        details = [*_details(status)]
+        details = [*_details(status), *_revocations(status.revocations, newest, now_wall)]
         if details:
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in details)]
     return "\n".join(lines)
@@ -60,6 +70,17 @@ def _details(status: SidecarStatus) -> Iterator[str]:
             state = "ready on the robot" if use.fallback_up else "MISSING: its node does not run, or has another type"
             yield f"{use.name}: fallback {state}"
     yield from columns([_path(path) for path in status.paths])
+
+
+def _revocations(held: RevocationSet, newest: Mapping[int, int], now_wall: float) -> Iterator[str]:
+    """`newest`: the largest number that anybody has, by CA."""
+    for one in held.lists:
+        age_s = now_wall - one.signed_at_s
+        age = f"{age_s / _DAY_S:.1f} days ago" if age_s >= 0.0 else f"{-age_s:.0f} s FROM NOW: a clock is wrong"
+        behind = f": OLDER than {newest[one.ca]}, which others have" if one.number < newest[one.ca] else ""
+        yield f"revocation list {one.number}, signed {age}{behind}"
+    if held.too_old:
+        yield f"REVOCATION LIST TOO OLD of {held.too_old} CAs: talks to none of their nodes; do: plr ca publish"
 
 
 def _rejection(resource: ResourceStatus) -> str:

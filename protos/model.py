@@ -276,6 +276,29 @@ class CandidateSet:
 
 
 @dataclass(frozen=True, slots=True)
+class HeldList:
+    """A revocation list that somebody uses; `ca` is the first 64 bits of the SHA-256 of the CA's certificate."""
+
+    ca: int
+    number: int
+    signed_at_s: int
+    """Seconds since 1970."""
+
+
+@dataclass(frozen=True, slots=True)
+class RevocationSet:
+    """The newest list of each CA that has one."""
+
+    lists: tuple[HeldList, ...] = ()
+    too_old: int = 0
+    """CAs whose list is older than may be, so that their nodes are not talked to."""
+
+
+NO_REVOCATIONS = RevocationSet()
+"""No list, or none told of."""
+
+
+@dataclass(frozen=True, slots=True)
 class ServiceSet:
     """All services a sidecar offers and carries, replacing those it sent before."""
 
@@ -412,7 +435,7 @@ class Report:
     interface_joints: tuple[InterfaceJointReport, ...] = ()
 
 
-SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain
+SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain | RevocationSet
 """What a sidecar says on its stream; a Registration first, once."""
 
 ControlMessage = Welcome | PeerSet | MappingSet

@@ -6,7 +6,7 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model import Version
+from protos.model import NO_REVOCATIONS, RevocationSet, Version
 
 if TYPE_CHECKING:
     from protos.model import PathReport, Peer, ServiceMapping, ServiceName, ServiceUse
@@ -49,3 +49,4 @@ class SidecarStatus:
     paths: tuple[PathReport, ...] = ()
     refused_offers: tuple[ServiceName, ...] = ()
     """What it offers and the policy does not let it."""
+    revocations: RevocationSet = NO_REVOCATIONS

@@ -33,7 +33,7 @@ from sidecar.refusal_log import RefusalLog
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import CandidateSet, ServiceOffer, ServiceUse
+    from protos.model import CandidateSet, RevocationSet, ServiceOffer, ServiceUse
     from protos.plr.v1 import control_pb2
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
@@ -118,6 +118,10 @@ class ControlClient:
     def set_services(self, offers: tuple[ServiceOffer, ...], uses: tuple[ServiceUse, ...]) -> None:
         """Tell the control plane what we offer and carry now."""
         self._post(lambda: self._session.set_services(ServiceSet(offers, uses)))
+
+    def set_revocations(self, held: RevocationSet) -> None:
+        """Tell the control plane which revocation lists we use now."""
+        self._post(lambda: self._session.set_revocations(held))
 
     def try_again(self) -> None:
         """Interfaces or peers are others now: a mapping that was refused for want of them may fit."""

@@ -17,7 +17,7 @@ from prometheus_client.registry import Collector
 from protos.config_fields import split_host_port
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind
-from protos.revocation_gauges import revocation_gauges
+from protos.revocation_views import revocation_gauges
 from sidecar.core.control_watch import LEAVE_CAUSES
 from sidecar.core.control_ways import DIAL_DROPS
 from sidecar.core.revocation_exchange import EXCHANGES

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Protocol
 
 from protos.convert.fields import MAX_CRL_BYTES
 from protos.identity import CertificateError
+from protos.revocation_views import revocation_set
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from protos.identity import RevocationList
-    from protos.model import NodeName
+    from protos.model import NodeName, RevocationSet
     from protos.tls_files import TlsWatch
 
 log = logging.getLogger(__name__)
@@ -62,12 +63,17 @@ class Revocations:
         tls: TlsWatch,
         data_plane: RevocationUser,
         remember: Callable[[bytes], None],
+        show: Callable[[RevocationSet], None],
         max_age_s: float = math.inf,
     ) -> None:
-        """`remember` keeps lists over a restart. `max_age_s`: beyond it nobody is believed (`Trust.check`)."""
+        """`remember` keeps lists over a restart; `show` tells the operator which they are.
+
+        `max_age_s`: beyond it nobody is believed (`Trust.check`).
+        """
         self._tls = tls
         self._data_plane = data_plane
         self._remember = remember
+        self._show = show
         self._max_age_s = max_age_s
         self._heard: deque[tuple[NodeName, bytes]] = deque()
         self._complained: set[NodeName] = set()
@@ -115,8 +121,12 @@ class Revocations:
         if too_long and not self._too_long:
             log.error("the revocation lists are longer than %d bytes: peers are not told of them", MAX_CRL_BYTES)
         self._too_long = too_long
+        self._say()
         numbers = {ca: -1 if one is None else one.number for ca, one in trust.lists().items()}
         self._data_plane.set_revocations(numbers, b"" if too_long else pem)
+
+    def _say(self) -> None:
+        self._show(revocation_set(self._tls.current.trust.lists(), len(self._too_old)))
 
     def look(self, now_wall: float) -> None:
         """Judge what peers sent, and how old the lists are by now (seconds since 1970). To be called every second."""
@@ -158,4 +168,5 @@ class Revocations:
         else:
             log.warning("the revocation lists are new enough again: peers are talked to")
         self._too_old = too_old
+        self._say()
         self._data_plane.trust_changed()

@@ -97,7 +97,13 @@ class Sidecar:
         self._revocations = (
             None
             if tls is None
-            else Revocations(tls, self._data_plane, self._store.remember_revocations, config.max_revocation_age)
+            else Revocations(
+                tls,
+                self._data_plane,
+                self._store.remember_revocations,
+                lambda held: self._control.set_revocations(held),
+                config.max_revocation_age,
+            )
         )
         last = self._store.last_good
         self._control_session = ControlSession(

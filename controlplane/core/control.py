@@ -51,6 +51,7 @@ from protos.model import (
     RemovalReason,
     Report,
     ResourceKind,
+    RevocationSet,
     Role,
     ServiceSet,
     Welcome,
@@ -150,6 +151,8 @@ class ControlCore:
             case Drain():
                 if self.registry.set_draining(name):
                     self._members_changed(now)
+            case RevocationSet():
+                self.registry.set_revocations(name, message)
             case Heartbeat():
                 pass
             case _:

@@ -13,10 +13,12 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
 from protos.model import (
+    NO_REVOCATIONS,
     NodeName,
     Peer,
     Registration,
     RemovalReason,
+    RevocationSet,
     Role,
 )
 
@@ -80,6 +82,8 @@ class Sidecar:
     candidates_signature: bytes = field(default=b"", repr=False)
     signed_under: bytes = field(default=b"", repr=False)
     """The credential in whose session, and with whose certificate, the candidates were signed."""
+    revocations: RevocationSet = NO_REVOCATIONS
+    """Which lists it uses."""
 
     @property
     def name(self) -> NodeName:
@@ -244,6 +248,10 @@ class Registry:
             offered = now_offered
         self._sidecars[name] = replace(known, services=services, offered=offered)
         return services != known.services
+
+    def set_revocations(self, name: NodeName, held: RevocationSet) -> None:
+        """Note which revocation lists it uses."""
+        self._sidecars[name] = replace(self._sidecars[name], revocations=held)
 
     def set_draining(self, name: NodeName) -> bool:
         """It is about to go; True if that is news."""

@@ -32,4 +32,5 @@ def statuses(
             services=snapshots.mapping.sent or (),
             paths=tuple(estimator.paths(sidecar.name)),
             refused_offers=permits.refused_offers(sidecar),
+            revocations=sidecar.revocations,
         )

@@ -8,7 +8,7 @@ to `MAX_STRING_BYTES` printable bytes.
 
 from __future__ import annotations
 
-from protos.convert.admin import status_from_proto, status_to_proto
+from protos.convert.admin import own_revocations_from_proto, status_from_proto, status_to_proto
 from protos.convert.control import (
     control_message_from_proto,
     control_message_to_proto,
@@ -51,6 +51,7 @@ __all__ = [
     "mapping_set_to_proto",
     "offer_from_proto",
     "offer_to_proto",
+    "own_revocations_from_proto",
     "parse_control_message",
     "parse_sidecar_message",
     "peer_from_proto",

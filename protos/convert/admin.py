@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
+from protos.convert.control import revocations_from_proto, revocations_to_proto
 from protos.convert.fields import (
     MAX_MAPPED_SERVICES,
     MAX_OFFERS,
@@ -19,7 +20,7 @@ from protos.convert.fields import (
 from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
 from protos.convert.reports import path_from_proto, path_to_proto
 from protos.convert.types import peer_from_proto, peer_to_proto, service_names, use_from_proto, use_to_proto
-from protos.model import MAX_PATHS
+from protos.model import MAX_PATHS, NO_REVOCATIONS, RevocationSet
 from protos.names import clean_text, text
 from protos.plr.v1 import admin_pb2
 from protos.status import ResourceStatus, SidecarStatus, SyncState
@@ -41,9 +42,16 @@ def status_from_proto(message: admin_pb2.GetStatusResponse) -> tuple[SidecarStat
     return each(message.sidecars, MAX_SIDECARS, "sidecars", _sidecar_from_proto)
 
 
-def status_to_proto(sidecars: Iterable[SidecarStatus]) -> admin_pb2.GetStatusResponse:
-    """Encode the status of all sidecars, without their tokens and credentials."""
-    return admin_pb2.GetStatusResponse(sidecars=map(_sidecar_to_proto, sidecars))
+def own_revocations_from_proto(message: admin_pb2.GetStatusResponse) -> RevocationSet:
+    """Check which revocation lists the control plane uses."""
+    return revocations_from_proto(message.revocations)
+
+
+def status_to_proto(
+    sidecars: Iterable[SidecarStatus], own: RevocationSet = NO_REVOCATIONS
+) -> admin_pb2.GetStatusResponse:
+    """Encode the status of all sidecars, without their tokens and credentials; `own` is of the control plane."""
+    return admin_pb2.GetStatusResponse(sidecars=map(_sidecar_to_proto, sidecars), revocations=revocations_to_proto(own))
 
 
 def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
@@ -58,6 +66,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         services=each(message.services, MAX_MAPPED_SERVICES, "services", service_mapping_from_proto),
         paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
         refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
+        revocations=revocations_from_proto(message.revocations),
     )
 
 
@@ -73,6 +82,7 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         services=map(service_mapping_to_proto, status.services),
         paths=map(path_to_proto, status.paths),
         refused_offers=status.refused_offers,
+        revocations=revocations_to_proto(status.revocations),
     )
 
 

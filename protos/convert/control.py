@@ -39,6 +39,7 @@ from protos.convert.types import (
     use_to_proto,
 )
 from protos.errors import DecodeError
+from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import (
     TOKEN_BYTES,
     Ack,
@@ -46,6 +47,7 @@ from protos.model import (
     ControlMessage,
     Drain,
     Heartbeat,
+    HeldList,
     MappingSet,
     Nack,
     PeerSet,
@@ -54,12 +56,16 @@ from protos.model import (
     RemovedPeer,
     Report,
     ResourceKind,
+    RevocationSet,
     ServiceSet,
     SidecarMessage,
     Welcome,
 )
 from protos.names import clean_text, domain_label, node_name, text
 from protos.plr.v1 import control_pb2
+
+MAX_WALL_S = 253_402_300_799
+"""The end of the year 9999, the last that a certificate can name (RFC 5280 section 4.1.2.5)."""
 
 _RESOURCES = {
     control_pb2.RESOURCE_KIND_PEERS: ResourceKind.PEERS,
@@ -124,8 +130,31 @@ def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMe
             return Heartbeat()
         case "drain":
             return Drain()
+        case "revocations":
+            return revocations_from_proto(message.revocations)
         case _:
             raise DecodeError("sidecar message of no known kind")
+
+
+def revocations_from_proto(message: control_pb2.Revocations) -> RevocationSet:
+    """Check which revocation lists somebody uses."""
+    lists = each(message.lists, MAX_CA_CERTIFICATES, "lists", _held_list_from_proto)
+    unique((one.ca for one in lists), "lists")
+    if message.too_old > MAX_CA_CERTIFICATES:
+        raise DecodeError(f"too_old is above {MAX_CA_CERTIFICATES}")
+    return RevocationSet(lists, message.too_old)
+
+
+def _held_list_from_proto(message: control_pb2.HeldList) -> HeldList:
+    if message.signed_at_s > MAX_WALL_S:
+        raise DecodeError("signed_at_s is beyond the year 9999")
+    return HeldList(message.ca, message.number, message.signed_at_s)
+
+
+def revocations_to_proto(value: RevocationSet) -> control_pb2.Revocations:
+    """Encode which revocation lists somebody uses."""
+    lists = [control_pb2.HeldList(ca=one.ca, number=one.number, signed_at_s=one.signed_at_s) for one in value.lists]
+    return control_pb2.Revocations(lists=lists, too_old=value.too_old)
 
 
 def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessage:
@@ -155,6 +184,8 @@ def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessag
             return control_pb2.SidecarMessage(heartbeat=control_pb2.Heartbeat())
         case Drain():
             return control_pb2.SidecarMessage(drain=control_pb2.Drain())
+        case RevocationSet():
+            return control_pb2.SidecarMessage(revocations=revocations_to_proto(value))
         case _:
             assert_never(value)
 

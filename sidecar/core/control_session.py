@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from protos.model import (
+    NO_REVOCATIONS,
     Ack,
     CandidateSet,
     Drain,
@@ -26,6 +27,7 @@ from protos.model import (
     PeerSet,
     Report,
     ResourceKind,
+    RevocationSet,
     ServiceSet,
     Version,
     Welcome,
@@ -119,6 +121,7 @@ class ControlSession:
         self._backoff = Backoff(rng, first_s=RETRY_FIRST_S, max_s=RETRY_MAX_S)
         self._candidates = CandidateSet()
         self._services = ServiceSet()
+        self._revocations = NO_REVOCATIONS
         self._draining = False
         self.refused: Apply | None = None
         """The newest mapping, if it could not be put in force: it may fit when interfaces or peers are others."""
@@ -137,6 +140,7 @@ class ControlSession:
         self._register_due = False
         self._candidates_due = False
         self._services_due = False
+        self._revocations_due = False
         self._drain_due = False
         self._heartbeat_due = False
         self._answers: dict[ResourceKind, Ack | Nack] = {}
@@ -171,6 +175,7 @@ class ControlSession:
         self._register_due = True
         self._candidates_due = True
         self._services_due = True
+        self._revocations_due = self._revocations != NO_REVOCATIONS
         self._drain_due = self._draining
 
     def closed(self, now: float, *, refused: bool = False, moved: bool = False) -> float:
@@ -285,6 +290,12 @@ class ControlSession:
             self._services = services
             self._services_due = self.state is not ControlState.OFFLINE
 
+    def set_revocations(self, held: RevocationSet) -> None:
+        """Replace what is said of the revocation lists in use."""
+        if held != self._revocations:
+            self._revocations = held
+            self._revocations_due = self.state is not ControlState.OFFLINE
+
     def drain(self) -> None:
         """Say goodbye, on this stream and on later ones."""
         if not self._draining:
@@ -337,6 +348,8 @@ class ControlSession:
             messages.append(self._candidates)
         if self._services_due:
             messages.append(self._services)
+        if self._revocations_due:
+            messages.append(self._revocations)
         messages += self._answers.values()
         if self._report is not None:
             messages.append(self._report)

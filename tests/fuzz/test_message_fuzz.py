@@ -17,6 +17,9 @@ from sidecar.core.messages import (
     RejectionMessage,
     RequestMessage,
     ResponseMessage,
+    RevocationLists,
+    RevocationsHeld,
+    RevocationsWanted,
     decode_message,
     encode_message,
 )
@@ -26,7 +29,11 @@ ids = st.binary(min_size=16, max_size=16).map(RequestId)
 u8, u32 = st.integers(0, 255), st.integers(0, 2**32 - 1)
 names = st.text(st.characters(codec="utf-8"), max_size=60)
 payloads = st.binary(max_size=200)
+u64 = st.integers(0, 2**64 - 1)
 messages = st.one_of(
+    st.builds(RevocationsHeld, st.dictionaries(u64, u64, max_size=16)),
+    st.builds(RevocationsWanted, st.dictionaries(u64, u64, max_size=16)),
+    st.builds(RevocationLists, payloads),
     st.builds(
         RequestMessage,
         ids,
@@ -42,7 +49,7 @@ messages = st.one_of(
     st.builds(RejectionMessage, ids, u8, st.sampled_from(RejectReason), names),
     st.builds(CancelMessage, ids),
 )
-framed = st.builds(lambda kind, rest: bytes([kind]) + rest, st.integers(0, 6), st.binary(max_size=400))
+framed = st.builds(lambda kind, rest: bytes([kind]) + rest, st.integers(0, 8), st.binary(max_size=400))
 
 
 @given(messages)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.ca import Authority, Validity
+from controlplane.ca.files import write_atomically
 from protos.identity import CertificateError, IdentityRole
 from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, Welcome
 from protos.tls_files import TlsWatch, load_tls_files
@@ -19,6 +20,7 @@ from sidecar import control_client
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
+from tests.free_ports import free_port
 from tests.integration.control_plane_process import (
     PATIENCE_S,
     ControlPlaneProcess,
@@ -116,6 +118,33 @@ def test_a_renewed_certificate_is_shown_on_a_new_stream(
             assert robot.connection.get(timeout=PATIENCE_S) == (False, "new certificate files")
             assert robot.connection.get(timeout=PATIENCE_S) == (True, "registered")
             assert robot.session.version(ResourceKind.PEERS) >= first.version
+
+
+@pytest.mark.audit("sec-12")
+def test_new_files_count_while_no_control_plane_is_there(
+    plane: SecuredControlPlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also between two attempts to reach it, which may be long."""
+    monkeypatch.setattr(control_client, "LOOK_INTERVAL_S", 0.05)
+    folder = tmp_path / "tls"
+    plane.authority.write_tls_dir(folder, "robot-6", IdentityRole.ROBOT)
+    robot = Robot(f"127.0.0.1:{free_port()}", folder, "robot-6")
+    closed = robot.session.closed
+
+    def give_up(now: float, *, refused: bool = False, moved: bool = False) -> float:
+        closed(now, refused=refused, moved=moved)
+        robot.session._retry_at = now + HOUR_S
+        return HOUR_S
+
+    monkeypatch.setattr(robot.session, "closed", give_up)
+    monkeypatch.setattr(robot.session, "network_changed", lambda _now: None)
+    with robot:
+        while robot.client.last_failure is None:
+            time.sleep(0.05)
+        time.sleep(0.2)
+        plane.authority.publish()
+        write_atomically(folder / "crl.pem", plane.authority.crl_pem(), 0o644)
+        assert robot.files.get(timeout=PATIENCE_S).crl_pem == plane.authority.crl_pem()
 
 
 def test_sidecars_are_told_what_is_revoked(plane: SecuredControlPlane, tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ class Keeper:
         self.tls = TlsWatch(load_tls_files(self.folder))
         self.kept = b""
         self.judged = 0
-        self.revocations = Revocations(self.tls, self, self._keep, max_age_s)
+        self.revocations = Revocations(self.tls, self, self._keep, lambda _: None, max_age_s)
 
         def judge(credential: SessionCredential) -> float:
             check = self.tls.current.trust.check

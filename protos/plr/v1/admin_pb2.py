@@ -26,43 +26,43 @@ from protos.plr.v1 import types_pb2 as protos_dot_plr_dot_v1_dot_types__pb2
 from protos.plr.v1 import control_pb2 as protos_dot_plr_dot_v1_dot_control__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19protos/plr/v1/admin.proto\x12\x06plr.v1\x1a\x19protos/plr/v1/types.proto\x1a\x1bprotos/plr/v1/control.proto\"\x12\n\x10GetStatusRequest\"n\n\x0eResourceStatus\x12\x14\n\x0cversion_sent\x18\x01 \x01(\x04\x12\x15\n\rversion_acked\x18\x02 \x01(\x04\x12 \n\x05state\x18\x03 \x01(\x0e\x32\x11.plr.v1.SyncState\x12\r\n\x05\x65rror\x18\x04 \x01(\t\"\xc6\x02\n\rSidecarStatus\x12\x1a\n\x04peer\x18\x01 \x01(\x0b\x32\x0c.plr.v1.Peer\x12\x11\n\tconnected\x18\x02 \x01(\x08\x12\x15\n\rlease_left_us\x18\x03 \x01(\x04\x12\x18\n\x10software_version\x18\x04 \x01(\t\x12 \n\x04uses\x18\x05 \x03(\x0b\x32\x12.plr.v1.ServiceUse\x12%\n\x05peers\x18\x06 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12\'\n\x07mapping\x18\x07 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12(\n\x08services\x18\x08 \x03(\x0b\x32\x16.plr.v1.ServiceMapping\x12!\n\x05paths\x18\t \x03(\x0b\x32\x12.plr.v1.PathReport\x12\x16\n\x0erefused_offers\x18\n \x03(\t\"<\n\x11GetStatusResponse\x12\'\n\x08sidecars\x18\x01 \x03(\x0b\x32\x15.plr.v1.SidecarStatus\"0\n\x0e\x45xplainRequest\x12\r\n\x05robot\x18\x01 \x01(\t\x12\x0f\n\x07service\x18\x02 \x01(\t\"1\n\x06\x42\x65lief\x12\x0c\n\x04mean\x18\x01 \x01(\x01\x12\x0b\n\x03low\x18\x02 \x01(\x01\x12\x0c\n\x04high\x18\x03 \x01(\x01\"\xff\x02\n\rExplainedPair\x12 \n\x04path\x18\x01 \x01(\x0b\x32\x12.plr.v1.Assignment\x12\x0e\n\x06\x63hosen\x18\x02 \x01(\x08\x12 \n\x05state\x18\x03 \x01(\x0e\x32\x11.plr.v1.PathState\x12\x1c\n\x04miss\x18\x04 \x01(\x0b\x32\x0e.plr.v1.Belief\x12\x10\n\x08requests\x18\x05 \x01(\x01\x12\x0e\n\x06probes\x18\x06 \x01(\x01\x12\x1e\n\x03rtt\x18\x07 \x01(\x0b\x32\x11.plr.v1.Histogram\x12\"\n\x07network\x18\x08 \x01(\x0b\x32\x11.plr.v1.Histogram\x12\"\n\x07\x63ompute\x18\t \x01(\x0b\x32\x11.plr.v1.Histogram\x12\x0f\n\x07\x63\x61rrier\x18\n \x01(\t\x12\x0e\n\x06region\x18\x0b \x01(\t\x12\x0e\n\x06\x62\x61rred\x18\x0c \x01(\x08\x12\x11\n\twitnesses\x18\r \x01(\r\x12\x17\n\x0f\x62usiest_witness\x18\x0e \x01(\t\x12\x15\n\rbusiest_share\x18\x0f \x01(\x01\"\xe1\x01\n\x0e\x45xplainedJoint\x12\x17\n\x0f\x66irst_interface\x18\x01 \x01(\t\x12\x18\n\x10second_interface\x18\x02 \x01(\t\x12\x0e\n\x06server\x18\x03 \x01(\t\x12\x10\n\x08requests\x18\x04 \x01(\x01\x12\x14\n\x0c\x66irst_missed\x18\x05 \x01(\x01\x12\x15\n\rsecond_missed\x18\x06 \x01(\x01\x12\x13\n\x0b\x62oth_missed\x18\x07 \x01(\x01\x12(\n\x0b\x63orrelation\x18\x08 \x01(\x0e\x32\x13.plr.v1.Correlation\x12\x0e\n\x06shared\x18\t \x03(\t\"\xb4\x01\n\x0b\x41lternative\x12%\n\x04kind\x18\x01 \x01(\x0e\x32\x17.plr.v1.AlternativeKind\x12\'\n\x0b\x61ssignments\x18\x02 \x03(\x0b\x32\x12.plr.v1.Assignment\x12\x16\n\x0epredicted_miss\x18\x03 \x01(\x01\x12\x0f\n\x07without\x18\x04 \x01(\t\x12\x0c\n\x04note\x18\x05 \x01(\t\x12\x13\n\x06\x63harge\x18\x06 \x01(\x01H\x00\x88\x01\x01\x42\t\n\x07_charge\"Y\n\rMappingChange\x12\x0e\n\x06\x61ge_us\x18\x01 \x01(\x04\x12\x0f\n\x07version\x18\x02 \x01(\x04\x12\'\n\x07mapping\x18\x03 \x01(\x0b\x32\x16.plr.v1.ServiceMapping\"\xb2\x04\n\x0f\x45xplainResponse\x12\r\n\x05robot\x18\x01 \x01(\t\x12\x0f\n\x07service\x18\x02 \x01(\t\x12\x13\n\x0b\x64\x65\x61\x64line_us\x18\x03 \x01(\x04\x12\x12\n\nidempotent\x18\x04 \x01(\x08\x12\x11\n\tobjective\x18\x05 \x01(\t\x12\'\n\x07mapping\x18\x06 \x01(\x0b\x32\x16.plr.v1.ServiceMapping\x12$\n\x04sync\x18\x07 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12\x18\n\x0bin_force_us\x18\x08 \x01(\x04H\x00\x88\x01\x01\x12\x1a\n\robserved_miss\x18\t \x01(\x01H\x01\x88\x01\x01\x12$\n\x05pairs\x18\n \x03(\x0b\x32\x15.plr.v1.ExplainedPair\x12\x16\n\x0epairs_left_out\x18\x0b \x01(\x04\x12&\n\x06joints\x18\x0c \x03(\x0b\x32\x16.plr.v1.ExplainedJoint\x12)\n\x0c\x61lternatives\x18\r \x03(\x0b\x32\x13.plr.v1.Alternative\x12&\n\x07\x63hanges\x18\x0e \x03(\x0b\x32\x15.plr.v1.MappingChange\x12\x13\n\x0btarget_miss\x18\x0f \x01(\x01\x12\x13\n\x06\x63harge\x18\x10 \x01(\x01H\x02\x88\x01\x01\x12\x1b\n\x0epredicted_miss\x18\x11 \x01(\x01H\x03\x88\x01\x01\x42\x0e\n\x0c_in_force_usB\x10\n\x0e_observed_missB\t\n\x07_chargeB\x11\n\x0f_predicted_miss*\x86\x01\n\tSyncState\x12\x1a\n\x16SYNC_STATE_UNSPECIFIED\x10\x00\x12\x17\n\x13SYNC_STATE_NOT_SENT\x10\x01\x12\x14\n\x10SYNC_STATE_STALE\x10\x02\x12\x15\n\x11SYNC_STATE_SYNCED\x10\x03\x12\x17\n\x13SYNC_STATE_REJECTED\x10\x04*g\n\tPathState\x12\x1a\n\x16PATH_STATE_UNSPECIFIED\x10\x00\x12\x11\n\rPATH_STATE_UP\x10\x01\x12\x13\n\x0fPATH_STATE_DOWN\x10\x02\x12\x16\n\x12PATH_STATE_UNKNOWN\x10\x03*y\n\x0b\x43orrelation\x12\x1b\n\x17\x43ORRELATION_UNSPECIFIED\x10\x00\x12\x18\n\x14\x43ORRELATION_TOGETHER\x10\x01\x12\x1b\n\x17\x43ORRELATION_INDEPENDENT\x10\x02\x12\x16\n\x12\x43ORRELATION_LIKELY\x10\x03*\x89\x01\n\x0f\x41lternativeKind\x12 \n\x1c\x41LTERNATIVE_KIND_UNSPECIFIED\x10\x00\x12\x1a\n\x16\x41LTERNATIVE_KIND_OTHER\x10\x01\x12\x1a\n\x16\x41LTERNATIVE_KIND_ALONE\x10\x02\x12\x1c\n\x18\x41LTERNATIVE_KIND_WITHOUT\x10\x03\x32\x85\x01\n\x05\x41\x64min\x12@\n\tGetStatus\x12\x18.plr.v1.GetStatusRequest\x1a\x19.plr.v1.GetStatusResponse\x12:\n\x07\x45xplain\x12\x16.plr.v1.ExplainRequest\x1a\x17.plr.v1.ExplainResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19protos/plr/v1/admin.proto\x12\x06plr.v1\x1a\x19protos/plr/v1/types.proto\x1a\x1bprotos/plr/v1/control.proto\"\x12\n\x10GetStatusRequest\"n\n\x0eResourceStatus\x12\x14\n\x0cversion_sent\x18\x01 \x01(\x04\x12\x15\n\rversion_acked\x18\x02 \x01(\x04\x12 \n\x05state\x18\x03 \x01(\x0e\x32\x11.plr.v1.SyncState\x12\r\n\x05\x65rror\x18\x04 \x01(\t\"\xf0\x02\n\rSidecarStatus\x12\x1a\n\x04peer\x18\x01 \x01(\x0b\x32\x0c.plr.v1.Peer\x12\x11\n\tconnected\x18\x02 \x01(\x08\x12\x15\n\rlease_left_us\x18\x03 \x01(\x04\x12\x18\n\x10software_version\x18\x04 \x01(\t\x12 \n\x04uses\x18\x05 \x03(\x0b\x32\x12.plr.v1.ServiceUse\x12%\n\x05peers\x18\x06 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12\'\n\x07mapping\x18\x07 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12(\n\x08services\x18\x08 \x03(\x0b\x32\x16.plr.v1.ServiceMapping\x12!\n\x05paths\x18\t \x03(\x0b\x32\x12.plr.v1.PathReport\x12\x16\n\x0erefused_offers\x18\n \x03(\t\x12(\n\x0brevocations\x18\x0b \x01(\x0b\x32\x13.plr.v1.Revocations\"f\n\x11GetStatusResponse\x12\'\n\x08sidecars\x18\x01 \x03(\x0b\x32\x15.plr.v1.SidecarStatus\x12(\n\x0brevocations\x18\x02 \x01(\x0b\x32\x13.plr.v1.Revocations\"0\n\x0e\x45xplainRequest\x12\r\n\x05robot\x18\x01 \x01(\t\x12\x0f\n\x07service\x18\x02 \x01(\t\"1\n\x06\x42\x65lief\x12\x0c\n\x04mean\x18\x01 \x01(\x01\x12\x0b\n\x03low\x18\x02 \x01(\x01\x12\x0c\n\x04high\x18\x03 \x01(\x01\"\xff\x02\n\rExplainedPair\x12 \n\x04path\x18\x01 \x01(\x0b\x32\x12.plr.v1.Assignment\x12\x0e\n\x06\x63hosen\x18\x02 \x01(\x08\x12 \n\x05state\x18\x03 \x01(\x0e\x32\x11.plr.v1.PathState\x12\x1c\n\x04miss\x18\x04 \x01(\x0b\x32\x0e.plr.v1.Belief\x12\x10\n\x08requests\x18\x05 \x01(\x01\x12\x0e\n\x06probes\x18\x06 \x01(\x01\x12\x1e\n\x03rtt\x18\x07 \x01(\x0b\x32\x11.plr.v1.Histogram\x12\"\n\x07network\x18\x08 \x01(\x0b\x32\x11.plr.v1.Histogram\x12\"\n\x07\x63ompute\x18\t \x01(\x0b\x32\x11.plr.v1.Histogram\x12\x0f\n\x07\x63\x61rrier\x18\n \x01(\t\x12\x0e\n\x06region\x18\x0b \x01(\t\x12\x0e\n\x06\x62\x61rred\x18\x0c \x01(\x08\x12\x11\n\twitnesses\x18\r \x01(\r\x12\x17\n\x0f\x62usiest_witness\x18\x0e \x01(\t\x12\x15\n\rbusiest_share\x18\x0f \x01(\x01\"\xe1\x01\n\x0e\x45xplainedJoint\x12\x17\n\x0f\x66irst_interface\x18\x01 \x01(\t\x12\x18\n\x10second_interface\x18\x02 \x01(\t\x12\x0e\n\x06server\x18\x03 \x01(\t\x12\x10\n\x08requests\x18\x04 \x01(\x01\x12\x14\n\x0c\x66irst_missed\x18\x05 \x01(\x01\x12\x15\n\rsecond_missed\x18\x06 \x01(\x01\x12\x13\n\x0b\x62oth_missed\x18\x07 \x01(\x01\x12(\n\x0b\x63orrelation\x18\x08 \x01(\x0e\x32\x13.plr.v1.Correlation\x12\x0e\n\x06shared\x18\t \x03(\t\"\xb4\x01\n\x0b\x41lternative\x12%\n\x04kind\x18\x01 \x01(\x0e\x32\x17.plr.v1.AlternativeKind\x12\'\n\x0b\x61ssignments\x18\x02 \x03(\x0b\x32\x12.plr.v1.Assignment\x12\x16\n\x0epredicted_miss\x18\x03 \x01(\x01\x12\x0f\n\x07without\x18\x04 \x01(\t\x12\x0c\n\x04note\x18\x05 \x01(\t\x12\x13\n\x06\x63harge\x18\x06 \x01(\x01H\x00\x88\x01\x01\x42\t\n\x07_charge\"Y\n\rMappingChange\x12\x0e\n\x06\x61ge_us\x18\x01 \x01(\x04\x12\x0f\n\x07version\x18\x02 \x01(\x04\x12\'\n\x07mapping\x18\x03 \x01(\x0b\x32\x16.plr.v1.ServiceMapping\"\xb2\x04\n\x0f\x45xplainResponse\x12\r\n\x05robot\x18\x01 \x01(\t\x12\x0f\n\x07service\x18\x02 \x01(\t\x12\x13\n\x0b\x64\x65\x61\x64line_us\x18\x03 \x01(\x04\x12\x12\n\nidempotent\x18\x04 \x01(\x08\x12\x11\n\tobjective\x18\x05 \x01(\t\x12\'\n\x07mapping\x18\x06 \x01(\x0b\x32\x16.plr.v1.ServiceMapping\x12$\n\x04sync\x18\x07 \x01(\x0b\x32\x16.plr.v1.ResourceStatus\x12\x18\n\x0bin_force_us\x18\x08 \x01(\x04H\x00\x88\x01\x01\x12\x1a\n\robserved_miss\x18\t \x01(\x01H\x01\x88\x01\x01\x12$\n\x05pairs\x18\n \x03(\x0b\x32\x15.plr.v1.ExplainedPair\x12\x16\n\x0epairs_left_out\x18\x0b \x01(\x04\x12&\n\x06joints\x18\x0c \x03(\x0b\x32\x16.plr.v1.ExplainedJoint\x12)\n\x0c\x61lternatives\x18\r \x03(\x0b\x32\x13.plr.v1.Alternative\x12&\n\x07\x63hanges\x18\x0e \x03(\x0b\x32\x15.plr.v1.MappingChange\x12\x13\n\x0btarget_miss\x18\x0f \x01(\x01\x12\x13\n\x06\x63harge\x18\x10 \x01(\x01H\x02\x88\x01\x01\x12\x1b\n\x0epredicted_miss\x18\x11 \x01(\x01H\x03\x88\x01\x01\x42\x0e\n\x0c_in_force_usB\x10\n\x0e_observed_missB\t\n\x07_chargeB\x11\n\x0f_predicted_miss*\x86\x01\n\tSyncState\x12\x1a\n\x16SYNC_STATE_UNSPECIFIED\x10\x00\x12\x17\n\x13SYNC_STATE_NOT_SENT\x10\x01\x12\x14\n\x10SYNC_STATE_STALE\x10\x02\x12\x15\n\x11SYNC_STATE_SYNCED\x10\x03\x12\x17\n\x13SYNC_STATE_REJECTED\x10\x04*g\n\tPathState\x12\x1a\n\x16PATH_STATE_UNSPECIFIED\x10\x00\x12\x11\n\rPATH_STATE_UP\x10\x01\x12\x13\n\x0fPATH_STATE_DOWN\x10\x02\x12\x16\n\x12PATH_STATE_UNKNOWN\x10\x03*y\n\x0b\x43orrelation\x12\x1b\n\x17\x43ORRELATION_UNSPECIFIED\x10\x00\x12\x18\n\x14\x43ORRELATION_TOGETHER\x10\x01\x12\x1b\n\x17\x43ORRELATION_INDEPENDENT\x10\x02\x12\x16\n\x12\x43ORRELATION_LIKELY\x10\x03*\x89\x01\n\x0f\x41lternativeKind\x12 \n\x1c\x41LTERNATIVE_KIND_UNSPECIFIED\x10\x00\x12\x1a\n\x16\x41LTERNATIVE_KIND_OTHER\x10\x01\x12\x1a\n\x16\x41LTERNATIVE_KIND_ALONE\x10\x02\x12\x1c\n\x18\x41LTERNATIVE_KIND_WITHOUT\x10\x03\x32\x85\x01\n\x05\x41\x64min\x12@\n\tGetStatus\x12\x18.plr.v1.GetStatusRequest\x1a\x19.plr.v1.GetStatusResponse\x12:\n\x07\x45xplain\x12\x16.plr.v1.ExplainRequest\x1a\x17.plr.v1.ExplainResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'protos.plr.v1.admin_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_SYNCSTATE']._serialized_start=2171
-  _globals['_SYNCSTATE']._serialized_end=2305
-  _globals['_PATHSTATE']._serialized_start=2307
-  _globals['_PATHSTATE']._serialized_end=2410
-  _globals['_CORRELATION']._serialized_start=2412
-  _globals['_CORRELATION']._serialized_end=2533
-  _globals['_ALTERNATIVEKIND']._serialized_start=2536
-  _globals['_ALTERNATIVEKIND']._serialized_end=2673
+  _globals['_SYNCSTATE']._serialized_start=2255
+  _globals['_SYNCSTATE']._serialized_end=2389
+  _globals['_PATHSTATE']._serialized_start=2391
+  _globals['_PATHSTATE']._serialized_end=2494
+  _globals['_CORRELATION']._serialized_start=2496
+  _globals['_CORRELATION']._serialized_end=2617
+  _globals['_ALTERNATIVEKIND']._serialized_start=2620
+  _globals['_ALTERNATIVEKIND']._serialized_end=2757
   _globals['_GETSTATUSREQUEST']._serialized_start=93
   _globals['_GETSTATUSREQUEST']._serialized_end=111
   _globals['_RESOURCESTATUS']._serialized_start=113
   _globals['_RESOURCESTATUS']._serialized_end=223
   _globals['_SIDECARSTATUS']._serialized_start=226
-  _globals['_SIDECARSTATUS']._serialized_end=552
-  _globals['_GETSTATUSRESPONSE']._serialized_start=554
-  _globals['_GETSTATUSRESPONSE']._serialized_end=614
-  _globals['_EXPLAINREQUEST']._serialized_start=616
-  _globals['_EXPLAINREQUEST']._serialized_end=664
-  _globals['_BELIEF']._serialized_start=666
-  _globals['_BELIEF']._serialized_end=715
-  _globals['_EXPLAINEDPAIR']._serialized_start=718
-  _globals['_EXPLAINEDPAIR']._serialized_end=1101
-  _globals['_EXPLAINEDJOINT']._serialized_start=1104
-  _globals['_EXPLAINEDJOINT']._serialized_end=1329
-  _globals['_ALTERNATIVE']._serialized_start=1332
-  _globals['_ALTERNATIVE']._serialized_end=1512
-  _globals['_MAPPINGCHANGE']._serialized_start=1514
-  _globals['_MAPPINGCHANGE']._serialized_end=1603
-  _globals['_EXPLAINRESPONSE']._serialized_start=1606
-  _globals['_EXPLAINRESPONSE']._serialized_end=2168
-  _globals['_ADMIN']._serialized_start=2676
-  _globals['_ADMIN']._serialized_end=2809
+  _globals['_SIDECARSTATUS']._serialized_end=594
+  _globals['_GETSTATUSRESPONSE']._serialized_start=596
+  _globals['_GETSTATUSRESPONSE']._serialized_end=698
+  _globals['_EXPLAINREQUEST']._serialized_start=700
+  _globals['_EXPLAINREQUEST']._serialized_end=748
+  _globals['_BELIEF']._serialized_start=750
+  _globals['_BELIEF']._serialized_end=799
+  _globals['_EXPLAINEDPAIR']._serialized_start=802
+  _globals['_EXPLAINEDPAIR']._serialized_end=1185
+  _globals['_EXPLAINEDJOINT']._serialized_start=1188
+  _globals['_EXPLAINEDJOINT']._serialized_end=1413
+  _globals['_ALTERNATIVE']._serialized_start=1416
+  _globals['_ALTERNATIVE']._serialized_end=1596
+  _globals['_MAPPINGCHANGE']._serialized_start=1598
+  _globals['_MAPPINGCHANGE']._serialized_end=1687
+  _globals['_EXPLAINRESPONSE']._serialized_start=1690
+  _globals['_EXPLAINRESPONSE']._serialized_end=2252
+  _globals['_ADMIN']._serialized_start=2760
+  _globals['_ADMIN']._serialized_end=2893
 # @@protoc_insertion_point(module_scope)

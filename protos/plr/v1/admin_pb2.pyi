@@ -170,6 +170,7 @@ class SidecarStatus(_message.Message):
     SERVICES_FIELD_NUMBER: _builtins.int
     PATHS_FIELD_NUMBER: _builtins.int
     REFUSED_OFFERS_FIELD_NUMBER: _builtins.int
+    REVOCATIONS_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
@@ -191,6 +192,8 @@ class SidecarStatus(_message.Message):
     def refused_offers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Clouds: services it offers and the policy does not let it; no robot hears of them."""
 
+    @_builtins.property
+    def revocations(self) -> _control_pb2.Revocations: ...
     def __init__(
         self,
         *,
@@ -204,10 +207,11 @@ class SidecarStatus(_message.Message):
         services: _abc.Iterable[_control_pb2.ServiceMapping] | None = ...,
         paths: _abc.Iterable[_control_pb2.PathReport] | None = ...,
         refused_offers: _abc.Iterable[_builtins.str] | None = ...,
+        revocations: _control_pb2.Revocations | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "services", b"services", "software_version", b"software_version", "uses", b"uses"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "uses", b"uses"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -218,16 +222,22 @@ class GetStatusResponse(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     SIDECARS_FIELD_NUMBER: _builtins.int
+    REVOCATIONS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def sidecars(self) -> _containers.RepeatedCompositeFieldContainer[Global___SidecarStatus]: ...
+    @_builtins.property
+    def revocations(self) -> _control_pb2.Revocations:
+        """The control plane's own."""
+
     def __init__(
         self,
         *,
         sidecars: _abc.Iterable[Global___SidecarStatus] | None = ...,
+        revocations: _control_pb2.Revocations | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["sidecars", b"sidecars"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["revocations", b"revocations", "sidecars", b"sidecars"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -82,6 +82,7 @@ class SidecarMessage(_message.Message):
     NACK_FIELD_NUMBER: _builtins.int
     HEARTBEAT_FIELD_NUMBER: _builtins.int
     DRAIN_FIELD_NUMBER: _builtins.int
+    REVOCATIONS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def register(self) -> Global___Register:
         """The first message, once."""
@@ -108,6 +109,10 @@ class SidecarMessage(_message.Message):
     def drain(self) -> Global___Drain:
         """The sidecar finishes what is in flight and goes."""
 
+    @_builtins.property
+    def revocations(self) -> Global___Revocations:
+        """Which revocation lists it uses: for the operator's eyes."""
+
     def __init__(
         self,
         *,
@@ -119,12 +124,13 @@ class SidecarMessage(_message.Message):
         nack: Global___Nack | None = ...,
         heartbeat: Global___Heartbeat | None = ...,
         drain: Global___Drain | None = ...,
+        revocations: Global___Revocations | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "candidates", b"candidates", "drain", b"drain", "heartbeat", b"heartbeat", "kind", b"kind", "nack", b"nack", "register", b"register", "report", b"report", "services", b"services"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "candidates", b"candidates", "drain", b"drain", "heartbeat", b"heartbeat", "kind", b"kind", "nack", b"nack", "register", b"register", "report", b"report", "revocations", b"revocations", "services", b"services"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "candidates", b"candidates", "drain", b"drain", "heartbeat", b"heartbeat", "kind", b"kind", "nack", b"nack", "register", b"register", "report", b"report", "services", b"services"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "candidates", b"candidates", "drain", b"drain", "heartbeat", b"heartbeat", "kind", b"kind", "nack", b"nack", "register", b"register", "report", b"report", "revocations", b"revocations", "services", b"services"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_kind: _TypeAlias = _typing.Literal["register", "candidates", "services", "report", "ack", "nack", "heartbeat", "drain"]  # noqa: Y015
+    _WhichOneofReturnType_kind: _TypeAlias = _typing.Literal["register", "candidates", "services", "report", "ack", "nack", "heartbeat", "drain", "revocations"]  # noqa: Y015
     _WhichOneofArgType_kind: _TypeAlias = _typing.Literal["kind", b"kind"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_kind) -> _WhichOneofReturnType_kind | None: ...
 
@@ -579,6 +585,59 @@ class Drain(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Drain: _TypeAlias = Drain  # noqa: Y015
+
+@_typing.final
+class HeldList(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CA_FIELD_NUMBER: _builtins.int
+    NUMBER_FIELD_NUMBER: _builtins.int
+    SIGNED_AT_S_FIELD_NUMBER: _builtins.int
+    ca: _builtins.int
+    """The first 64 bits of the SHA-256 of the CA's certificate."""
+    number: _builtins.int
+    signed_at_s: _builtins.int
+    """Seconds since 1970."""
+    def __init__(
+        self,
+        *,
+        ca: _builtins.int = ...,
+        number: _builtins.int = ...,
+        signed_at_s: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["ca", b"ca", "number", b"number", "signed_at_s", b"signed_at_s"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___HeldList: _TypeAlias = HeldList  # noqa: Y015
+
+@_typing.final
+class Revocations(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    LISTS_FIELD_NUMBER: _builtins.int
+    TOO_OLD_FIELD_NUMBER: _builtins.int
+    too_old: _builtins.int
+    """CAs whose list is older than the sidecar's max_revocation_age_s: it does not talk to their nodes."""
+    @_builtins.property
+    def lists(self) -> _containers.RepeatedCompositeFieldContainer[Global___HeldList]:
+        """The newest of each CA that has one."""
+
+    def __init__(
+        self,
+        *,
+        lists: _abc.Iterable[Global___HeldList] | None = ...,
+        too_old: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["lists", b"lists", "too_old", b"too_old"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Revocations: _TypeAlias = Revocations  # noqa: Y015
 
 @_typing.final
 class ControlMessage(_message.Message):

@@ -7,10 +7,12 @@ from dataclasses import replace
 from controlplane.status_table import render
 from protos.model import (
     Assignment,
+    HeldList,
     InterfaceName,
     NodeName,
     PathReport,
     Peer,
+    RevocationSet,
     Role,
     ServiceMapping,
     ServiceName,
@@ -85,3 +87,14 @@ def test_refused_offers_are_shown() -> None:
     peer = Peer(NodeName("cloud-a"), Role.CLOUD, SessionId(2), b"", 1, offers=(offer(), offer("/secret")))
     cloud = SidecarStatus(peer, True, 1.0, "", refused_offers=(ServiceName("/secret"),))
     assert "REFUSED by the policy: /secret (offered here, told to no robot)" in render([cloud])
+
+
+def test_who_lacks_a_revocation_is_seen() -> None:
+    peer = Peer(NodeName("robot"), Role.ROBOT, SessionId(1), b"", 1)
+    held = RevocationSet((HeldList(5, 11, 1000),), too_old=1)
+    status = SidecarStatus(peer, True, 1.0, "", revocations=held)
+    text = render([status], RevocationSet((HeldList(5, 12, 87_400),)), 87_400.0 + 8640.0)
+    assert text.splitlines()[0] == "control plane: revocation list 12, signed 0.1 days ago"
+    assert "revocation list 11, signed 1.1 days ago: OLDER than 12, which others have" in text
+    assert "REVOCATION LIST TOO OLD of 1 CAs: talks to none of their nodes; do: plr ca publish" in text
+    assert "signed 1000 s FROM NOW: a clock is wrong" in render([status], now_wall=0.0)

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from hypothesis import strategies as st
 
+from protos.convert.control import MAX_WALL_S
 from protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS, MAX_VERSION
 from protos.explanation import (
     Alternative,
@@ -36,6 +37,7 @@ from protos.model import (
     ControlMessage,
     Drain,
     Heartbeat,
+    HeldList,
     InterfaceId,
     InterfaceJointReport,
     InterfaceName,
@@ -53,6 +55,7 @@ from protos.model import (
     RemovedPeer,
     Report,
     ResourceKind,
+    RevocationSet,
     Role,
     ServiceMapping,
     ServiceName,
@@ -251,6 +254,13 @@ def peer_sets(draw: st.DrawFn) -> PeerSet:
     return PeerSet(draw(versions), draw(uint64), present, removed, draw(uint64))
 
 
+revocation_sets = st.builds(
+    RevocationSet,
+    st.lists(
+        st.builds(HeldList, uint64, uint64, st.integers(0, MAX_WALL_S)), max_size=16, unique_by=lambda one: one.ca
+    ).map(tuple),
+    st.integers(0, 16),
+)
 sidecar_messages: st.SearchStrategy[SidecarMessage] = st.one_of(
     registrations,
     candidate_sets(),
@@ -260,6 +270,7 @@ sidecar_messages: st.SearchStrategy[SidecarMessage] = st.one_of(
     st.builds(Nack, st.sampled_from(ResourceKind), versions, uint64, texts),
     st.just(Heartbeat()),
     st.just(Drain()),
+    revocation_sets,
 )
 control_messages: st.SearchStrategy[ControlMessage] = st.one_of(welcomes, peer_sets(), mapping_sets)
 resource_statuses = st.builds(ResourceStatus, versions, versions, st.sampled_from(SyncState), texts)
@@ -275,6 +286,7 @@ statuses = st.builds(
     _tuples(service_mappings()),
     _tuples(paths),
     _tuples(service_names),
+    revocation_sets,
 )
 
 beliefs = st.tuples(probabilities, probabilities, probabilities).map(lambda three: Belief(three[0], *sorted(three[1:])))

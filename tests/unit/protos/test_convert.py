@@ -14,6 +14,7 @@ from protos.convert import (
     control_message_to_proto,
     explanation_from_proto,
     explanation_to_proto,
+    own_revocations_from_proto,
     parse_control_message,
     parse_sidecar_message,
     peer_from_proto,
@@ -40,6 +41,7 @@ from protos.model import (
     NodeName,
     Peer,
     ResourceKind,
+    RevocationSet,
     Role,
     SessionId,
     SidecarMessage,
@@ -69,10 +71,12 @@ def test_control_messages_round_trip(value: ControlMessage) -> None:
     assert parse_control_message(control_message_to_proto(value).SerializeToString()) == value
 
 
-@given(st.lists(some.statuses, max_size=3))
+@given(st.lists(some.statuses, max_size=3), some.revocation_sets)
 @settings(max_examples=30)
-def test_statuses_round_trip(statuses: list[SidecarStatus]) -> None:
-    assert status_from_proto(status_to_proto(statuses)) == tuple(statuses)
+def test_statuses_round_trip(statuses: list[SidecarStatus], own: RevocationSet) -> None:
+    message = status_to_proto(statuses, own)
+    assert status_from_proto(message) == tuple(statuses)
+    assert own_revocations_from_proto(message) == own
 
 
 @given(some.explanations)

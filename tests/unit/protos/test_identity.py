@@ -271,3 +271,52 @@ def test_older_and_missing_lists_are_told_from_newer_ones() -> None:
     assert Trust(ca.ca_pem, before).forgets(both)
     ca.retire()
     assert not Trust(ca.ca_pem, ca.crl_pem()).forgets(both), "of a CA that is no longer believed nothing is needed"
+
+
+def test_further_lists_take_nothing_back() -> None:
+    ca, other = authority(), authority()
+    der = ca.issue("robot-1", IdentityRole.ROBOT).certificate_der
+    before = ca.crl_pem()
+    ca.revoke("robot-1")
+    trust = Trust(ca.ca_pem + other.ca_pem, ca.crl_pem())
+    wider = trust.with_revocations(before + other.crl_pem())
+    assert reason(der, wider) == "revoked"
+    assert [one and one.number for one in trust.lists().values()] == [1, None]
+    assert [one and one.number for one in wider.lists().values()] == [1, 0]
+    assert Trust(ca.ca_pem + other.ca_pem, wider.crl_pem()).lists() == wider.lists()
+    with pytest.raises(CertificateError):
+        trust.with_revocations(authority().crl_pem())
+
+
+def test_lists_without_end_are_not_looked_at() -> None:
+    with pytest.raises(CertificateError, match="more than 64 revocation lists"):
+        Trust(CA.ca_pem, CA.crl_pem() * 65)
+
+
+def test_a_certificate_needs_a_list_that_is_new_enough_if_that_is_asked_for() -> None:
+    clock = [NOW]
+    ca, other = Authority.create(clock=lambda: clock[0]), authority("other")
+    der = ca.issue("robot-1", IdentityRole.ROBOT).certificate_der
+    ca.publish()
+    both = Trust(ca.ca_pem + other.ca_pem, ca.crl_pem())
+    both.check(der, NOW + 60.0, 60.0)
+    with pytest.raises(CertificateError) as caught:
+        both.check(der, NOW + 61.0, 60.0)
+    assert caught.value.reason == "list_too_old"
+    with pytest.raises(CertificateError, match="is not here"):
+        both.check(other.issue("robot-1", IdentityRole.ROBOT).certificate_der, NOW, 60.0)
+    assert len(both.too_old(NOW, 60.0)) == 1
+    assert len(both.too_old(NOW + 61.0, 60.0)) == 2
+    assert not both.too_old(NOW + 1e9, float("inf")) - both.too_old(NOW, 60.0)
+    clock[0] = NOW + 100.0
+    ca.publish()
+    both.with_revocations(ca.crl_pem()).check(der, NOW + 150.0, 60.0)
+
+
+def test_a_list_of_a_clock_that_is_ahead_is_believed() -> None:
+    ahead = Authority.create(clock=lambda: NOW)
+    der = ahead.issue("robot-1", IdentityRole.ROBOT).certificate_der
+    ahead._clock = lambda: NOW + 3600.0
+    ahead.revoke("robot-1")
+    with pytest.raises(CertificateError, match="revoked"):
+        Trust(ahead.ca_pem, ahead.crl_pem()).check(der, NOW, 60.0)

@@ -75,6 +75,28 @@ def test_a_revoked_node_is_in_the_list_that_is_to_be_copied(shell: Shell, tmp_pa
         control_plane.trust.check(robot.certificate_der, robot.identity.not_before)
 
 
+def test_a_published_list_is_newer_and_says_the_same(shell: Shell, tmp_path: Path) -> None:
+    shell("init")
+    shell("issue", "robot-1", "--role", "robot")
+    shell("issue", "robot-2", "--role", "robot")
+    shell("revoke", "robot-1")
+    before = load_tls_files(tmp_path / "plr-ca/nodes/robot-2").trust
+    assert "plr-ca/crl.pem" in shell("publish")
+    after = load_tls_files(tmp_path / "plr-ca/nodes/robot-2").trust
+    (old,), (new,) = before.lists().values(), after.lists().values()
+    assert old is not None
+    assert new is not None
+    assert new.number == old.number + 1
+    assert new.signed_at >= old.signed_at
+    robot = load_tls_files(tmp_path / "plr-ca/nodes/robot-1")
+    with pytest.raises(CertificateError, match="revoked"):
+        after.check(robot.certificate_der, robot.identity.not_before)
+    shell("revoke", "robot-2")
+    (last,) = load_tls_files(tmp_path / "plr-ca/nodes/robot-1").trust.lists().values()
+    assert last is not None
+    assert last.number == new.number + 1
+
+
 def test_the_list_shows_everything(shell: Shell) -> None:
     shell("init", "--name", "warehouse")
     shell("issue", "robot-2", "--role", "robot", "--days", "30")
@@ -174,7 +196,7 @@ def test_the_commands_of_the_page_work_in_their_order(shell: Shell) -> None:
     page = Path(__file__).parents[4] / "docs" / "certificates.md"
     commands = re.findall(r"^ *plr ca (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     assert {command.split()[0] for command in commands} == {
-        *("init", "issue", "list", "renew", "revoke", "rotate", "retire")
+        *("init", "issue", "list", "publish", "renew", "revoke", "rotate", "retire")
     }
     for command in commands:
         shell(*command.split())

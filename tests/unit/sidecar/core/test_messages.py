@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from protos.convert.fields import MAX_CRL_BYTES
 from protos.errors import DecodeError
 from protos.model import ServiceName
 from sidecar.core.events import RejectReason, RequestId
@@ -13,6 +14,9 @@ from sidecar.core.messages import (
     RejectionMessage,
     RequestMessage,
     ResponseMessage,
+    RevocationLists,
+    RevocationsHeld,
+    RevocationsWanted,
     decode_message,
     encode_message,
 )
@@ -30,6 +34,9 @@ GOLDENS: dict[str, tuple[Message, str]] = {
         "03" + ID.hex() + "00 04 0004 66756c6c",
     ),
     "cancel": (CancelMessage(ID), "04" + ID.hex() + "00"),
+    "held": (RevocationsHeld({1: 7, 2: 2**70}), "05 02 0000000000000001 0000000000000007 0000000000000002" + "ff" * 8),
+    "wanted": (RevocationsWanted({}), "06 00"),
+    "lists": (RevocationLists(b"PEM"), "07 50454d"),
 }
 
 
@@ -38,13 +45,15 @@ def test_the_bytes_of_each_message(kind: str) -> None:
     message, golden = GOLDENS[kind]
     encoded = b"".join(encode_message(message))
     assert encoded == bytes.fromhex(golden)
+    if kind == "held":  # a number too long is told as the largest
+        message = RevocationsHeld({1: 7, 2: 2**64 - 1})
     assert decode_message(memoryview(encoded)) == message
 
 
 @pytest.mark.parametrize("kind", GOLDENS)
 def test_a_message_cut_within_its_head_is_refused(kind: str) -> None:
     encoded = b"".join(encode_message(GOLDENS[kind][0]))
-    head = len(encoded) - (3 if kind in ("request", "response") else 0)
+    head = len(encoded) - (3 if kind in ("request", "response", "lists") else 0)
     for length in range(head):
         with pytest.raises(DecodeError):
             decode_message(memoryview(encoded[:length]))
@@ -52,7 +61,11 @@ def test_a_message_cut_within_its_head_is_refused(kind: str) -> None:
 
 def test_other_kinds_reasons_and_text_are_refused() -> None:
     for bad in (
-        "05" + ID.hex() + "00",
+        "08" + ID.hex() + "00",
+        "05" + "11" + 17 * 16 * "00",
+        "05" + "01" + 15 * "00",
+        "06" + "01" + 17 * "00",
+        "05",
         "03" + ID.hex() + "00 ff 0000",
         "01" + ID.hex() + "00 00 00000000 00000000 0001 ff 0000",
         "01" + ID.hex() + "00 03 00000000 00000000 0001 61 0000",
@@ -64,6 +77,13 @@ def test_other_kinds_reasons_and_text_are_refused() -> None:
 def test_a_payload_over_the_limit_is_refused() -> None:
     whole = b"".join(encode_message(ResponseMessage(ID, 0, 0.0, bytes(MAX_PAYLOAD_BYTES))))
     assert isinstance(decode_message(memoryview(whole)), ResponseMessage)
+    with pytest.raises(DecodeError, match="limit"):
+        decode_message(memoryview(whole + b"\0"))
+
+
+def test_lists_over_the_limit_are_refused() -> None:
+    whole = bytes((7,)) + bytes(MAX_CRL_BYTES)
+    assert isinstance(decode_message(memoryview(whole)), RevocationLists)
     with pytest.raises(DecodeError, match="limit"):
         decode_message(memoryview(whole + b"\0"))
 

@@ -1,14 +1,20 @@
-"""What both programs show of their revocation lists: number, age, and when the CA wants another to be there."""
+"""What both programs show of their revocation lists: in metrics, and in the status that an operator asks for."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
+from protos.model import HeldList, RevocationSet
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from protos.identity import RevocationList
+
+
+MAX_NUMBER = (1 << 64) - 1
+"""What a message holds; a list's number may be longer (RFC 5280 section 5.2.3)."""
 
 
 class RevocationGauge(NamedTuple):
@@ -38,3 +44,11 @@ def revocation_gauges(lists: Mapping[int, RevocationList | None], now_wall: floa
         "Until the time at which the list says that there is another.",
         {ca: one.next_at - now_wall for ca, one in known.items() if math.isfinite(one.next_at)},
     )
+
+
+def revocation_set(lists: Mapping[int, RevocationList | None], too_old: int = 0) -> RevocationSet:
+    """Return what to tell of these lists; `too_old`: how many CAs have one that is older than may be."""
+    held = [
+        HeldList(ca, min(one.number, MAX_NUMBER), int(one.signed_at)) for ca, one in lists.items() if one is not None
+    ]
+    return RevocationSet(tuple(held), too_old)
