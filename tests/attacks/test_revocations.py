@@ -16,15 +16,31 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(240), pytest.mark.audit("sec-12")]
 
-ROBOT_2 = "robot-2"
+ROBOT_2, ROBOT_3 = "robot-2", "robot-3"
 SOON_S = 30.0
-"""Telling, asking, sending and judging take some 3 s from a sidecar to the next: generous for a busy machine."""
+"""Telling, asking, sending and judging take about 1 s from a sidecar to the next: generous for a busy machine."""
 
 
 def numbers(world: World, host: str) -> list[float]:
     """The numbers of the revocation lists that a sidecar uses, one for each CA."""
     metrics = world.system.metrics(host)
     return [number for name, number in metrics.items() if name.startswith("plr_revocation_list_number")]
+
+
+def test_a_robot_that_demands_a_fresh_list_talks_to_nobody_without_one(world: World) -> None:
+    """The fleet's first list is as old as its CA, which begins five minutes in the past."""
+    system = world.system
+    robot = system.start_robot(SERVICES, name=ROBOT_3, host="robot_2", interfaces=["eth9"], max_revocation_age_s=120)
+    refused = re.compile(r"cloud-a is not talked to, whatever the control plane says: its CA's revocation list was")
+    system.wait("it to refuse its peers", lambda: refused.search(robot.log.read_text()) is not None)
+    assert "are older than max_revocation_age_s (120 s) by this clock" in robot.log.read_text()
+    assert world.counter("robot_2", "plr_revocation_lists_too_old") == 1
+    assert world.counter("robot_2", "plr_path_up") == 0
+    system.authority.publish()
+    write_atomically(world.tls_dir("control") / CRL_FILE, system.authority.crl_pem(), 0o644)
+    system.wait("its paths", lambda: world.counter("robot_2", "plr_path_up") == 2, SOON_S)
+    system.wait("it to say so", lambda: world.counter("robot_2", "plr_revocation_lists_too_old") == 0, SOON_S)
+    assert robot.terminate() == 0
 
 
 def test_a_list_that_one_cloud_is_given_revokes_at_all(world: World) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
@@ -191,12 +192,17 @@ def test_who_was_away_hears_of_it_when_a_path_comes_up(tmp_path: Path) -> None:
 
 
 def test_nothing_travels_where_all_hold_the_same(tmp_path: Path) -> None:
-    """A control plane tells all of them at once: the numbers travel, the lists do not."""
+    """A control plane tells all of them within a moment: the numbers travel, the lists do not."""
     fleet = Fleet(tmp_path, 5, 5)
     fleet.start()
     fleet.ca.revoke("robot-0")
-    for keeper in fleet.keepers.values():
+
+    def welcome(keeper: Keeper) -> None:
         assert keeper.revocations.take(fleet.ca.crl_pem(), "the control plane")
+        fleet.mesh.pump(keeper.node)
+
+    for keeper in fleet.keepers.values():
+        fleet.mesh.at(fleet.mesh.rng.uniform(0.0, 0.3), partial(welcome, keeper))
     fleet.mesh.run(60.0)
     assert all(not fleet.counted(name) for name in fleet.keepers)
 
