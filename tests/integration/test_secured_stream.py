@@ -15,6 +15,7 @@ from controlplane.ca import Authority, Validity
 from controlplane.ca.files import write_atomically
 from protos.identity import CertificateError, IdentityRole
 from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, Welcome
+from protos.revocation_views import revocation_set
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar import control_client
 from sidecar.control_client import ControlClient
@@ -205,6 +206,34 @@ def test_a_name_that_is_not_the_certificates_is_refused_in_words(plane: SecuredC
 def plr(*arguments: str) -> subprocess.CompletedProcess[str]:
     argv = [sys.executable, "-m", "controlplane.cli", *arguments]
     return subprocess.run(argv, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.audit("sec-12")
+def test_plr_status_shows_who_uses_which_revocation_list(plane: SecuredControlPlane, tmp_path: Path) -> None:
+    plane.authority.write_tls_dir(tmp_path / "bob", "bob", IdentityRole.OPERATOR)
+    plane.authority.write_tls_dir(tmp_path / "tls", "robot-8", IdentityRole.ROBOT)
+    plane.authority.publish()
+    plane.install("crl.pem", plane.authority.crl_pem())
+    trust = load_tls_files(tmp_path / "tls").trust
+    old, new = trust.lists(), trust.with_revocations(plane.authority.crl_pem()).lists()
+    ((was,), (now,)) = old.values(), new.values()
+    assert was is not None
+    assert now is not None
+
+    def shown() -> str:
+        return plr("status", "--address", plane.address, "--tls-dir", str(tmp_path / "bob")).stdout
+
+    with Robot(plane.address, tmp_path / "tls", "robot-8") as robot:
+        robot.client.set_revocations(revocation_set(old, too_old=1))
+        robot.welcomes.get(timeout=PATIENCE_S)
+        behind = f"revocation list {was.number}, signed 0.0 days ago: OLDER than {now.number}, which others have"
+        while behind not in (text := shown()):
+            assert f"control plane: revocation list {now.number}, signed 0.0 days ago" in text
+        assert "REVOCATION LIST TOO OLD of 1 CAs" in text
+        robot.client.set_revocations(revocation_set(new))
+        while behind in (text := shown()):
+            pass
+        assert text.count(f"revocation list {now.number}, signed") == 2
 
 
 def test_plr_asks_with_an_operators_certificate(plane: SecuredControlPlane, tmp_path: Path) -> None:
