@@ -41,7 +41,14 @@ from sidecar.state_file import (
     encode_identity,
     encode_last_good,
 )
-from sidecar.state_store import ADDRESSES_FILE, IDENTITY_FILE, LAST_GOOD_FILE, StateDirError, StateStore
+from sidecar.state_store import (
+    ADDRESSES_FILE,
+    IDENTITY_FILE,
+    LAST_GOOD_FILE,
+    REVOCATIONS_FILE,
+    StateDirError,
+    StateStore,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -142,6 +149,21 @@ def test_addresses_of_a_control_plane_are_found_under_the_names_that_are_configu
     store = StateStore(tmp_path, OWNER)
     assert store.control_addresses(names) == ()
     assert store.failures == {"control_addresses_refused": 1}
+    store.close()
+
+
+@pytest.mark.audit("sec-12")
+def test_revocation_lists_are_found_again_wherever_they_came_from(tmp_path: Path) -> None:
+    store = StateStore(tmp_path, OWNER)
+    assert store.revocations == b""
+    store.remember_revocations(b"PEM")
+    store = reopen(store, tmp_path)
+    assert store.revocations == b"PEM"
+    store.close()
+    (tmp_path / REVOCATIONS_FILE).write_bytes(b"spoilt")
+    store = StateStore(tmp_path, OWNER)
+    assert store.revocations == b""
+    assert store.failures == {"revocations_refused": 1}
     store.close()
 
 
