@@ -13,6 +13,7 @@ from controlplane.ca.files import write_atomically, write_tls_files
 from protos.identity import IdentityRole
 from protos.model import Role
 from protos.tls_files import CRL_FILE, TlsWatch, load_tls_files
+from sidecar.announcement import Announcer
 from sidecar.core.link_events import SetCredential
 from sidecar.core.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 from sidecar.core.priority import Priority
@@ -116,6 +117,8 @@ class Fleet:
 
     def certify(self, node: Node, certificate: bytes) -> None:
         node.own.renew(replace(node.own.credential, certificate=certificate))
+        files = load_tls_files(self.folder / node.name)
+        node.announcer = Announcer(node.session, lambda: files, lambda _: ())
         for link in node.links.values():
             link.execute(SetCredential(node.own.credential.encode()), node.now)
 
