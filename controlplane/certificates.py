@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
-import time
 from typing import TYPE_CHECKING, NoReturn
 
 from protos.convert.fields import MAX_CRL_BYTES
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from controlplane.loop import ControlLoop
     from controlplane.metrics import Metrics
     from controlplane.tls_gate import TlsGate
+    from protos.clock_floor import ClockFloor
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,9 @@ def load_own_files(directory: Path) -> TlsFiles:
 class CertificateKeeper:
     """Looks for new files and for the end of certificates, and tells the gate and the loop."""
 
-    def __init__(self, files: TlsFiles, gate: TlsGate, loop: ControlLoop, metrics: Metrics) -> None:
+    def __init__(self, files: TlsFiles, gate: TlsGate, loop: ControlLoop, metrics: Metrics, clock: ClockFloor) -> None:
+        """`clock` is the gate's too."""
+        self._clock = clock
         self._watch = TlsWatch(files)
         self._gate = gate
         self._loop = loop
@@ -51,7 +53,9 @@ class CertificateKeeper:
             files = self._watch.poll()
             if files is not None:
                 self._take(files)
-            now = time.time()
+            self._clock.note_lists(self._watch.current.trust)
+            self._clock.note(self._watch.current.identity.not_before)
+            now = self._clock.now()
             self._loop.end_expired(self._watch.current.trust, now)
             self._gate.end_expired(now)
             await asyncio.sleep(POLL_INTERVAL_S)
@@ -61,7 +65,7 @@ class CertificateKeeper:
             log.error("the new certificate is a %s's: the old one stays in use", files.identity.role.value)
             return
         # The streams first: who is revoked shall hear so from gRPC before the connection is cut.
-        self._loop.review(files.trust, time.time())
+        self._loop.review(files.trust, self._clock.now())
         self._relay_revocations(files)
         try:
             self._gate.use(files)

@@ -101,7 +101,7 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
     key_pem = read_guarded(key_path, KEY_FORBIDDEN)
     key = load_private_key(key_pem, None, key_path)
     if key.public_key() != certificate.public_key():
-        raise ConfigError(str(key_path), "", f"expected the key of {CERTIFICATE_FILE}; copy both from one plr ca issue")
+        raise ConfigError(str(key_path), "", f"expected the key of {CERTIFICATE_FILE}; copy those that belong together")
     return TlsFiles(
         directory=directory,
         certificate_pem=certificate_pem,
@@ -137,8 +137,10 @@ def load_private_key(pem: bytes, passphrase: bytes | None, path: Path) -> ec.Ell
         problem = "a key without a passphrase" if passphrase is None else "a key with a passphrase"
         raise ConfigError(str(path), "", f"expected {problem}") from error
     except Exception as error:
-        other = "" if passphrase is None else ", or another passphrase"
-        raise ConfigError(str(path), "", f"expected a private key in PEM{other}") from error
+        problem = "expected a private key in PEM"
+        if passphrase is not None:
+            problem = "the passphrase does not open it: give another passphrase, or a private key in PEM"
+        raise ConfigError(str(path), "", problem) from error
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise ConfigError(str(path), "", "expected an ECDSA key")
     return key

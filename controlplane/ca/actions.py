@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -12,7 +13,8 @@ from cryptography.x509.oid import NameOID
 from controlplane.ca import listing
 from controlplane.ca.authority import Authority, AuthorityError
 from controlplane.ca.files import write_tls_files
-from controlplane.ca.folder import NOT_THE_OWNER, AuthorityFolder
+from controlplane.ca.folder import AuthorityFolder, Protection
+from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE, PassphraseSource
 from protos.errors import ConfigError
 from protos.identity import IdentityRole
 from protos.tls_files import (
@@ -32,114 +34,147 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec
 
 
+_OPTION = "--passphrase-file"
+
+
 def init(arguments: argparse.Namespace) -> None:
     """Make a CA."""
-    folder = _folder(arguments)
+    AuthorityFolder(arguments.dir).refuse_existing()
+    source = PassphraseSource("passphrase for the CA's key", _OPTION, VARIABLE, arguments.passphrase_file)
+    passphrase = None if arguments.no_passphrase else source.choose()
+    folder = AuthorityFolder(arguments.dir, passphrase)
     authority = Authority.create(arguments.name, days=arguments.days)
     folder.create(authority)
-    _say(f"made the CA {arguments.name}, good until {listing.day(authority.not_after)}: {folder.path}")
+    kept = "not encrypted" if passphrase is None else "encrypted"
+    say(f"made the CA {arguments.name}, good until {listing.day(authority.not_after)}, its key {kept}: {folder.path}")
 
 
 def issue(arguments: argparse.Namespace) -> None:
     """Write a new node's files."""
-    folder = _folder(arguments)
+    folder = opened(arguments)
     role = IdentityRole(arguments.role)
     with folder.locked() as authority:
         out = arguments.out or folder.node_folder(arguments.name)
-        _refuse_taken(out, arguments.name)
+        refuse_taken(out, arguments.name)
         issued = authority.issue(arguments.name, role, days=arguments.days)
         folder.save(authority)
         write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
     until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
-    _say(f"issued {arguments.name} ({role.value}), good until {until}: {out}")
+    say(f"issued {arguments.name} ({role.value}), good until {until}: {out}")
 
 
 def renew(arguments: argparse.Namespace) -> None:
     """Write a node's files with a further certificate."""
-    folder = _folder(arguments)
+    folder = opened(arguments)
     with folder.locked() as authority:
         out = arguments.out or folder.node_folder(arguments.name)
         last = authority.latest(arguments.name)
-        _refuse_taken(out, arguments.name)
-        key = _kept_key(out) if arguments.keep_key else None
+        refuse_taken(out, arguments.name)
+        key = kept_key(out) if arguments.keep_key else None
         issued = authority.renew(arguments.name, days=arguments.days, key=key)
         folder.save(authority)
         write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
     until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
-    _say(f"renewed {arguments.name} ({last.role.value}), good until {until}: {out}")
+    say(f"renewed {arguments.name} ({last.role.value}), good until {until}: {out}")
 
 
 def revoke(arguments: argparse.Namespace) -> None:
     """Revoke what a node has."""
-    folder = _folder(arguments)
+    folder = opened(arguments)
     with folder.locked() as authority:
         revoked = authority.revoke(arguments.name, x509.ReasonFlags(arguments.reason))
         folder.save(authority)
     where = "copy to the control plane's tls_dir, or any node's"
-    _say(f"revoked {len(revoked)} of {arguments.name}; {where}: {folder.path / CRL_FILE}")
+    say(f"revoked {len(revoked)} of {arguments.name}; {where}: {folder.path / CRL_FILE}")
 
 
 def publish(arguments: argparse.Namespace) -> None:
     """Sign the revocation lists again."""
-    folder = _folder(arguments)
+    folder = opened(arguments)
     with folder.locked() as authority:
         authority.publish()
         folder.save(authority)
-    _say(f"signed revocation list {authority.crl_number}; copy to any node's tls_dir: {folder.path / CRL_FILE}")
+    say(f"signed revocation list {authority.crl_number}; copy to any node's tls_dir: {folder.path / CRL_FILE}")
 
 
 def show(arguments: argparse.Namespace) -> None:
     """Print what was issued."""
-    folder = _folder(arguments)
+    folder = AuthorityFolder(arguments.dir)
     records = folder.records()
-    _say(listing.render(records, [folder.certificate(record) for record in records], time.time()))
+    say(listing.render(records, [folder.certificate(record) for record in records], time.time()))
 
 
 def rotate(arguments: argparse.Namespace) -> None:
     """Put a new CA before the one in use."""
-    folder = _folder(arguments)
+    folder = opened(arguments)
     with folder.locked() as authority:
         authority.rotate(arguments.name, days=arguments.days)
         folder.save(authority)
-    _say(f"made the CA {arguments.name}; before renewing any node, copy to every tls_dir: {folder.path / CA_FILE}")
+    files = f"{folder.path / CA_FILE} and {folder.path / CRL_FILE}"
+    say(f"made the CA {arguments.name}; before renewing any node, copy to every tls_dir: {files}")
 
 
 def retire(arguments: argparse.Namespace) -> None:
     """Forget the former CAs."""
-    folder = _folder(arguments)
+    folder = opened(arguments)
     with folder.locked() as authority:
         authority.retire()
         folder.save(authority)
-    _say(f"retired; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}")
+    say(f"retired; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}")
 
 
-def _folder(arguments: argparse.Namespace) -> AuthorityFolder:
-    path: Path | None = getattr(arguments, "passphrase_file", None)
-    if path is None:
-        return AuthorityFolder(arguments.dir)
-    passphrase = read_guarded(path, NOT_THE_OWNER).strip(b"\r\n")
-    if not passphrase:
-        raise ConfigError(str(path), "", "expected a passphrase")
-    return AuthorityFolder(arguments.dir, passphrase)
+def change_passphrase(arguments: argparse.Namespace) -> None:
+    """Encrypt the CA's key with another passphrase, in the way of today."""
+    folder = opened(arguments, warn=False)
+    source = PassphraseSource("new passphrase", "--new-passphrase-file", NEW_VARIABLE, arguments.new_passphrase_file)
+    new = None if arguments.no_passphrase else source.choose()
+    folder.change_passphrase(new)
+    kept = "no longer encrypted" if new is None else "encrypted with the new passphrase; copies from before are not"
+    say(f"the CA's key is {kept}: {folder.path}")
 
 
-def _refuse_taken(out: Path, name: str) -> None:
-    """Raise AuthorityError if the folder holds the key of a node with another name."""
-    if not (out / KEY_FILE).exists():
+def opened(arguments: argparse.Namespace, *, warn: bool = True) -> AuthorityFolder:
+    """Return the CA's folder with the passphrase of its keys, asked for if they have one; raises ConfigError.
+
+    Whoever is asked for it is asked before the folder is locked.
+    """
+    folder = AuthorityFolder(arguments.dir)
+    protections = folder.protections()
+    if warn and min(protections) is not Protection.GOOD:
+        how = "not encrypted" if min(protections) is Protection.CLEAR else "encrypted in an old way, cheap to guess at"
+        sys.stderr.write(f"plr: warning: {folder.path}: the CA's key is {how}; do: {_mend(arguments)}\n")
+    if max(protections) is Protection.CLEAR:
+        if arguments.passphrase_file is not None:
+            raise ConfigError(str(folder.path), "", f"the CA's key has no passphrase; leave out {_OPTION}")
+        return folder
+    source = PassphraseSource("passphrase of the CA's key", _OPTION, VARIABLE, arguments.passphrase_file)
+    return AuthorityFolder(arguments.dir, source.get())
+
+
+def _mend(arguments: argparse.Namespace) -> str:
+    return shlex.join(["plr", "ca", "passphrase", "--dir", str(arguments.dir)])
+
+
+def refuse_taken(out: Path, name: str) -> None:
+    """Raise AuthorityError if the folder holds the key or the certificate of a node with another name."""
+    path = out / CERTIFICATE_FILE
+    if not ((out / KEY_FILE).exists() or path.exists()):
         return
     try:
-        certificate = x509.load_pem_x509_certificate((out / CERTIFICATE_FILE).read_bytes())
+        certificate = x509.load_pem_x509_certificate(path.read_bytes())
         owners = [each.value for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
     except (OSError, ValueError):
         owners = []
     if owners != [name]:
-        raise AuthorityError(f"{out}: holds another node's key; give another --out")
+        raise AuthorityError(f"{out}: holds another node's files; give another --out")
 
 
-def _kept_key(out: Path) -> ec.EllipticCurvePrivateKey:
+def kept_key(out: Path) -> ec.EllipticCurvePrivateKey:
+    """Return the key of a node's folder; raises ConfigError."""
     path = out / KEY_FILE
     return load_private_key(read_guarded(path, KEY_FORBIDDEN), None, path)
 
 
-def _say(line: str) -> None:
+def say(line: str) -> None:
+    """Print a line of what was done."""
     sys.stdout.write(f"{line}\n")

@@ -19,6 +19,7 @@ from controlplane.ca.certificates import (
 )
 from controlplane.ca.files import write_tls_files
 from controlplane.ca.index import Entry, Record
+from controlplane.ca.request import fingerprint
 from protos.names import node_name
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from cryptography.hazmat.primitives.asymmetric import ec
 
+    from controlplane.ca.request import Request
     from protos.identity import IdentityRole
 
 DAY_S = 86_400.0
@@ -54,12 +56,15 @@ class Authority:
         former: Iterable[Authority] = (),
         clock: Callable[[], float] = time.time,
         published_at: float | None = None,
+        past: Iterable[Entry] = (),
     ) -> None:
         self.own = own
         self.entries = list(entries)
         self.crl_number = crl_number
         self.published_at = published_at
         self.former = list(former)
+        self._past = list(past)
+        """Of each key that a retired CA certified, a certificate: a revoked one if there is one."""
         self._clock = clock
 
     @classmethod
@@ -81,7 +86,8 @@ class Authority:
 
     def record(self) -> Record:
         """Return what is to be remembered of this CA beside its key and certificate."""
-        return Record(self.own.certificate.serial_number, self.crl_number, tuple(self.entries), self.published_at)
+        serial, entries = self.own.certificate.serial_number, tuple(self.entries)
+        return Record(serial, self.crl_number, entries, self.published_at, tuple(self._past))
 
     def all_entries(self) -> list[Entry]:
         """Return what the former CAs and this one have issued, oldest first."""
@@ -95,9 +101,7 @@ class Authority:
         `validity` in place of `days` is for tests: it may lie in the past, but not beyond the CA's own end.
         """
         node_name(name, "the name")
-        now = self._clock()
-        if any(entry.name == name and entry.in_force(now) for entry in self.all_entries()):
-            raise AuthorityError(f"{name} has a certificate; do: plr ca renew {name}")
+        self._refuse_in_force(name, f"plr ca renew {name}")
         return self._issue(name, role, validity or self._validity(days), generate_key())
 
     def renew(self, name: str, *, days: float = DEFAULT_DAYS, key: ec.EllipticCurvePrivateKey | None = None) -> Issued:
@@ -105,10 +109,46 @@ class Authority:
 
         The certificate before it stays good until its end, so that the node can change over without a gap.
         """
+        last = self._renewable(name)
+        if key is not None:
+            self._refuse_key(name, fingerprint(key.public_key()), "the key", "leave out --keep-key")
+        return self._issue(name, last.role, self._validity(days), key or generate_key())
+
+    def sign(self, request: Request, *, renewing: bool = False, days: float = DEFAULT_DAYS) -> x509.Certificate:
+        """Certify the key of a request whose name and role the operator has confirmed; raises AuthorityError.
+
+        As `issue`, or as `renew`. A key serves one name, and no more once it was revoked.
+        """
+        name = request.name
+        self._refuse_key(
+            name, fingerprint(request.key), "the request's key", f"make another on the node: plr request {name}"
+        )
+        if not renewing:
+            self._refuse_in_force(name, "plr ca sign --renew")
+        elif (last := self._renewable(name)).role is not request.role:
+            roles = f"{last.role.value}, not {request.role.value}"
+            raise AuthorityError(f"{name} has the role {roles}; to change it, do first: plr ca revoke {name}")
+        return self._certify(name, request.role, self._validity(days), request.key)
+
+    def _refuse_key(self, name: str, key: str, what: str, instead: str) -> None:
+        for entry in (*self._past, *self.all_entries()):
+            if entry.key == key and entry.name != name:
+                raise AuthorityError(f"{what} is the one of {entry.name}; {instead}")
+            if entry.key == key and entry.revoked_at is not None:
+                raise AuthorityError(f"{what} was revoked; {instead}")
+
+    def _refuse_in_force(self, name: str, instead: str) -> None:
+        now = self._clock()
+        if any(entry.name == name and entry.in_force(now) for entry in self.all_entries()):
+            raise AuthorityError(f"{name} has a certificate; do: {instead}")
+
+    def _renewable(self, name: str) -> Entry:
         last = self.latest(name)
         if last.revoked_at is not None:
-            raise AuthorityError(f"{name} is revoked; to let it in again, do: plr ca issue {name} --role ...")
-        return self._issue(name, last.role, self._validity(days), key or generate_key())
+            raise AuthorityError(
+                f"{name} is revoked; to let it in again, do: plr ca issue {name} --role ..., or plr ca sign"
+            )
+        return last
 
     def revoke(self, name: str, reason: x509.ReasonFlags = x509.ReasonFlags.unspecified) -> list[Entry]:
         """Revoke every certificate of a name that is in force; returns them. Raises AuthorityError if there is none."""
@@ -130,10 +170,17 @@ class Authority:
         return revoked
 
     def publish(self) -> None:
-        """Sign the revocation lists again, unchanged, so that nodes can see that they miss none."""
+        """Sign the revocation lists again, unchanged, so that nodes can see that they miss none.
+
+        That of a former CA that has ended stays: nobody believes it any more. Raises AuthorityError if this one has.
+        """
+        now = self._clock()
+        if now >= self.not_after:
+            raise AuthorityError("the CA itself has ended; to go on, do: plr ca rotate (if this clock is right)")
         for authority in (self, *self.former):
-            authority.crl_number += 1
-            authority.published_at = self._clock()
+            if now < authority.not_after:
+                authority.crl_number += 1
+                authority.published_at = now
 
     def rotate(self, name: str, *, days: float = DEFAULT_CA_DAYS) -> None:
         """Make a new CA that issues from now on; the one before it stays believed until `retire`.
@@ -151,9 +198,18 @@ class Authority:
         waiting = sorted({entry.name for entry in self.all_entries() if entry.in_force(now)} - renewed)
         if waiting:
             raise AuthorityError(
-                f"{len(waiting)} nodes have a certificate of the former CA only; renew or revoke first: "
+                "these nodes have a certificate of the former CA only; renew or revoke first: "
                 + ", ".join(waiting[:5])
+                + (f" and {len(waiting) - 5} more" if len(waiting) > 5 else "")
             )
+        # Their certificates end with them; their keys do not, and may be asked for again.
+        past = {entry.key: entry for entry in self._past}
+        for authority in reversed(self.former):
+            for entry in authority.entries:
+                known = past.get(entry.key)
+                if entry.key and (known is None or known.revoked_at is None):
+                    past[entry.key] = entry
+        self._past = list(past.values())
         self.former.clear()
 
     def latest(self, name: str) -> Entry:
@@ -161,7 +217,9 @@ class Authority:
         for entry in reversed(self.all_entries()):
             if entry.name == name:
                 return entry
-        raise AuthorityError(f"{name} has no certificate of this CA; do: plr ca issue {name} --role ...")
+        raise AuthorityError(
+            f"{name} has no certificate of this CA; do: plr ca issue {name} --role ..., or plr ca sign"
+        )
 
     def crl_pem(self) -> bytes:
         """Return the revocation lists of this CA and the former ones; each stands as long as its CA.
@@ -202,7 +260,12 @@ class Authority:
         return Validity(now - BACKDATE_S, end)
 
     def _issue(self, name: str, role: IdentityRole, validity: Validity, key: ec.EllipticCurvePrivateKey) -> Issued:
-        certificate = build_leaf(self.own, name, role, key.public_key(), validity)
+        return Issued(self._certify(name, role, validity, key.public_key()), key)
+
+    def _certify(
+        self, name: str, role: IdentityRole, validity: Validity, key: ec.EllipticCurvePublicKey
+    ) -> x509.Certificate:
+        certificate = build_leaf(self.own, name, role, key, validity)
         self.entries.append(
             Entry(
                 name=node_name(name, "the name"),
@@ -210,9 +273,10 @@ class Authority:
                 serial=certificate.serial_number,
                 not_before=certificate.not_valid_before_utc.timestamp(),
                 not_after=certificate.not_valid_after_utc.timestamp(),
+                key=fingerprint(key),
             )
         )
-        return Issued(certificate, key)
+        return certificate
 
 
 def _own(name: str, days: float, now: float) -> Issued:

@@ -13,14 +13,10 @@ from typing import TYPE_CHECKING
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import (
-    BestAvailableEncryption,
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-)
+from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from controlplane.ca.key_file import clear_pem
 from protos.identity import CONTROL_PLANE_DNS, IdentityRole, identity_uri
 
 if TYPE_CHECKING:
@@ -57,18 +53,12 @@ class Issued:
     @property
     def key_pem(self) -> bytes:
         """The private key in PEM, in clear."""
-        return private_key_pem(self.key, None)
+        return clear_pem(self.key)
 
 
 def generate_key() -> ec.EllipticCurvePrivateKey:
     """Make a private key on P-256, the curve that gRPC's TLS takes."""
     return ec.generate_private_key(ec.SECP256R1())
-
-
-def private_key_pem(key: ec.EllipticCurvePrivateKey, passphrase: bytes | None) -> bytes:
-    """Return the key in PEM (PKCS #8), encrypted if there is a passphrase."""
-    encryption = BestAvailableEncryption(passphrase) if passphrase is not None else NoEncryption()
-    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption)
 
 
 def build_authority(name: str, key: ec.EllipticCurvePrivateKey, validity: Validity) -> x509.Certificate:
@@ -84,18 +74,24 @@ def build_leaf(
     issuer: Issued, name: str, role: IdentityRole, key: ec.EllipticCurvePublicKey, validity: Validity
 ) -> x509.Certificate:
     """Return the certificate of a node."""
-    names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(identity_uri(name, role))]
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if role is IdentityRole.CONTROL_PLANE:
-        names.append(x509.DNSName(CONTROL_PLANE_DNS))
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     builder = _builder(subject, issuer.certificate.subject, key, validity)
     builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
     builder = builder.add_extension(_key_usage(authority=False), critical=True)
     builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-    builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+    builder = builder.add_extension(alternative_names(name, role), critical=False)
     return _with_key_ids(builder, key, issuer.key.public_key()).sign(issuer.key, _HASH, ecdsa_deterministic=True)
+
+
+def alternative_names(name: str, role: IdentityRole) -> x509.SubjectAlternativeName:
+    """Return where name and role stand."""
+    names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(identity_uri(name, role))]
+    if role is IdentityRole.CONTROL_PLANE:
+        names.append(x509.DNSName(CONTROL_PLANE_DNS))
+    return x509.SubjectAlternativeName(names)
 
 
 def build_revocation_list(

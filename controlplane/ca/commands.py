@@ -1,4 +1,4 @@
-"""`plr ca`: the fleet's CA on the command line."""
+"""`plr ca`: the fleet's CA on the command line; `plr request`: what a node asks of it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 
 from cryptography.x509 import ReasonFlags
 
-from controlplane.ca import actions
+from controlplane.ca import actions, request_actions
 from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityError
+from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
 from protos.errors import ConfigError, DecodeError
 from protos.identity import IdentityRole
+from protos.log_lines import escaped
 from protos.names import node_name, text
 
 if TYPE_CHECKING:
@@ -27,11 +29,21 @@ _EXAMPLES = """examples:
   plr ca issue cp --role controlplane
   plr ca issue robot-1 --role robot --days 30
   plr ca issue alice --role operator --out ~/.plr-tls
+  plr ca sign request.pem --name robot-2 --role robot
   plr ca list
   plr ca renew robot-1
   plr ca revoke robot-1 --reason keyCompromise
+  plr ca passphrase
 
 exit codes: 0 ok, 1 refused or not done, 2 bad usage or a CA folder that is not in order
+"""
+
+_REQUEST_EXAMPLES = """examples:
+  plr request robot-7 --role robot
+  plr request robot-7 --role robot --out /etc/plr/tls --keep-key
+  plr request alice --role operator --out ~/.plr-tls
+
+exit codes: 0 ok, 1 refused or not done, 2 bad usage or a key that is not in order
 """
 
 _REASONS = [
@@ -44,12 +56,13 @@ _REASONS = [
         ReasonFlags.privilege_withdrawn,
     )
 ]
+_ROLES = [role.value for role in IdentityRole]
 _MAX_DAYS = 36_500.0
 _MAX_COMMON_NAME = 64
 
 
 def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `ca` to the commands of plr."""
+    """Add `ca` and `request` to the commands of plr."""
     ca = commands.add_parser(
         "ca",
         help="issue and revoke the fleet's certificates",
@@ -57,10 +70,18 @@ def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    _add_request(commands)
     about = ca.add_subparsers(required=True, metavar="COMMAND")
     for name, command, summary, details in (
         ("init", actions.init, "make the CA", "Make the CA's key and certificate in a folder of its own."),
         ("issue", actions.issue, "make a node's key and certificate", "Write a folder ready to be the node's tls_dir."),
+        (
+            "sign",
+            request_actions.sign,
+            "certify a key that stays on its node",
+            "Show what a file of plr request asks for, and sign it once you confirm name and role: by both options, "
+            "or at the terminal. Of the request itself only its key is taken.",
+        ),
         (
             "renew",
             actions.renew,
@@ -77,33 +98,101 @@ def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
         ("list", actions.show, "show what was issued", "Show every certificate and how long it is good."),
         ("rotate", actions.rotate, "make a new CA beside the one in use", "Both are believed until: plr ca retire."),
         ("retire", actions.retire, "stop believing former CAs", "Refused while a node depends on one of them."),
+        (
+            "passphrase",
+            actions.change_passphrase,
+            "change the passphrase of the CA's key",
+            "Encrypt the key again, or for the first time. No certificate changes.",
+        ),
     ):
         parser = about.add_parser(name, help=summary, description=details)
         parser.add_argument("--dir", type=Path, default=Path("plr-ca"), help="the CA's folder (default: ./plr-ca)")
         _ARGUMENTS[name](parser)
-        parser.set_defaults(run=_reported(command))
+        parser.set_defaults(run=_reported(command, lambda arguments: arguments.dir))
+
+
+def _add_request(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "request",
+        help="make a key on its node, and a request to certify it",
+        description="Make a key and a request for its certificate, which plr ca sign answers. The key stays here.",
+        epilog=_REQUEST_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("name", type=_node_name, metavar="NAME")
+    parser.add_argument("--role", required=True, choices=_ROLES)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        default=Path("plr-request"),
+        help="where to write it (default: ./plr-request)",
+    )
+    parser.add_argument("--keep-key", action="store_true", help="ask for a certificate of the key that is there")
+    parser.set_defaults(run=_reported(request_actions.request, lambda arguments: arguments.out))
 
 
 def _signing(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--passphrase-file", type=Path, metavar="FILE", help="what the CA's key is encrypted with")
+    help_text = f"what the CA's key is encrypted with (default: {VARIABLE} of the environment, else you are asked)"
+    parser.add_argument("--passphrase-file", type=Path, metavar="FILE", help=help_text)
+
+
+def _authority_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--name", type=_common_name, default="fleet", help="what people call the CA (default: fleet)")
+    parser.add_argument("--days", type=_days, default=DEFAULT_CA_DAYS, help="how long it lasts (default: 3650)")
 
 
 def _init_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--name", type=_common_name, default="fleet", help="what people call the CA (default: fleet)")
-    parser.add_argument("--days", type=_days, default=DEFAULT_CA_DAYS, help="how long it lasts (default: 3650)")
+    _authority_arguments(parser)
+    choice = parser.add_mutually_exclusive_group()
+    help_text = f"what to encrypt the CA's key with (default: {VARIABLE} of the environment, else you are asked)"
+    choice.add_argument("--passphrase-file", type=Path, metavar="FILE", help=help_text)
+    _no_passphrase(choice)
+
+
+def _rotate_arguments(parser: argparse.ArgumentParser) -> None:
+    _authority_arguments(parser)
     _signing(parser)
+
+
+def _passphrase_arguments(parser: argparse.ArgumentParser) -> None:
+    _signing(parser)
+    choice = parser.add_mutually_exclusive_group()
+    help_text = f"what to encrypt the key with from now on (default: {NEW_VARIABLE} of the environment, else asked)"
+    choice.add_argument("--new-passphrase-file", type=Path, metavar="FILE", help=help_text)
+    _no_passphrase(choice)
+
+
+def _no_passphrase(choice: argparse._MutuallyExclusiveGroup) -> None:
+    help_text = "leave the CA's key unencrypted: whoever reads the file can be any node"
+    choice.add_argument("--no-passphrase", action="store_true", help=help_text)
 
 
 def _out_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", type=_node_name, metavar="NAME")
+    _certificate_arguments(parser)
+
+
+def _certificate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--days", type=_days, default=DEFAULT_DAYS, help="how long it lasts (default: 90)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write it (default: nodes/NAME in the CA's)")
     _signing(parser)
 
 
 def _issue_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--role", required=True, choices=[role.value for role in IdentityRole])
+    parser.add_argument("--role", required=True, choices=_ROLES)
     _out_arguments(parser)
+
+
+def _sign_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("request", type=Path, metavar="REQUEST", help="the request.pem that plr request wrote")
+    parser.add_argument("--name", type=_node_name, help="the name that it must ask for")
+    parser.add_argument("--role", choices=_ROLES, help="the role that it must ask for")
+    parser.add_argument(
+        "--fingerprint", metavar="SHA256:...", help="the key that it must be of, as plr request shows it"
+    )
+    parser.add_argument("--renew", action="store_true", help="the name has a certificate, which stays good to its end")
+    _certificate_arguments(parser)
 
 
 def _renew_arguments(parser: argparse.ArgumentParser) -> None:
@@ -120,31 +209,43 @@ def _revoke_arguments(parser: argparse.ArgumentParser) -> None:
 _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "init": _init_arguments,
     "issue": _issue_arguments,
+    "sign": _sign_arguments,
     "renew": _renew_arguments,
     "revoke": _revoke_arguments,
     "publish": _signing,
     "list": lambda parser: None,
-    "rotate": _init_arguments,
+    "rotate": _rotate_arguments,
     "retire": _signing,
+    "passphrase": _passphrase_arguments,
 }
 
 
-def _reported(command: Callable[[argparse.Namespace], None]) -> Callable[[argparse.Namespace], int]:
+def _reported(
+    command: Callable[[argparse.Namespace], None], folder: Callable[[argparse.Namespace], Path]
+) -> Callable[[argparse.Namespace], int]:
     def run(arguments: argparse.Namespace) -> int:
         try:
             command(arguments)
         except AuthorityError as error:
-            sys.stderr.write(f"plr: {error}\n")
+            _complain(str(error))
             return EXIT_FAILED
         except ConfigError as error:
-            sys.stderr.write(f"plr: {error}\n")
+            _complain(str(error))
             return EXIT_USAGE
+        except KeyboardInterrupt:
+            sys.stderr.write("\nplr: stopped\n")
+            return EXIT_FAILED
         except OSError as error:
-            sys.stderr.write(f"plr: {error.filename or arguments.dir}: {error.strerror or error}\n")
+            _complain(f"{error.filename or folder(arguments)}: {error.strerror or error}")
             return EXIT_FAILED
         return EXIT_OK
 
     return run
+
+
+def _complain(problem: str) -> None:
+    # It may name a file that somebody else has named.
+    sys.stderr.write(f"plr: {escaped(problem)}\n")
 
 
 def _node_name(value: str) -> str:

@@ -48,8 +48,21 @@ def write_atomically(path: Path, data: bytes, mode: int) -> None:
 
 def write_tls_files(folder: Path, issued: Issued, ca_pem: bytes, crl_pem: bytes) -> None:
     """Write a node's TLS files; a folder that is missing is made, readable for its owner alone. Raises OSError."""
-    folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+    write_certificate(folder, issued.certificate_pem, ca_pem, crl_pem, issued.key_pem)
+
+
+def write_certificate(
+    folder: Path, certificate_pem: bytes, ca_pem: bytes, crl_pem: bytes, key_pem: bytes | None = None
+) -> None:
+    """Write a node's TLS files, without the key if only the node has it; as `write_tls_files`. Raises OSError."""
+    make_private(folder)
     write_atomically(folder / CA_FILE, ca_pem, PUBLIC_FILE)
     write_atomically(folder / CRL_FILE, crl_pem, PUBLIC_FILE)
-    write_atomically(folder / KEY_FILE, issued.key_pem, PRIVATE_FILE)
-    write_atomically(folder / CERTIFICATE_FILE, issued.certificate_pem, PUBLIC_FILE)
+    if key_pem is not None:
+        write_atomically(folder / KEY_FILE, key_pem, PRIVATE_FILE)
+    write_atomically(folder / CERTIFICATE_FILE, certificate_pem, PUBLIC_FILE)
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder that is missing, readable for its owner alone; raises OSError."""
+    folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)

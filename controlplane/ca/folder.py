@@ -1,7 +1,7 @@
 """A CA on disk.
 
     index.json               the CAs, the one that issues first, and what each has issued and revoked
-    authorities/SERIAL/      cert.pem and key.pem of each; the key perhaps under a passphrase
+    authorities/SERIAL/      cert.pem and key.pem of each; the key under a passphrase, unless refused
     ca.pem, crl.pem          what every node needs, written from the above
     nodes/NAME/              a folder for each node, ready to be its `tls_dir`
 
@@ -12,6 +12,7 @@ alone says what is: a command cut short before it has written that has not happe
 from __future__ import annotations
 
 import contextlib
+import enum
 import fcntl
 import os
 import shutil
@@ -20,15 +21,18 @@ from typing import TYPE_CHECKING
 from cryptography import x509
 
 from controlplane.ca.authority import Authority
-from controlplane.ca.certificates import Issued, private_key_pem
+from controlplane.ca.certificates import Issued
 from controlplane.ca.files import PRIVATE_FILE, PRIVATE_FOLDER, PUBLIC_FILE, write_atomically
 from controlplane.ca.index import decode_index, encode_index
+from controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
 from protos.errors import ConfigError
 from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from cryptography.hazmat.primitives.asymmetric import ec
 
     from controlplane.ca.index import Record
 
@@ -39,6 +43,15 @@ _LOCK_FILE = ".lock"
 
 NOT_THE_OWNER = 0o077
 """Permissions that nothing of a CA's has to have."""
+
+
+class Protection(enum.IntEnum):
+    """How well a CA's keys are kept from whoever gets hold of the files, the worst first."""
+
+    CLEAR = 0
+    WEAK = 1
+    """Encrypted, but guesses at the passphrase are cheap: as older versions wrote it."""
+    GOOD = 2
 
 
 class AuthorityFolder:
@@ -57,9 +70,42 @@ class AuthorityFolder:
         self.path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
         self.path.chmod(PRIVATE_FOLDER)
         with self._lock():
-            if (self.path / INDEX_FILE).exists():
-                raise ConfigError(str(self.path), "", "there is a CA already; another one needs another --dir")
+            self.refuse_existing()
             self.save(authority)
+
+    def refuse_existing(self) -> None:
+        """Raise ConfigError if there is a CA."""
+        if (self.path / INDEX_FILE).exists():
+            raise ConfigError(str(self.path), "", "there is a CA already; another one needs another --dir")
+
+    def protections(self) -> list[Protection]:
+        """Return how each of the CAs' keys is kept; raises ConfigError."""
+        keys = [read_guarded(self._key_path(record), NOT_THE_OWNER) for record in self.records()]
+        return [
+            Protection.GOOD if is_well_encrypted(pem) else Protection.WEAK if is_encrypted(pem) else Protection.CLEAR
+            for pem in keys
+        ]
+
+    def change_passphrase(self, new: bytes | None) -> None:
+        """Encrypt the CAs' keys with another passphrase, or not at all; raises ConfigError, OSError.
+
+        Cut short, it has changed some keys and not others: given again, it changes the rest.
+        """
+        self._check()
+        with self._lock():
+            keys = [(path, self._open(path, new)) for path in map(self._key_path, self.records())]
+            for path, key in keys:
+                write_atomically(path, _key_pem(key, new), PRIVATE_FILE)
+
+    def _open(self, path: Path, new: bytes | None) -> ec.EllipticCurvePrivateKey:
+        try:
+            return self._load_key(path, self._passphrase)
+        except ConfigError:
+            if new is None:
+                raise
+            with contextlib.suppress(ConfigError):
+                return self._load_key(path, new)
+            raise
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[Authority]:
@@ -115,17 +161,23 @@ class AuthorityFolder:
             return
         folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
         write_atomically(folder / CERTIFICATE_FILE, authority.own.certificate_pem, PRIVATE_FILE)
-        write_atomically(folder / KEY_FILE, private_key_pem(authority.own.key, self._passphrase), PRIVATE_FILE)
+        write_atomically(folder / KEY_FILE, _key_pem(authority.own.key, self._passphrase), PRIVATE_FILE)
 
     def _load(self, record: Record) -> Authority:
-        path = self._own_folder(record) / KEY_FILE
-        pem = read_guarded(path, NOT_THE_OWNER)
-        if (b"ENCRYPTED" in pem) != (self._passphrase is not None):
-            problem = "has a passphrase; give" if self._passphrase is None else "has no passphrase; leave out"
-            raise ConfigError(str(path), "", f"the CA's key {problem} --passphrase-file")
-        key = load_private_key(pem, self._passphrase, path)
+        key = self._load_key(self._key_path(record), self._passphrase)
         issued = Issued(self.certificate(record), key)
-        return Authority(issued, record.entries, record.crl_number, published_at=record.published_at)
+        return Authority(issued, record.entries, record.crl_number, published_at=record.published_at, past=record.past)
+
+    def _load_key(self, path: Path, passphrase: bytes | None) -> ec.EllipticCurvePrivateKey:
+        pem = read_guarded(path, NOT_THE_OWNER)
+        if not is_encrypted(pem):
+            return load_private_key(pem, None, path)
+        if passphrase is None:
+            raise ConfigError(str(path), "", "the CA's key has a passphrase; give --passphrase-file")
+        return load_private_key(pem, passphrase, path)
+
+    def _key_path(self, record: Record) -> Path:
+        return self._own_folder(record) / KEY_FILE
 
     def _own_folder(self, record: Record) -> Path:
         return self.path / AUTHORITIES / f"{record.serial:x}"
@@ -145,3 +197,7 @@ class AuthorityFolder:
             yield
         finally:
             os.close(descriptor)
+
+
+def _key_pem(key: ec.EllipticCurvePrivateKey, passphrase: bytes | None) -> bytes:
+    return clear_pem(key) if passphrase is None else encrypted_pem(key, passphrase)

@@ -31,6 +31,8 @@ class Entry:
     not_after: float
     revoked_at: float | None = None
     reason: str = ""
+    key: str = ""
+    """The key's fingerprint; empty for what older versions issued."""
 
     def in_force(self, now_wall: float) -> bool:
         """Whether the certificate is neither revoked nor past its time."""
@@ -46,6 +48,8 @@ class Record:
     entries: tuple[Entry, ...]
     published_at: float | None = None
     """When the list was signed without anything new in it; None: never."""
+    past: tuple[Entry, ...] = ()
+    """What CAs before it, no longer believed, certified: a key of theirs that was revoked stays refused."""
 
 
 def _number(text: object) -> int:
@@ -70,10 +74,19 @@ class _EntryRow(BaseModel):
     not_after: float
     revoked_at: float | None = None
     reason: str = ""
+    key: str = ""
 
     def entry(self) -> Entry:
-        name = node_name(self.name, "the name")
-        return Entry(name, self.role, self.serial, self.not_before, self.not_after, self.revoked_at, self.reason)
+        return Entry(
+            name=node_name(self.name, "the name"),
+            role=self.role,
+            serial=self.serial,
+            not_before=self.not_before,
+            not_after=self.not_after,
+            revoked_at=self.revoked_at,
+            reason=self.reason,
+            key=self.key,
+        )
 
 
 class _RecordRow(BaseModel):
@@ -83,6 +96,7 @@ class _RecordRow(BaseModel):
     crl_number: int = Field(ge=0)
     published_at: float | None = None
     entries: tuple[_EntryRow, ...]
+    past: tuple[_EntryRow, ...] = ()
 
 
 class _Index(BaseModel):
@@ -99,22 +113,25 @@ def encode_index(records: Iterable[Record]) -> bytes:
             "serial": f"{record.serial:x}",
             "crl_number": record.crl_number,
             "published_at": record.published_at,
-            "entries": [
-                {
-                    "name": entry.name,
-                    "role": entry.role.value,
-                    "serial": f"{entry.serial:x}",
-                    "not_before": entry.not_before,
-                    "not_after": entry.not_after,
-                    "revoked_at": entry.revoked_at,
-                    "reason": entry.reason,
-                }
-                for entry in record.entries
-            ],
+            "entries": [_row(entry) for entry in record.entries],
+            "past": [_row(entry) for entry in record.past],
         }
         for record in records
     ]
     return json.dumps({"authorities": rows}, indent=1).encode() + b"\n"
+
+
+def _row(entry: Entry) -> dict[str, object]:
+    return {
+        "name": entry.name,
+        "role": entry.role.value,
+        "serial": f"{entry.serial:x}",
+        "not_before": entry.not_before,
+        "not_after": entry.not_after,
+        "revoked_at": entry.revoked_at,
+        "reason": entry.reason,
+        "key": entry.key,
+    }
 
 
 def decode_index(data: bytes, path: Path) -> tuple[Record, ...]:
@@ -125,6 +142,12 @@ def decode_index(data: bytes, path: Path) -> tuple[Record, ...]:
         first = error.errors(include_url=False)[0]
         raise ConfigError(str(path), key_path(first["loc"]), f"not what plr ca wrote: {first['msg']}") from error
     return tuple(
-        Record(row.serial, row.crl_number, tuple(entry.entry() for entry in row.entries), row.published_at)
+        Record(
+            row.serial,
+            row.crl_number,
+            tuple(entry.entry() for entry in row.entries),
+            row.published_at,
+            tuple(entry.entry() for entry in row.past),
+        )
         for row in index.authorities
     )

@@ -7,6 +7,7 @@ from cryptography.x509 import ReasonFlags
 
 from controlplane.ca import Authority, AuthorityError
 from controlplane.ca.authority import BACKDATE_S
+from controlplane.ca.request import build_request, parse_request
 from protos.errors import DecodeError
 from protos.identity import CertificateError, IdentityRole, Trust
 
@@ -138,7 +139,7 @@ def test_a_ca_is_replaced_without_a_moment_in_which_a_node_is_not_believed(ca: A
     for name in names:
         believing[name] = trust(ca)
         everyone_believes_everyone()
-    with pytest.raises(AuthorityError, match="2 nodes have a certificate of the former CA only"):
+    with pytest.raises(AuthorityError, match=r"former CA only; renew or revoke first: [a-z0-9-]+, [a-z0-9-]+$"):
         ca.retire()
     for name in names:
         shown[name] = ca.renew(name).certificate_der
@@ -182,3 +183,52 @@ def test_the_revocation_list_changes_only_when_something_is_revoked(ca: Authorit
     assert after != before
     clock.now += DAY_S
     assert ca.crl_pem() == after
+
+
+@pytest.mark.audit("sec-12")
+def test_lists_are_published_beside_a_former_ca_that_has_ended(ca: Authority, clock: Clock) -> None:
+    der = ca.issue("robot-1", IdentityRole.ROBOT, days=10).certificate_der
+    clock.now += 20 * DAY_S
+    ca.rotate("next", days=1000)
+    clock.now += 80 * DAY_S
+    ended = ca.former[0].crl_number
+    ca.publish()
+    lists = [one for one in trust(ca).lists().values() if one is not None]
+    assert clock.now in [one.signed_at for one in lists]
+    assert ca.former[0].crl_number == ended
+    assert refusal(ca, der, clock) == "expired"
+
+
+@pytest.mark.audit("sec-12")
+def test_a_ca_that_has_ended_says_so_when_it_should_publish(ca: Authority, clock: Clock) -> None:
+    clock.now += 100 * DAY_S
+    with pytest.raises(AuthorityError, match="plr ca rotate"):
+        ca.publish()
+    trust(ca)
+
+
+@pytest.mark.audit("sec-11")
+def test_a_revoked_key_is_not_kept_when_a_name_is_renewed(ca: Authority) -> None:
+    stolen = ca.issue("robot-1", IdentityRole.ROBOT).key
+    ca.revoke("robot-1")
+    of_another = ca.issue("robot-2", IdentityRole.ROBOT).key
+    ca.issue("robot-1", IdentityRole.ROBOT)
+    with pytest.raises(AuthorityError, match="was revoked"):
+        ca.renew("robot-1", key=stolen)
+    with pytest.raises(AuthorityError, match="the one of robot-2"):
+        ca.renew("robot-1", key=of_another)
+
+
+@pytest.mark.audit("sec-11")
+def test_a_revoked_key_does_not_come_back_when_its_ca_has_gone(ca: Authority) -> None:
+    stolen = ca.issue("robot-1", IdentityRole.ROBOT).key
+    ca.revoke("robot-1")
+    ca.issue("robot-1", IdentityRole.ROBOT)
+    for name in ("two", "three"):
+        ca.rotate(name)
+        ca.renew("robot-1")
+        ca.retire()
+    asked = parse_request(build_request("robot-1", IdentityRole.ROBOT, stolen))
+    with pytest.raises(AuthorityError, match="was revoked"):
+        ca.sign(asked, renewing=True)
+    assert [entry.name for entry in ca.all_entries()] == ["robot-1"]

@@ -3,47 +3,24 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from controlplane import cli
+from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
 from protos.identity import CertificateError, IdentityRole
 from protos.tls_files import load_tls_files
 
-
-class Shell:
-    """Runs `plr ca` in a folder of its own."""
-
-    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
-        self._capsys = capsys
-
-    def __call__(self, *arguments: str, code: int = 0) -> str:
-        """Return what it prints, or what it complains of."""
-        assert cli.main(["ca", *arguments]) == code
-        printed = self._capsys.readouterr()
-        if code:
-            assert printed.out == ""
-            assert printed.err.startswith("plr: ")
-            assert printed.err.count("\n") == 1
-        return printed.err if code else printed.out
-
-    def usage(self, *arguments: str) -> str:
-        with pytest.raises(SystemExit) as caught:
-            cli.main(["ca", *arguments])
-        assert caught.value.code == 2
-        return self._capsys.readouterr().err
-
-
-@pytest.fixture
-def shell(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Shell:
-    monkeypatch.chdir(tmp_path)
-    return Shell(capsys)
+if TYPE_CHECKING:
+    from tests.unit.controlplane.ca.shell import Shell
 
 
 @pytest.mark.parametrize("role", [role.value for role in IdentityRole])
 def test_what_is_issued_is_a_tls_dir(shell: Shell, tmp_path: Path, role: str) -> None:
-    shell("init", "--name", "warehouse")
+    shell("init", "--no-passphrase", "--name", "warehouse")
     assert "plr-ca/nodes/node-1" in shell("issue", "node-1", "--role", role)
     identity = load_tls_files(tmp_path / "plr-ca" / "nodes" / "node-1").identity
     assert (identity.name, identity.role.value) == ("node-1", role)
@@ -51,7 +28,7 @@ def test_what_is_issued_is_a_tls_dir(shell: Shell, tmp_path: Path, role: str) ->
 
 def test_a_certificate_is_renewed_in_its_place(shell: Shell, tmp_path: Path) -> None:
     out = tmp_path / "tls"
-    shell("init")
+    shell("init", "--no-passphrase")
     shell("issue", "robot-1", "--role", "robot", "--days", "1", "--out", str(out))
     first = load_tls_files(out)
     shell("renew", "robot-1", "--out", str(out))
@@ -65,7 +42,7 @@ def test_a_certificate_is_renewed_in_its_place(shell: Shell, tmp_path: Path) -> 
 
 
 def test_a_revoked_node_is_in_the_list_that_is_to_be_copied(shell: Shell, tmp_path: Path) -> None:
-    shell("init")
+    shell("init", "--no-passphrase")
     shell("issue", "cp", "--role", "controlplane")
     shell("issue", "robot-1", "--role", "robot")
     robot = load_tls_files(tmp_path / "plr-ca/nodes/robot-1")
@@ -76,7 +53,7 @@ def test_a_revoked_node_is_in_the_list_that_is_to_be_copied(shell: Shell, tmp_pa
 
 
 def test_a_published_list_is_newer_and_says_the_same(shell: Shell, tmp_path: Path) -> None:
-    shell("init")
+    shell("init", "--no-passphrase")
     shell("issue", "robot-1", "--role", "robot")
     shell("issue", "robot-2", "--role", "robot")
     shell("revoke", "robot-1")
@@ -98,7 +75,7 @@ def test_a_published_list_is_newer_and_says_the_same(shell: Shell, tmp_path: Pat
 
 
 def test_the_list_shows_everything(shell: Shell) -> None:
-    shell("init", "--name", "warehouse")
+    shell("init", "--no-passphrase", "--name", "warehouse")
     shell("issue", "robot-2", "--role", "robot", "--days", "30")
     shell("issue", "robot-1", "--role", "robot")
     shell("renew", "robot-2", "--days", "60")
@@ -114,7 +91,7 @@ def test_the_list_shows_everything(shell: Shell) -> None:
 
 
 def test_a_ca_is_rotated(shell: Shell, tmp_path: Path) -> None:
-    shell("init")
+    shell("init", "--no-passphrase")
     shell("issue", "cp", "--role", "controlplane")
     old = load_tls_files(tmp_path / "plr-ca/nodes/cp")
     shell("rotate", "--name", "next")
@@ -129,26 +106,10 @@ def test_a_ca_is_rotated(shell: Shell, tmp_path: Path) -> None:
         new.trust.identify(old.certificate_der)
 
 
-def test_the_key_may_have_a_passphrase(shell: Shell, tmp_path: Path) -> None:
-    secret = tmp_path / "passphrase"
-    secret.write_text("correct horse\n")
-    secret.chmod(0o600)
-    shell("init", "--passphrase-file", str(secret))
-    assert "give --passphrase-file" in shell("issue", "robot-1", "--role", "robot", code=2)
-    shell("issue", "robot-1", "--role", "robot", "--passphrase-file", str(secret))
-    assert "robot-1" in shell("list")
-    secret.write_text("wrong\n")
-    assert "another passphrase" in shell("renew", "robot-1", "--passphrase-file", str(secret), code=2)
-    secret.write_text("\n")
-    assert "expected a passphrase" in shell("renew", "robot-1", "--passphrase-file", str(secret), code=2)
-    secret.chmod(0o644)
-    assert "others may read" in shell("renew", "robot-1", "--passphrase-file", str(secret), code=2)
-
-
 def test_what_is_refused_says_what_to_do(shell: Shell, tmp_path: Path) -> None:
     assert "see: plr ca init" in shell("list", code=2)
     assert "see: plr ca init" in shell("issue", "robot-1", "--role", "robot", code=2)
-    shell("init", "--days", "10")
+    shell("init", "--no-passphrase", "--days", "10")
     assert "there is a CA already" in shell("init", code=2)
     assert "the CA itself ends" in shell("issue", "robot-1", "--role", "robot", code=1)
     assert "plr ca issue robot-1" in shell("renew", "robot-1", "--days", "1", code=1)
@@ -162,7 +123,7 @@ def test_what_is_refused_says_what_to_do(shell: Shell, tmp_path: Path) -> None:
 
 def test_a_folder_that_can_not_be_written_is_one_line(shell: Shell, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "file" in shell("init", "--dir", str(tmp_path / "file" / "ca"), code=1)
+    assert "file" in shell("init", "--no-passphrase", "--dir", str(tmp_path / "file" / "ca"), code=1)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +145,9 @@ def test_bad_usage_is_told(shell: Shell, arguments: list[str], problem: str) -> 
     assert problem in shell.usage(*arguments)
 
 
-@pytest.mark.parametrize("command", ["init", "issue", "renew", "revoke", "list", "rotate", "retire"])
+@pytest.mark.parametrize(
+    "command", ["init", "issue", "sign", "renew", "revoke", "publish", "list", "rotate", "retire", "passphrase"]
+)
 def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         cli.main(["ca", command, "--help"])
@@ -192,11 +155,19 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
     assert "--dir" in capsys.readouterr().out
 
 
-def test_the_commands_of_the_page_work_in_their_order(shell: Shell) -> None:
+def test_the_commands_of_the_page_work_in_their_order(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch, cheap_guesses: None
+) -> None:
     page = Path(__file__).parents[4] / "docs" / "certificates.md"
-    commands = re.findall(r"^ *plr ca (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    assert {command.split()[0] for command in commands} == {
-        *("init", "issue", "list", "publish", "renew", "revoke", "rotate", "retire")
+    commands = [
+        command.split() for command in re.findall(r"^ *plr (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+    assert {name for program, name, *_ in commands if program == "ca"} == {
+        *("init", "issue", "list", "passphrase", "publish", "renew", "revoke", "rotate", "retire", "sign")
     }
+    for variable in (VARIABLE, NEW_VARIABLE):
+        monkeypatch.setenv(variable, "correct horse")
     for command in commands:
-        shell(*command.split())
+        shell.run(*command)
+        if command[0] == "request":
+            shutil.copy("plr-request/request.pem", ".")  # by scp

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import stat
 import threading
 from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority, folder
+from controlplane.ca import Authority, AuthorityError, folder
 from controlplane.ca.files import write_atomically
-from controlplane.ca.folder import AuthorityFolder
+from controlplane.ca.folder import AuthorityFolder, Protection
 from protos.errors import ConfigError
 from protos.identity import CertificateError, IdentityRole, Trust
 
@@ -85,6 +86,19 @@ def test_a_former_ca_goes_with_its_key(kept: AuthorityFolder) -> None:
     ]
 
 
+@pytest.mark.audit("sec-11")
+def test_the_keys_of_a_former_ca_are_remembered(kept: AuthorityFolder) -> None:
+    with kept.locked() as authority:
+        stolen = authority.issue("robot-1", IdentityRole.ROBOT).key
+        authority.revoke("robot-1")
+        authority.rotate("next")
+        authority.retire()
+        authority.issue("robot-1", IdentityRole.ROBOT)
+        kept.save(authority)
+    with kept.locked() as authority, pytest.raises(AuthorityError, match="was revoked"):
+        authority.renew("robot-1", key=stolen)
+
+
 def test_every_nodes_folder_hears_of_a_revocation(kept: AuthorityFolder) -> None:
     with kept.locked() as authority:
         authority.write_tls_dir(kept.node_folder("cp"), "cp", IdentityRole.CONTROL_PLANE)
@@ -111,19 +125,63 @@ def test_a_nodes_folder_is_not_touched_for_nothing(kept: AuthorityFolder) -> Non
 # -- passphrase ----------------------------------------------------------------------------------------------------
 
 
-def test_a_passphrase_guards_the_key(tmp_path: Path) -> None:
+def test_a_passphrase_guards_the_key(tmp_path: Path, cheap_guesses: None) -> None:
     AuthorityFolder(tmp_path / "ca", b"secret").create(Authority.create())
     with AuthorityFolder(tmp_path / "ca", b"secret").locked() as authority:
         authority.issue("robot-1", IdentityRole.ROBOT)
-    for passphrase, problem in ((None, "give --passphrase-file"), (b"wrong", "or another passphrase")):
+    for passphrase, problem in ((None, "give --passphrase-file"), (b"wrong", "another passphrase")):
         with pytest.raises(ConfigError, match=problem), AuthorityFolder(tmp_path / "ca", passphrase).locked():
             pass
     assert len(AuthorityFolder(tmp_path / "ca").records()) == 1
 
 
-def test_a_passphrase_for_a_key_without_one_is_refused(kept: AuthorityFolder) -> None:
-    with pytest.raises(ConfigError, match="leave out --passphrase-file"), AuthorityFolder(kept.path, b"x").locked():
-        pass
+@pytest.mark.audit("sec-11")
+def test_a_new_ca_has_its_key_under_the_passphrase_of_the_one_before(tmp_path: Path) -> None:
+    kept = AuthorityFolder(tmp_path / "ca", b"secret")
+    kept.create(Authority.create())
+    with kept.locked() as authority:
+        authority.rotate("next")
+        kept.save(authority)
+    assert kept.protections() == [Protection.GOOD] * 2
+
+
+@pytest.mark.audit("sec-11")
+@pytest.mark.parametrize("before", [None, b"secret"])
+@pytest.mark.parametrize("after", [None, b"another"])
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_a_change_of_passphrase_that_was_cut_short_can_be_given_again(
+    tmp_path: Path,
+    cheap_guesses: None,
+    monkeypatch: pytest.MonkeyPatch,
+    before: bytes | None,
+    after: bytes | None,
+    count: int,
+) -> None:
+    kept = AuthorityFolder(tmp_path / "ca", before)
+    kept.create(Authority.create())
+    with kept.locked() as authority:
+        authority.rotate("next")
+        kept.save(authority)
+    with monkeypatch.context() as cut, contextlib.suppress(Cut):
+        cut_at(cut, count)
+        kept.change_passphrase(after)
+    kept.change_passphrase(after)
+    assert kept.protections() == [Protection.CLEAR if after is None else Protection.GOOD] * 2
+    with AuthorityFolder(tmp_path / "ca", after).locked() as again:
+        assert [each.own.certificate for each in (again, *again.former)] == [
+            each.own.certificate for each in (authority, *authority.former)
+        ]
+
+
+@pytest.mark.audit("sec-11")
+def test_a_wrong_passphrase_changes_nothing(tmp_path: Path, cheap_guesses: None) -> None:
+    AuthorityFolder(tmp_path / "ca", b"secret").create(Authority.create())
+    (key,) = tmp_path.glob("ca/authorities/*/key.pem")
+    before = key.read_bytes()
+    for new in (None, b"another"):
+        with pytest.raises(ConfigError, match="another passphrase"):
+            AuthorityFolder(tmp_path / "ca", b"wrong").change_passphrase(new)
+    assert key.read_bytes() == before
 
 
 # -- interruptions and company -------------------------------------------------------------------------------------

@@ -1,0 +1,117 @@
+"""A node's request for a certificate: PKCS #10 with its name and role, signed with the key that stays on the node.
+
+    subject          CN=robot-7
+    public key       ECDSA on P-256
+    attributes       one extension request, of one extension:
+    subjectAltName   as the certificate's (protos/identity.py)
+
+A request proves that who made it has the key, and nothing else: whoever made it wrote down the name and role. So the CA
+takes its key only, and name and role from the operator. Who asks for more than a certificate of ours holds is refused.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+from cryptography.x509.oid import NameOID
+
+from controlplane.ca.certificates import alternative_names
+from protos.errors import DecodeError
+from protos.identity import SIGNATURES, name_and_role
+
+if TYPE_CHECKING:
+    from protos.identity import IdentityRole
+    from protos.model import NodeName
+
+REQUEST_FILE = "request.pem"
+
+MAX_REQUEST_BYTES = 4096
+"""Longest request, PEM: `plr request` writes some 420 bytes."""
+
+_EXTENSION_REQUEST = "1.2.840.113549.1.9.14"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What a node asks for; that it has the key is checked, that it is who it says is not."""
+
+    name: NodeName
+    role: IdentityRole
+    key: ec.EllipticCurvePublicKey = field(repr=False)
+
+
+def fingerprint(key: ec.EllipticCurvePublicKey) -> str:
+    """Return what people compare, and the CA knows a key by: SHA-256 of its SubjectPublicKeyInfo in base64."""
+    digest = hashlib.sha256(key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)).digest()
+    return "SHA256:" + base64.b64encode(digest).rstrip(b"=").decode()
+
+
+def build_request(name: str, role: IdentityRole, key: ec.EllipticCurvePrivateKey) -> bytes:
+    """Return a request for a certificate of this key, PEM."""
+    builder = x509.CertificateSigningRequestBuilder().subject_name(
+        x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    )
+    builder = builder.add_extension(alternative_names(name, role), critical=False)
+    return builder.sign(key, hashes.SHA256(), ecdsa_deterministic=True).public_bytes(Encoding.PEM)
+
+
+def parse_request(pem: bytes) -> Request:
+    """Return what is asked for; raises DecodeError, whose text is fit for a terminal."""
+    if len(pem) > MAX_REQUEST_BYTES:
+        raise DecodeError(f"the request is longer than {MAX_REQUEST_BYTES} bytes")
+    try:
+        return _checked(x509.load_pem_x509_csr(pem))
+    except DecodeError:
+        raise
+    except Exception as error:
+        # As with certificates: a dozen kinds of errors, some only when a field is first looked at.
+        raise DecodeError(f"the request is malformed: {type(error).__name__}") from error
+
+
+def _checked(request: x509.CertificateSigningRequest) -> Request:
+    key = request.public_key()
+    if not (isinstance(key, ec.EllipticCurvePublicKey) and isinstance(key.curve, ec.SECP256R1)):
+        raise DecodeError(f"the request's key is not an ECDSA key on P-256, but {_kind(key)}")
+    if request.signature_algorithm_oid not in SIGNATURES:
+        raise DecodeError("the request is not signed with ECDSA and SHA-2")
+    if not request.is_signature_valid:
+        raise DecodeError("the request is not signed with the key that it names")
+    attributes = [each.oid.dotted_string for each in request.attributes]
+    if attributes != [_EXTENSION_REQUEST]:
+        found = ", ".join(attributes) or "none"
+        raise DecodeError(f"the request has the attributes {found}, expected {_EXTENSION_REQUEST} alone")
+    extensions = request.extensions
+    for extension in extensions:
+        if not isinstance(extension.value, x509.SubjectAlternativeName):
+            raise DecodeError(f"the request asks for more than a name and role: {_wish(extension)}")
+    name, role = name_and_role(extensions, "request")
+    if list(request.subject) != [x509.NameAttribute(NameOID.COMMON_NAME, name)]:
+        subject = request.subject.rfc4514_string()
+        raise DecodeError(f"the request's subject is {subject!a}, expected the name alone: CN={name}")
+    # The same key can be written in several ways: with the curve's parameters, or compressed. Here there is one.
+    point = key.public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
+    return Request(name, role, ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), point))
+
+
+def _kind(key: object) -> str:
+    if isinstance(key, rsa.RSAPublicKey):
+        return f"RSA of {key.key_size} bits"
+    if isinstance(key, ec.EllipticCurvePublicKey):
+        return f"one on {key.curve.name}"
+    return type(key).__name__.removesuffix("PublicKey")
+
+
+def _wish(extension: x509.Extension[x509.ExtensionType]) -> str:
+    value = extension.value
+    if isinstance(value, x509.BasicConstraints) and value.ca:
+        return "to be a CA"
+    if isinstance(value, x509.UnrecognizedExtension):
+        return extension.oid.dotted_string
+    return type(value).__name__

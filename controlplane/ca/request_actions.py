@@ -1,0 +1,134 @@
+"""What `plr request` and `plr ca sign` do: a certificate for a key that stays on its node."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from controlplane.ca import listing
+from controlplane.ca.actions import kept_key, opened, refuse_taken, say
+from controlplane.ca.authority import AuthorityError
+from controlplane.ca.certificates import generate_key
+from controlplane.ca.files import PRIVATE_FILE, PUBLIC_FILE, make_private, write_atomically, write_certificate
+from controlplane.ca.folder import AuthorityFolder
+from controlplane.ca.key_file import clear_pem
+from controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_request, fingerprint, parse_request
+from protos.errors import ConfigError, DecodeError
+from protos.identity import IdentityRole
+from protos.log_lines import escaped
+from protos.tls_files import KEY_FILE
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from controlplane.ca.index import Record
+    from controlplane.ca.request import Request
+
+_MAY = {
+    IdentityRole.ROBOT: "may call services",
+    IdentityRole.CLOUD: "may offer services",
+    IdentityRole.CONTROL_PLANE: "may tell every sidecar where the others are",
+    IdentityRole.OPERATOR: "may ask the control plane about everybody",
+}
+
+
+def request(arguments: argparse.Namespace) -> None:
+    """Make a key and a request for a certificate of it."""
+    out: Path = arguments.out
+    role = IdentityRole(arguments.role)
+    key = _own_key(out, arguments.name) if arguments.keep_key else _new_key(out)
+    write_atomically(out / REQUEST_FILE, build_request(arguments.name, role, key), PUBLIC_FILE)
+    say(f"wrote a request for {arguments.name} ({role.value}): {out / REQUEST_FILE}")
+    say(f"its key is {fingerprint(key.public_key())} and stays here: {out / KEY_FILE}")
+    say(f"copy {REQUEST_FILE} to where the CA is, and there do: plr ca sign {REQUEST_FILE}")
+
+
+def sign(arguments: argparse.Namespace) -> None:
+    """Certify the key of a request, with the name and role that the operator confirms."""
+    asked = _read(arguments.request)
+    _confirm(arguments, asked, AuthorityFolder(arguments.dir).records())
+    folder = opened(arguments)
+    with folder.locked() as authority:
+        out = arguments.out or folder.node_folder(asked.name)
+        if (out / KEY_FILE).exists():
+            raise AuthorityError(f"{out}: holds a key, and not the request's; delete it or give another --out")
+        refuse_taken(out, asked.name)
+        certificate = authority.sign(asked, renewing=arguments.renew, days=arguments.days)
+        folder.save(authority)
+        write_certificate(out, certificate.public_bytes(Encoding.PEM), authority.ca_pem, authority.crl_pem())
+    until = listing.day(certificate.not_valid_after_utc.timestamp())
+    say(f"signed {asked.name} ({asked.role.value}), good until {until}; copy to where its key is: {out}")
+
+
+def _new_key(out: Path) -> ec.EllipticCurvePrivateKey:
+    if (out / KEY_FILE).exists():
+        raise AuthorityError(f"{out}: holds a key; give another --out, or --keep-key for a certificate of that one")
+    make_private(out)
+    key = generate_key()
+    write_atomically(out / KEY_FILE, clear_pem(key), PRIVATE_FILE)
+    return key
+
+
+def _own_key(out: Path, name: str) -> ec.EllipticCurvePrivateKey:
+    key = kept_key(out)
+    if not isinstance(key.curve, ec.SECP256R1):
+        raise AuthorityError(f"{out / KEY_FILE}: not on P-256; make another without --keep-key: plr request {name}")
+    return key
+
+
+def _read(path: Path) -> Request:
+    with path.open("rb") as file:
+        pem = file.read(MAX_REQUEST_BYTES + 1)
+    try:
+        return parse_request(pem)
+    except DecodeError as error:
+        raise AuthorityError(f"{path}: {error}; make it with: plr request") from error
+
+
+def _confirm(arguments: argparse.Namespace, asked: Request, records: Iterable[Record]) -> None:
+    """Return if the operator wants just this, by options or at the terminal; raises AuthorityError or ConfigError."""
+    name, role, key = asked.name, asked.role.value, fingerprint(asked.key)
+    for what, wanted, found in (
+        ("name", arguments.name, name),
+        ("role", arguments.role, role),
+        ("key", arguments.fingerprint, key),
+    ):
+        if wanted not in (None, found):
+            raise AuthorityError(f"{arguments.request}: asks for the {what} {found}, not {wanted}; nothing was signed")
+    if arguments.name is not None and arguments.role is not None:
+        return
+    if not sys.stdin.isatty():
+        problem = f"asks for the name {name} and the role {role}, and there is no terminal to confirm that"
+        raise ConfigError(str(arguments.request), "", f"{problem}; give --name and --role")
+    sys.stderr.write(
+        f"{escaped(str(arguments.request))} asks for\n"
+        f"  name  {name}, which has {_state(records, name)}\n"
+        f"  role  {role}, which {_MAY[asked.role]}\n"
+        f"  key   {key}; compare it with what plr request showed\n"
+        "type the role to sign it, anything else to refuse: "
+    )
+    sys.stderr.flush()
+    if _typed() != role:
+        raise AuthorityError("not confirmed; nothing was signed")
+
+
+def _typed() -> str:
+    try:
+        return sys.stdin.readline().strip()
+    except UnicodeError:
+        return ""
+
+
+def _state(records: Iterable[Record], name: str) -> str:
+    entries = [entry for record in records for entry in record.entries if entry.name == name]
+    if not entries:
+        return "no certificate yet"
+    newest = max(entries, key=lambda entry: entry.not_before)
+    if newest.revoked_at is not None:
+        return f"a certificate as {newest.role.value} that was revoked on {listing.day(newest.revoked_at)}"
+    return f"a certificate as {newest.role.value} until {listing.day(newest.not_after)}"
