@@ -7,6 +7,7 @@ examples:
   plr plan --traces drive.csv.gz --request-bytes 120000 --deadline-ms 250 --target 0.01
   plr ca init
   plr ca issue robot-1 --role robot
+  plr request robot-2 --role robot
   plr config schema controlplane
   plr config schema sidecar
   plr policy check --config /etc/plr/controlplane.yaml --robot arm-1 --service /plan --cloud cloud-a

@@ -36,6 +36,7 @@ def render(explanation: Explanation) -> str:
     for title, section in (
         ("mapping in force", list(_mapping(found))),
         ("pairs (times in ms, * in force)", list(_pairs(found))),
+        ("servers whose answers can not be delivered: others go before them", list(columns(_penalties(found)))),
         ("who says what the servers need", list(columns(_witnesses(found)))),
         (
             "interfaces that carried copies of the same requests",
@@ -78,7 +79,7 @@ def _pair(pair: PairExplanation) -> tuple[str, ...]:
         "*" if pair.chosen else "",
         _labelled(pair.path.interface, pair.carrier),
         _labelled(pair.path.server, pair.region),
-        {True: "up", False: "DOWN", None: "unknown"}[pair.up] + (", barred" if pair.barred else ""),
+        _state(pair),
         _probability(pair.miss.mean) if pair.miss is not None else "-",
         f"{_probability(pair.miss.low)} .. {_probability(pair.miss.high)}" if pair.miss is not None else "-",
         f"{pair.requests:.0f}",
@@ -87,6 +88,23 @@ def _pair(pair: PairExplanation) -> tuple[str, ...]:
         *_quantiles(pair.network),
         *_quantiles(pair.compute),
     )
+
+
+def _state(pair: PairExplanation) -> str:
+    state = {True: "up", False: "DOWN", None: "unknown"}[pair.up]
+    return state + ", barred" * pair.barred + ", PENALTY" * (pair.penalty_s > 0.0)
+
+
+def _penalties(found: Explanation) -> list[tuple[str, ...]]:
+    of_servers = {pair.path.server: pair for pair in found.pairs if pair.penalty_s > 0.0}
+    return [
+        (
+            f"{server}:",
+            f"{pair.bad_answers} bad answer{'s' * (pair.bad_answers != 1)} to {found.robot} lately,",
+            f"penalty ends in {_age(pair.penalty_s)}",
+        )
+        for server, pair in of_servers.items()
+    ]
 
 
 def _witnesses(found: Explanation) -> list[tuple[str, ...]]:

@@ -259,6 +259,7 @@ def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
             ("old_stream",): core.counters.old_stream_messages,
             ("report_of_cloud",): core.counters.reports_ignored,
             ("report_forbidden",): core.counters.report_entries_forbidden,
+            ("announced_too_often",): core.restlessness.held,
             ("superseded_before_sent",): superseded,
         },
     )

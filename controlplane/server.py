@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import tempfile
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
 from controlplane.stun_server import start_stun_server
 from controlplane.tls_gate import TlsGate
+from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
 from protos.plr.v1 import admin_pb2_grpc
 
@@ -91,7 +93,8 @@ async def serve(
         # Nobody but this user gets at the socket behind the gate.
         folder = cleanup.enter_context(tempfile.TemporaryDirectory(prefix="plr-controlplane-"))
         upstream = f"{folder}/grpc"
-        gate = TlsGate(files, upstream, metrics.refused_connection) if files is not None else None
+        clock = ClockFloor(time.time, alert=log.error)
+        gate = TlsGate(files, upstream, metrics.refused_connection, clock) if files is not None else None
         server, health_service = _make_server(config, loop, metrics, gate)
         stun = await _start_stun(config, loop, cleanup)
         metrics_address = _start_metrics(config, metrics)
@@ -107,7 +110,7 @@ async def serve(
             tasks.create_task(loop.run())
             keeper = None
             if files is not None and gate is not None:
-                keeper = tasks.create_task(CertificateKeeper(files, gate, loop, metrics).run())
+                keeper = tasks.create_task(CertificateKeeper(files, gate, loop, metrics, clock).run())
             reloading = tasks.create_task(reload.run(loop.set_policy, metrics))
             for name in _SERVICES:
                 await health_service.set(name, health_pb2.HealthCheckResponse.SERVING)

@@ -17,7 +17,6 @@ import logging
 import secrets
 import socket
 import ssl
-import time
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import partial
@@ -32,6 +31,7 @@ from protos.token_bucket import TokenBucket
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from protos.clock_floor import ClockFloor
     from protos.identity import Identity, Trust
     from protos.model import NodeName
     from protos.tls_files import TlsFiles
@@ -91,10 +91,11 @@ class _Connection:
 class TlsGate:
     """Accepts connections for the gRPC server at the Unix socket `upstream`; for one event loop.
 
-    `on_refused` is told the reason of every connection that is refused or ended.
+    `on_refused` is told the reason of every connection that is refused or ended; certificates are judged by `clock`.
     """
 
-    def __init__(self, files: TlsFiles, upstream: str, on_refused: Callable[[str], None]) -> None:
+    def __init__(self, files: TlsFiles, upstream: str, on_refused: Callable[[str], None], clock: ClockFloor) -> None:
+        self._clock = clock
         self._trust: Trust = files.trust
         self._context = server_context(files)
         self._upstream = upstream
@@ -279,9 +280,14 @@ class TlsGate:
     def _check(self, certificate: bytes) -> Caller:
         """Return the caller with its refusal, if any; raises CertificateError for one that is not even of our CA."""
         try:
-            return Caller(self._trust.check(certificate, time.time()), certificate)
+            return Caller(self._good(certificate), certificate)
         except CertificateError as error:
             return Caller(self._trust.identify(certificate), certificate, error)
+
+    def _good(self, certificate: bytes) -> Identity:
+        identity = self._trust.check(certificate, self._clock.now())
+        self._clock.note(identity.not_before)
+        return identity
 
     def _review(self, connection: _Connection) -> None:
         """End the connection if its certificate is not good any more."""
@@ -289,7 +295,7 @@ class TlsGate:
         if caller.refusal is not None:
             return
         try:
-            self._trust.check(caller.certificate, time.time())
+            self._good(caller.certificate)
         except CertificateError as error:
             refusal = error
         else:

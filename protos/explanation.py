@@ -58,6 +58,10 @@ class PairExplanation:
     """Whose word counts for most; None without witnesses."""
     busiest_share: float = 0.0
     """For what share of all."""
+    penalty_s: float = 0.0
+    """The robot asks others in place of this server for so long yet, ..."""
+    bad_answers: int = 0
+    """... for so many answers that could not be delivered."""
 
 
 class Correlation(enum.Enum):

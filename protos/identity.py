@@ -53,7 +53,7 @@ WRONG_ROLE = "wrong_role"
 REVOKED = "revoked"
 LIST_TOO_OLD = "list_too_old"
 
-_SIGNATURES = frozenset(
+SIGNATURES = frozenset(
     {
         SignatureAlgorithmOID.ECDSA_WITH_SHA256,
         SignatureAlgorithmOID.ECDSA_WITH_SHA384,
@@ -200,7 +200,7 @@ class Trust:
         try:
             certificate = x509.load_der_x509_certificate(certificate_der)
             _check_leaf(certificate)
-            name, role = _name_and_role(certificate)
+            name, role = name_and_role(certificate.extensions, "certificate")
             begin, end = _validity(certificate)
         except CertificateError:
             raise
@@ -291,7 +291,7 @@ def _check_leaf(certificate: x509.Certificate) -> None:
     key = certificate.public_key()
     if not (isinstance(key, ec.EllipticCurvePublicKey) and isinstance(key.curve, ec.SECP256R1)):
         raise CertificateError(MALFORMED, "the certificate's key is not an ECDSA key on P-256")
-    if certificate.signature_algorithm_oid not in _SIGNATURES:
+    if certificate.signature_algorithm_oid not in SIGNATURES:
         raise CertificateError(MALFORMED, "the certificate is not signed with ECDSA and SHA-2")
     extensions = certificate.extensions
     known = (x509.BasicConstraints, x509.KeyUsage, x509.ExtendedKeyUsage, x509.SubjectAlternativeName)
@@ -306,26 +306,27 @@ def _check_leaf(certificate: x509.Certificate) -> None:
         raise CertificateError(MALFORMED, "the certificate is not for TLS clients")
 
 
-def _name_and_role(certificate: x509.Certificate) -> tuple[NodeName, IdentityRole]:
-    names = list(certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value)
+def name_and_role(extensions: x509.Extensions, what: str) -> tuple[NodeName, IdentityRole]:
+    """Return whom a certificate or a request (`what` of the two, for the text) names; raises CertificateError."""
+    names = list(extensions.get_extension_for_class(x509.SubjectAlternativeName).value)
     uris = [name.value for name in names if isinstance(name, x509.UniformResourceIdentifier)]
     others = [name for name in names if not isinstance(name, x509.UniformResourceIdentifier)]
     if len(uris) != 1:
-        raise CertificateError(MALFORMED, f"the certificate has {len(uris)} URIs, expected one")
+        raise CertificateError(MALFORMED, f"the {what} has {len(uris)} URIs, expected one")
     scheme, _, rest = uris[0].partition("://")
     role_text, _, name_text = rest.partition("/")
     if scheme != URI_SCHEME:
-        raise CertificateError(MALFORMED, f"the certificate's URI is not {URI_SCHEME}://role/name")
+        raise CertificateError(MALFORMED, f"the {what}'s URI is not {URI_SCHEME}://role/name")
     role = _ROLES.get(role_text)
     if role is None:
-        raise CertificateError(WRONG_ROLE, f"the certificate's role {role_text!a} is unknown")
+        raise CertificateError(WRONG_ROLE, f"the {what}'s role {role_text!a} is unknown")
     try:
-        name = node_name(name_text, "the certificate's name")
+        name = node_name(name_text, f"the {what}'s name")
     except DecodeError as error:
         raise CertificateError(MALFORMED, str(error)) from error
     expected = [x509.DNSName(CONTROL_PLANE_DNS)] if role is IdentityRole.CONTROL_PLANE else []
     if others != expected:
-        raise CertificateError(MALFORMED, f"the certificate has alternative names that a {role.value} has not")
+        raise CertificateError(MALFORMED, f"the {what} has alternative names that a {role.value} has not")
     return name, role
 
 

@@ -68,6 +68,9 @@ MAX_PATHS = 4096
 MAX_JOINTS = 1024
 """Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers. As many of interfaces."""
 
+MAX_PENALTIES = 1024
+"""Servers in one report whose answers could not be delivered."""
+
 
 class Role(enum.Enum):
     """What a sidecar is for."""
@@ -425,6 +428,17 @@ class InterfaceJointReport:
 
 
 @dataclass(frozen=True, slots=True)
+class PenaltyReport:
+    """A server whose answers could not be delivered: whatever the mapping says, others go before it."""
+
+    server: NodeName
+    left_s: float
+    """For how long yet."""
+    bad_answers: int = 1
+    """That it is penalised for; half of what lies two minutes back."""
+
+
+@dataclass(frozen=True, slots=True)
 class Report:
     """Everything a robot sidecar measured since its last report."""
 
@@ -433,6 +447,8 @@ class Report:
     outcomes: tuple[OutcomeReport, ...] = ()
     joints: tuple[JointReport, ...] = ()
     interface_joints: tuple[InterfaceJointReport, ...] = ()
+    penalties: tuple[PenaltyReport, ...] = ()
+    """All that are in force."""
 
 
 SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain | RevocationSet

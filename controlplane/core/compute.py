@@ -10,7 +10,7 @@ from controlplane.core.distribution import Distribution
 from controlplane.core.fading import FadedCount, FadedHistogram
 from controlplane.core.regime import ChangeWatch
 from controlplane.core.silence import HeardClock
-from controlplane.core.witnesses import Witnesses
+from controlplane.core.witnesses import COUNTS_ANYWAY, Witnesses
 from protos.histogram import Histogram
 
 if TYPE_CHECKING:
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 MAX_PROCESSING = 8192
 """Processing histograms kept, one for each (server, service); the least recently reported goes."""
+
+MAX_PROCESSING_OF_SERVER = 1024
+"""Of these for one server, as many as it may offer at once: one that changes its offers evicts nobody else's."""
 
 OTHERS_REQUESTS = 1.0
 """What the other servers of a service are worth, in requests to a server itself: machines are not alike."""
@@ -93,6 +96,8 @@ class ComputeTimes:
         self._servers: OrderedDict[tuple[NodeName, ServiceName], _OfServer] = OrderedDict()
         self._services: dict[ServiceName, _OfService] = {}
         """Of the servers kept."""
+        self._kept: dict[NodeName, OrderedDict[ServiceName, None]] = {}
+        """Services kept of each server, the one reported least recently first."""
         self.dropped = 0
         """Entries evicted because a table was full."""
 
@@ -115,9 +120,15 @@ class ComputeTimes:
             self._servers[server, service] = of_server
             of_service.servers[server] = of_server.times
         self._servers.move_to_end((server, service))
-        if len(self._servers) > MAX_PROCESSING:
-            self._forget(*self._servers.popitem(last=False)[0])
-        of_server.lately.add(processing.total, 0.0, now)
+        kept = self._kept.setdefault(server, OrderedDict())
+        kept[service] = None
+        kept.move_to_end(service)
+        if len(kept) > MAX_PROCESSING_OF_SERVER:
+            self._forget(server, next(iter(kept)))
+        elif len(self._servers) > MAX_PROCESSING:
+            self._forget(*next(iter(self._servers)))
+        # No more than a robot may count for: what it says of one moment shall not pass for minutes.
+        of_server.lately.add(min(processing.total, int(COUNTS_ANYWAY)), 0.0, now)
         processing = of_server.witnesses.weigh(robot, processing, now)
         since = of_server.changed_with(robot, processing, now)
         if since is None:
@@ -141,6 +152,10 @@ class ComputeTimes:
                 times.forget(DOUBTED_REQUESTS / max(times.weight(now), DOUBTED_REQUESTS))
 
     def _forget(self, server: NodeName, service: ServiceName) -> None:
+        del self._servers[server, service]
+        del self._kept[server][service]
+        if not self._kept[server]:
+            del self._kept[server]
         of_service = self._services[service]
         del of_service.servers[server]
         if not of_service.servers:

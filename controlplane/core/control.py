@@ -7,6 +7,7 @@ call it drains `next_event`. Times are monotonic seconds.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, assert_never
@@ -37,6 +38,7 @@ from controlplane.core.reconcile import changed_robots
 from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.report_filter import believable
+from controlplane.core.restlessness import Restlessness
 from controlplane.core.stability import Stability
 from controlplane.core.status import statuses
 from protos.errors import DecodeError
@@ -64,6 +66,9 @@ if TYPE_CHECKING:
     from protos.explanation import Explanation
     from protos.model import NodeName, ServiceName, SidecarMessage
     from protos.status import SidecarStatus, SyncState
+
+RESTLESS_DELAY_S = 1.0
+"""The same, for a member that comes and goes beyond its share."""
 
 PUBLISH_DELAY_S = 0.02
 """From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two
@@ -104,6 +109,7 @@ class ControlCore:
         self._last_stream = 0
         self._crl = b""
         self._refused_offers = RefusedOffers()
+        self.restlessness = Restlessness()
         self._publish_at: float | None = None
         self._events: deque[Event] = deque()
 
@@ -117,13 +123,14 @@ class ControlCore:
             return result
         self._last_stream = stream
         name = registration.name
+        self.restlessness.forget(name)
         self._close(result.replaced, CloseReason.REPLACED, now)
         self._streams[stream] = name
         if result.new_run:
             self._forget_paths(name)
         self._publisher.begin_stream(registration)
         self._events.append(Send(stream, self._welcome()))
-        self._members_changed(now)
+        self._came_or_went(name, now)
         return stream
 
     def receive(self, stream: StreamId, message: SidecarMessage, now: float) -> None:
@@ -135,13 +142,9 @@ class ControlCore:
         match message:
             case Registration():
                 raise DecodeError("a second registration on one stream")
-            case CandidateSet():
-                if self.registry.set_candidates(name, message):
-                    self._members_changed(now)
-            case ServiceSet():
-                if self.registry.set_services(name, message):
-                    self._members_changed(now)
-                    self._note_refused_offers(name)
+            case CandidateSet() | ServiceSet():
+                if self.restlessness.admits(name, stream, message, now):
+                    self._announced(name, message, now)
             case Report():
                 self._receive_report(name, message, now)
             case Ack():
@@ -150,13 +153,23 @@ class ControlCore:
                 self._receive_nack(name, message, now)
             case Drain():
                 if self.registry.set_draining(name):
-                    self._members_changed(now)
+                    self._came_or_went(name, now)
             case RevocationSet():
                 self.registry.set_revocations(name, message)
             case Heartbeat():
                 pass
             case _:
                 assert_never(message)
+
+    def _announced(self, name: NodeName, told: CandidateSet | ServiceSet, now: float) -> None:
+        if isinstance(told, CandidateSet):
+            changed = self.registry.set_candidates(name, told)
+        else:
+            changed = self.registry.set_services(name, told)
+        if changed:
+            self._members_changed(now)
+            if isinstance(told, ServiceSet):
+                self._note_refused_offers(name)
 
     def _receive_report(self, name: NodeName, report: Report, now: float) -> None:
         sidecar = self.registry.get(name)
@@ -237,7 +250,7 @@ class ControlCore:
         name = self._streams.pop(stream, None)
         if name is not None and self.registry.disconnect(name, stream) is not None:
             self._forget(name, RemovalReason.LEFT)
-            self._members_changed(now)
+            self._came_or_went(name, now)
 
     # ── policy ──
 
@@ -270,6 +283,7 @@ class ControlCore:
             self._drawing_since,
             self._publisher.warm_until,
             self._publisher.resend_at,
+            self.restlessness.next_time(),
         )
         return min((time for time in times if time is not None), default=None)
 
@@ -279,6 +293,10 @@ class ControlCore:
             self._close(sidecar.stream, CloseReason.LEASE_EXPIRED, now)
             self._forget(sidecar.name, RemovalReason.LEASE_EXPIRED)
             self._members_changed(now)
+        for name, stream, waited in self.restlessness.due(now):
+            if self._streams.get(stream) == name and self.registry.get(name) is not None:
+                for told in waited:
+                    self._announced(name, told, now)
         if self._publisher.warm_until is not None and self._publisher.warm_until <= now:
             self._publisher.end_warm_up()
             self._publish_soon(now)
@@ -292,6 +310,7 @@ class ControlCore:
         self._events.append(DepartureNotice(name, reason))
         self._forget_paths(name)
         self._refused_offers.forget(name)
+        self.restlessness.forget(name)
         self._publisher.forget(name)
 
     def _forget_paths(self, name: NodeName) -> None:
@@ -303,9 +322,18 @@ class ControlCore:
         self._debounce.note(Change.MEMBERS, now)
         self._publish_soon(now)
 
-    def _publish_soon(self, now: float) -> None:
+    def _came_or_went(self, name: NodeName, now: float) -> None:
+        """By its own will: beyond its share that is told a little later, and not solved for at once."""
+        if self.restlessness.take(name, now):
+            self._members_changed(now)
+            return
+        self._drawing.members_changed()
+        self._debounce.note(Change.REPORT, now)
         if self._publish_at is None:
-            self._publish_at = now + PUBLISH_DELAY_S
+            self._publish_at = now + RESTLESS_DELAY_S
+
+    def _publish_soon(self, now: float) -> None:
+        self._publish_at = min(self._publish_at or math.inf, now + PUBLISH_DELAY_S)
 
     # ── solving ──
 

@@ -103,6 +103,8 @@ class Drawing:
         self._routine = False
         self._queue: list[NodeName] | None = None
         """Robots still to be drawn for the next picture, the last one first; None until looked for."""
+        self._rest: tuple[NodeName, list[tuple[BlockKey, _Inputs]]] | None = None
+        """The robot that is being drawn, and its uses that are still to be, the last one first."""
 
     # ── what changed ──
 
@@ -132,6 +134,7 @@ class Drawing:
         """The next picture is wanted; unless `routine`, new reports alone do not matter for it."""
         self._routine = routine
         self._queue = None
+        self._put_back()
 
     def advance(self, sidecars: Iterable[Sidecar], permits: Permits, estimator: Estimator, now: float) -> bool:
         """Draw some of what has to be drawn for the next picture; True once that is complete.
@@ -139,15 +142,31 @@ class Drawing:
         `sidecars` are those ready. To be called again until it returns True, with other work in between.
         """
         if self._frame is None:
+            self._put_back()
             self._frame = self._look_around(sidecars, permits)
         if self._queue is None:
             self._queue = self._next_routine(self._frame, now) if self._routine else []
         self._queue += reversed(self._urgent)
         self._urgent.clear()
         pairs = 0
-        while self._queue and pairs < SLICE_PAIRS:
-            pairs += self._draw_robot(self._queue.pop(), self._frame, estimator, now)
-        return not self._queue
+        while (self._rest or self._queue) and pairs < SLICE_PAIRS:
+            if self._rest is None:
+                robot = self._queue.pop()
+                self._rest = robot, list(reversed(self._frame.uses.get(robot, ())))
+                self._at[robot] = now
+                self._surprise.pop(robot, None)
+            robot, uses = self._rest
+            if uses:
+                pairs += self._draw_use(*uses.pop(), estimator, now)
+            if not uses:
+                self._rest = None
+        return not self._queue and not self._rest
+
+    def _put_back(self) -> None:
+        """A robot of which some uses were drawn is drawn anew."""
+        if self._rest is not None:
+            self._urgent[self._rest[0]] = None
+            self._rest = None
 
     def picture(self) -> Picture:
         """What was drawn."""
@@ -212,25 +231,20 @@ class Drawing:
     def _is_due(self, robot: NodeName, now: float) -> bool:
         return robot in self._surprise or now - self._at.get(robot, now) >= STALE_S
 
-    def _draw_robot(self, robot: NodeName, frame: _Frame, estimator: Estimator, now: float) -> int:
+    def _draw_use(self, key: BlockKey, inputs: _Inputs, estimator: Estimator, now: float) -> int:
         """Returns the pairs that were estimated."""
-        pairs = 0
-        for key, inputs in frame.uses.get(robot, ()):
-            before = self._drawn.get(key)
-            if inputs.unserved:
-                servers = tuple(cloud.name for cloud in inputs.clouds)
-                self._drawn[key] = _Drawn(inputs, None, BlockNotes(servers, unserved=inputs.unserved))
-                continue
-            block, notes = draw_block(
-                inputs.robot, inputs.use, inputs.clouds, estimator, now, capacity=self._capacity, barred=inputs.barred
-            )
-            if before is not None and before.block is not None and is_alike(block, before.block):
-                block = before.block
-            self._drawn[key] = _Drawn(inputs, block, notes)
-            pairs += inputs.pairs
-        self._at[robot] = now
-        self._surprise.pop(robot, None)
-        return pairs
+        before = self._drawn.get(key)
+        if inputs.unserved:
+            servers = tuple(cloud.name for cloud in inputs.clouds)
+            self._drawn[key] = _Drawn(inputs, None, BlockNotes(servers, unserved=inputs.unserved))
+            return 0
+        block, notes = draw_block(
+            inputs.robot, inputs.use, inputs.clouds, estimator, now, capacity=self._capacity, barred=inputs.barred
+        )
+        if before is not None and before.block is not None and is_alike(block, before.block):
+            block = before.block
+        self._drawn[key] = _Drawn(inputs, block, notes)
+        return inputs.pairs
 
 
 def _inputs(

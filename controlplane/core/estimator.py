@@ -17,6 +17,7 @@ from controlplane.core.fading import FadedCount, FadedShares
 from controlplane.core.interface_trouble import InterfaceTrouble
 from controlplane.core.network import RobotNetwork
 from controlplane.core.parts import Asked, from_parts
+from controlplane.core.penalties import Penalties
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
 from controlplane.core.shared_fate import SharedFate
 from controlplane.core.silence import HeardClock
@@ -25,7 +26,7 @@ from protos.histogram import Histogram
 from protos.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from controlplane.core.shared_fate import CommonMisses
     from protos.model import (
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
         LatencyReport,
         NodeName,
         PathReport,
+        PenaltyReport,
         Report,
         ServiceName,
     )
@@ -115,7 +117,9 @@ class _Pair:
 class _Robot:
     """Tables fed by one robot."""
 
-    __slots__ = ("fates", "joints", "network", "outcomes", "services", "trials", "troubles", "troubles_at")
+    __slots__ = (
+        *("fates", "joints", "network", "outcomes", "penalties", "services", "trials", "troubles", "troubles_at"),
+    )
 
     def __init__(self, half_life_s: float) -> None:
         self.network = RobotNetwork(half_life_s)
@@ -124,6 +128,7 @@ class _Robot:
         self.fates: OrderedDict[FateKey, SharedFate] = OrderedDict()
         self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
+        self.penalties = Penalties()
         self.troubles: dict[tuple[ServiceName, float], InterfaceTrouble] = {}
         """Worked out, by service and deadline ..."""
         self.troubles_at = (0, 0.0)
@@ -154,7 +159,7 @@ class Estimator:
 
     def merge(self, robot: NodeName, report: Report, now: float) -> bool:
         """Add a report; True if a path went up or down with it, or is reported for the first time, or if a server needs
-        other times than before."""
+        other times than before, or is penalised or is so no more."""
         self._reports += 1
         tables = self._robots.get(robot)
         if tables is None:
@@ -163,7 +168,7 @@ class Estimator:
         network = tables.network
         self._histograms -= len(network)
         dropped_before = network.dropped
-        changed = False
+        changed = tables.penalties.replace(report.penalties, now)
         for latency in report.latencies:
             changed |= self._merge_latency(robot, tables, latency, now)
         for joint in report.joints:
@@ -240,6 +245,11 @@ class Estimator:
         tables = self._robots.get(robot)
         state = tables.network.paths.get((interface, server)) if tables is not None else None
         return state.up if state is not None else None
+
+    def penalties(self, robot: NodeName, now: float) -> Mapping[NodeName, PenaltyReport]:
+        """Servers that the robot asks only where it has no other, as their answers could not be delivered."""
+        tables = self._robots.get(robot)
+        return tables.penalties.in_force(now) if tables is not None else {}
 
     def observed_miss_ratio(self, robot: NodeName, service: ServiceName, now: float) -> float | None:
         """Share of the robot's recent requests that missed their deadline or failed; None without any."""

@@ -127,8 +127,10 @@ def _pairs(
     def rank(path: Assignment) -> tuple[bool, float]:
         return path not in chosen, beliefs[path].mean if path in beliefs else 2.0
 
+    penalties = estimator.penalties(key.robot, now)
     found: list[PairExplanation] = []
     for path in sorted(paths, key=rank)[:MAX_PAIRS]:
+        penalty = penalties.get(path.server)
         evidence = estimator.evidence(key.robot, path, key.service, now)
         found.append(
             PairExplanation(
@@ -147,6 +149,8 @@ def _pairs(
                 witnesses=evidence.witnesses,
                 busiest_witness=evidence.busiest[0] if evidence.busiest is not None else None,
                 busiest_share=evidence.busiest[1] if evidence.busiest is not None else 0.0,
+                penalty_s=penalty.left_s if penalty is not None else 0.0,
+                bad_answers=penalty.bad_answers if penalty is not None else 0,
             )
         )
     return tuple(found)

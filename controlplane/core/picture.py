@@ -33,6 +33,8 @@ class BlockNotes:
     """No path at all is up, so every pair was let in."""
     barred: frozenset[tuple[InterfaceName, NodeName]] = frozenset()
     """Pairs that the operator's path rules keep mappings from."""
+    penalised: tuple[NodeName, ...] = ()
+    """Servers left out of the problem, as the robot can not use their answers, and there are others."""
     unserved: str = ""
     """Why there is nothing to assign; then the problem has no such block."""
 
@@ -63,7 +65,7 @@ def draw_block(
     """One robot's use of a service on these clouds, of which there is one at least, as of its interfaces.
 
     Only paths that are up are candidates, unless none is, and none of the pairs that are `barred`, of which not all
-    may be.
+    may be. Paths to servers that the robot penalises are candidates only if all are such.
     """
     interfaces = interfaces_of(robot)
     servers = tuple(cloud.name for cloud in clouds)
@@ -72,6 +74,12 @@ def draw_block(
     all_dark = not up
     if all_dark:
         up = allowed
+    usable, reaching = ({interface for interface, _ in pairs} for pairs in (allowed, up))
+    dark = tuple(interface for interface in interfaces if interface in usable and interface not in reaching)
+    penalties = estimator.penalties(robot.name, now)
+    favoured = {(interface, server) for interface, server in up if server not in penalties}
+    penalised = tuple(server for server in servers if favoured and server in penalties)
+    up = favoured or up
     lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
     reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
 
@@ -92,9 +100,7 @@ def draw_block(
         lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
         weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
-    usable = {interface for interface, _ in allowed}
-    dark = tuple(interface for interface in interfaces if interface in usable and interface not in lit)
-    return with_rules(block, robot, use, clouds), BlockNotes(servers, dark, all_dark, barred)
+    return with_rules(block, robot, use, clouds), BlockNotes(servers, dark, all_dark, barred, penalised)
 
 
 def _lifts(

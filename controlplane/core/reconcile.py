@@ -112,7 +112,9 @@ def _standby(
     standby: list[Assignment] = []
     for interface in notes.dark:
         server = had.get(interface)
-        allowed = [name for name in notes.servers if (interface, name) not in notes.barred]
+        allowed = [
+            name for name in notes.servers if (interface, name) not in notes.barred and name not in notes.penalised
+        ]
         if single:
             server = planned[0].server
         elif server not in allowed:
@@ -133,6 +135,8 @@ def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objectiv
     if notes.dark:
         standing_by = ": on standby" if standby else ""
         parts.append(f"no path is up over {', '.join(notes.dark)}{standing_by}")
+    if notes.penalised:
+        parts.append(f"answers of {', '.join(notes.penalised)} can not be delivered: others go before")
     if block.shared:
         parts.append(f"copies share {', '.join(block.shared)}")
     if block.excess:

@@ -37,7 +37,11 @@ def believable(report: Report, robot: NodeName, registry: Registry, permits: Per
         one for one in report.joints if calls(one.first.server, one.service) and calls(one.second.server, one.service)
     )
     paths = tuple(one for one in report.paths if of(one.server)[0])
-    left_out = (
-        len(report.latencies) - len(latencies) + len(report.joints) - len(joints) + len(report.paths) - len(paths)
-    )
-    return (replace(report, latencies=latencies, joints=joints, paths=paths) if left_out else report), left_out
+    penalties = tuple(one for one in report.penalties if of(one.server)[0])
+    left = replace(report, latencies=latencies, joints=joints, paths=paths, penalties=penalties)
+    left_out = _entries(report) - _entries(left)
+    return (left if left_out else report), left_out
+
+
+def _entries(report: Report) -> int:
+    return len(report.latencies) + len(report.joints) + len(report.paths) + len(report.penalties)

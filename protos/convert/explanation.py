@@ -177,6 +177,8 @@ def _pair_from_proto(message: admin_pb2.ExplainedPair) -> PairExplanation:
         witnesses=message.witnesses,
         busiest_witness=node_name(message.busiest_witness, "busiest_witness") if message.busiest_witness else None,
         busiest_share=probability(message.busiest_share, "busiest_share"),
+        penalty_s=duration(message.penalty_us, "penalty_us", zero=True),
+        bad_answers=at_most(message.bad_answers, MAX_EVENTS, "bad_answers"),
     )
 
 
@@ -197,6 +199,8 @@ def _pair_to_proto(pair: PairExplanation) -> admin_pb2.ExplainedPair:
         witnesses=pair.witnesses,
         busiest_witness=pair.busiest_witness or "",
         busiest_share=pair.busiest_share,
+        penalty_us=microseconds(pair.penalty_s),
+        bad_answers=pair.bad_answers,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protos.convert.fields import MAX_EVENTS, MAX_OUTCOMES, at_most, each
+from protos.convert.fields import MAX_EVENTS, MAX_OUTCOMES, at_most, duration, each, microseconds, unique
 from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
 from protos.errors import DecodeError
@@ -10,11 +10,13 @@ from protos.model import (
     MAX_JOINTS,
     MAX_LATENCIES,
     MAX_PATHS,
+    MAX_PENALTIES,
     InterfaceJointReport,
     JointReport,
     LatencyReport,
     OutcomeReport,
     PathReport,
+    PenaltyReport,
     Report,
 )
 from protos.names import interface_name, node_name, service_name
@@ -24,12 +26,15 @@ from protos.size_class import SIZE_CLASSES
 
 def report_from_proto(message: control_pb2.Report) -> Report:
     """Check a report."""
+    penalties = each(message.penalties, MAX_PENALTIES, "penalties", _penalty_from_proto)
+    unique((penalty.server for penalty in penalties), "penalties")
     return Report(
         latencies=each(message.latencies, MAX_LATENCIES, "latencies", _latency_from_proto),
         paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
         outcomes=each(message.outcomes, MAX_OUTCOMES, "outcomes", _outcome_from_proto),
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
         interface_joints=each(message.interface_joints, MAX_JOINTS, "interface_joints", _interface_joint_from_proto),
+        penalties=penalties,
     )
 
 
@@ -41,6 +46,7 @@ def report_to_proto(report: Report) -> control_pb2.Report:
         outcomes=map(_outcome_to_proto, report.outcomes),
         joints=map(_joint_to_proto, report.joints),
         interface_joints=map(_interface_joint_to_proto, report.interface_joints),
+        penalties=map(_penalty_to_proto, report.penalties),
     )
 
 
@@ -109,6 +115,20 @@ def _outcome_from_proto(message: control_pb2.OutcomeReport) -> OutcomeReport:
 def _outcome_to_proto(outcome: OutcomeReport) -> control_pb2.OutcomeReport:
     return control_pb2.OutcomeReport(
         service=outcome.service, ok=outcome.ok, deadline_missed=outcome.deadline_missed, failed=outcome.failed
+    )
+
+
+def _penalty_from_proto(message: control_pb2.PenaltyReport) -> PenaltyReport:
+    return PenaltyReport(
+        server=node_name(message.server, "server"),
+        left_s=duration(message.left_us, "left_us", zero=True),
+        bad_answers=at_most(message.bad_answers, MAX_EVENTS, "bad_answers"),
+    )
+
+
+def _penalty_to_proto(penalty: PenaltyReport) -> control_pb2.PenaltyReport:
+    return control_pb2.PenaltyReport(
+        server=penalty.server, left_us=microseconds(penalty.left_s), bad_answers=penalty.bad_answers
     )
 
 

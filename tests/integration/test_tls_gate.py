@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
+import time
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ import pytest
 from controlplane import tls_gate
 from controlplane.ca import Authority
 from controlplane.tls_gate import TlsGate
+from protos.clock_floor import ClockFloor
 from protos.identity import CONTROL_PLANE_DNS, IdentityRole
 from protos.tls_files import load_tls_files
 
@@ -77,7 +79,7 @@ async def opened(folder: Path) -> AsyncIterator[Gate]:
     upstream = str(folder / "upstream")
     server = await asyncio.start_unix_server(echo, upstream)
     files = load_tls_files(fleet.tls_dir("control", IdentityRole.CONTROL_PLANE))
-    gate = TlsGate(files, upstream, lambda reason: refused.update([reason]))
+    gate = TlsGate(files, upstream, lambda reason: refused.update([reason]), ClockFloor(time.time))
     try:
         yield Gate(fleet, gate.listen("127.0.0.1", 0), gate, refused, peers)
     finally:

@@ -313,6 +313,8 @@ class ExplainedPair(_message.Message):
     WITNESSES_FIELD_NUMBER: _builtins.int
     BUSIEST_WITNESS_FIELD_NUMBER: _builtins.int
     BUSIEST_SHARE_FIELD_NUMBER: _builtins.int
+    PENALTY_US_FIELD_NUMBER: _builtins.int
+    BAD_ANSWERS_FIELD_NUMBER: _builtins.int
     chosen: _builtins.bool
     state: Global___PathState.ValueType
     requests: _builtins.float
@@ -327,6 +329,9 @@ class ExplainedPair(_message.Message):
     """How many robots said what the server needs, which of them counts for most, and for what share of all."""
     busiest_witness: _builtins.str
     busiest_share: _builtins.float
+    penalty_us: _builtins.int
+    """The robot asks others in place of this server for so long yet, for so many answers that could not be delivered."""
+    bad_answers: _builtins.int
     @_builtins.property
     def path(self) -> _control_pb2.Assignment: ...
     @_builtins.property
@@ -361,10 +366,12 @@ class ExplainedPair(_message.Message):
         witnesses: _builtins.int = ...,
         busiest_witness: _builtins.str = ...,
         busiest_share: _builtins.float = ...,
+        penalty_us: _builtins.int = ...,
+        bad_answers: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["compute", b"compute", "miss", b"miss", "network", b"network", "path", b"path", "rtt", b"rtt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["barred", b"barred", "busiest_share", b"busiest_share", "busiest_witness", b"busiest_witness", "carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "miss", b"miss", "network", b"network", "path", b"path", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state", "witnesses", b"witnesses"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bad_answers", b"bad_answers", "barred", b"barred", "busiest_share", b"busiest_share", "busiest_witness", b"busiest_witness", "carrier", b"carrier", "chosen", b"chosen", "compute", b"compute", "miss", b"miss", "network", b"network", "path", b"path", "penalty_us", b"penalty_us", "probes", b"probes", "region", b"region", "requests", b"requests", "rtt", b"rtt", "state", b"state", "witnesses", b"witnesses"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -467,6 +467,35 @@ class OutcomeReport(_message.Message):
 Global___OutcomeReport: _TypeAlias = OutcomeReport  # noqa: Y015
 
 @_typing.final
+class PenaltyReport(_message.Message):
+    """A server whose answers could not be delivered: whatever the mapping says, others go before it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SERVER_FIELD_NUMBER: _builtins.int
+    LEFT_US_FIELD_NUMBER: _builtins.int
+    BAD_ANSWERS_FIELD_NUMBER: _builtins.int
+    server: _builtins.str
+    left_us: _builtins.int
+    """For how long yet."""
+    bad_answers: _builtins.int
+    """That it is penalised for; half of what lies two minutes back."""
+    def __init__(
+        self,
+        *,
+        server: _builtins.str = ...,
+        left_us: _builtins.int = ...,
+        bad_answers: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bad_answers", b"bad_answers", "left_us", b"left_us", "server", b"server"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___PenaltyReport: _TypeAlias = PenaltyReport  # noqa: Y015
+
+@_typing.final
 class Report(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -475,6 +504,7 @@ class Report(_message.Message):
     OUTCOMES_FIELD_NUMBER: _builtins.int
     JOINTS_FIELD_NUMBER: _builtins.int
     INTERFACE_JOINTS_FIELD_NUMBER: _builtins.int
+    PENALTIES_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def latencies(self) -> _containers.RepeatedCompositeFieldContainer[Global___LatencyReport]: ...
     @_builtins.property
@@ -485,6 +515,10 @@ class Report(_message.Message):
     def joints(self) -> _containers.RepeatedCompositeFieldContainer[Global___JointReport]: ...
     @_builtins.property
     def interface_joints(self) -> _containers.RepeatedCompositeFieldContainer[Global___InterfaceJointReport]: ...
+    @_builtins.property
+    def penalties(self) -> _containers.RepeatedCompositeFieldContainer[Global___PenaltyReport]:
+        """All that are in force."""
+
     def __init__(
         self,
         *,
@@ -493,10 +527,11 @@ class Report(_message.Message):
         outcomes: _abc.Iterable[Global___OutcomeReport] | None = ...,
         joints: _abc.Iterable[Global___JointReport] | None = ...,
         interface_joints: _abc.Iterable[Global___InterfaceJointReport] | None = ...,
+        penalties: _abc.Iterable[Global___PenaltyReport] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["interface_joints", b"interface_joints", "joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["interface_joints", b"interface_joints", "joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths", "penalties", b"penalties"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

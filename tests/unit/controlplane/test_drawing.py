@@ -21,7 +21,7 @@ from controlplane.core.estimator import Estimator
 from controlplane.core.permits import Permits
 from controlplane.core.problem import Block, BlockKey, Objective
 from controlplane.core.registry import Sidecar
-from protos.model import InterfaceName, NodeName, Report, Role, ServiceSet
+from protos.model import InterfaceName, NodeName, Report, Role, ServiceName, ServiceSet
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
 
 ALL_UP = tuple(path(interface, server) for interface in ("wlan0", "wwan0") for server in ("a", "b"))
@@ -181,3 +181,28 @@ def test_a_little_is_nothing(sign: int, times: float, alike: bool) -> None:
 def test_another_shape_is_another_block(other: Block) -> None:
     assert not is_alike(other, BLOCK)
     assert not is_alike(BLOCK, other)
+
+
+@pytest.mark.audit("sec-10")
+def test_one_robot_with_many_services_is_drawn_in_slices_too() -> None:
+    fleet = Fleet(robots=1)
+    services = 2 * SLICE_PAIRS // 4
+    uses = tuple(replace(use(), name=ServiceName(f"/service_{number}")) for number in range(services))
+    clouds = ("a", "b")
+    offers = tuple(replace(offer(), name=ServiceName(f"/service_{number}")) for number in range(services))
+    fleet.sidecars = [
+        replace(fleet._cloud(name), services=ServiceSet(offers), offered=frozenset(one.name for one in offers))
+        for name in clouds
+    ] + [Sidecar(registration(fleet.names[0]), 1e9, stream(2), interfaces("wlan0", "wwan0"), ServiceSet((), uses))]
+    fleet.drawing.members_changed()
+    assert fleet.draw(routine=True) >= 2
+    assert len(fleet.drawing.picture().problem.blocks) == services
+    # What changes in the middle of it is drawn with the change.
+    fleet.drawing.robot_changed(fleet.names[0])
+    fleet.drawing.begin(routine=False)
+    assert not fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now)
+    fleet.sidecars = fleet.sidecars[1:]
+    fleet.drawing.members_changed()
+    while not fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now):
+        pass
+    assert {block.servers for block in fleet.drawing.picture().problem.blocks} == {("b",)}

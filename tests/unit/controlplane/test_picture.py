@@ -11,6 +11,7 @@ from controlplane.core.drawing import Drawing
 from controlplane.core.estimator import Estimator
 from controlplane.core.objectives import joint_miss
 from controlplane.core.path_rules import PathRule
+from controlplane.core.penalties import LONGEST_S
 from controlplane.core.permits import Permits
 from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.policy import CallRule, OfferRule, Policy
@@ -23,6 +24,7 @@ from protos.model import (
     JointReport,
     NodeName,
     PathReport,
+    PenaltyReport,
     Report,
     Role,
     ServiceName,
@@ -229,6 +231,44 @@ def test_pairs_that_the_path_rules_bar_are_no_candidates() -> None:
     nothing = picture(robot(candidates=interfaces("sat0")), cloud("a"), path_rules=[no_satellite])
     assert nothing.problem.blocks == ()
     assert nothing.notes[KEY].unserved == "the path rules let this robot use no path to a live server"
+
+
+def penalised(*servers: str) -> Report:
+    return Report(penalties=tuple(PenaltyReport(NodeName(server), 10.0) for server in servers))
+
+
+@pytest.mark.audit("sec-2")
+def test_servers_that_the_robot_penalises_are_no_candidates_while_there_are_others() -> None:
+    estimator = Estimator(half_life_s=60.0)
+    paths = Report(paths=(path("wlan0", "a"), path("wlan0", "b"), path("wwan0", "b"), path("eth0", "a", up=False)))
+    estimator.merge(NodeName("robot"), paths, 0.0)
+    here = robot(candidates=interfaces("wlan0", "wwan0", "eth0"))
+    assert estimator.merge(NodeName("robot"), penalised("b"), 0.0), "to be drawn at once"
+    assert not estimator.merge(NodeName("robot"), penalised("b"), 0.0)
+    drawn = drawn_by(estimator, here, cloud("a"), cloud("b"))
+    (block,) = drawn.problem.blocks
+    assert (block.interfaces, block.servers) == (("wlan0",), ("a",))
+    assert drawn.notes[KEY] == BlockNotes(
+        (NodeName("a"), NodeName("b")), (InterfaceName("eth0"),), penalised=(NodeName("b"),)
+    )
+    assert estimator.merge(NodeName("robot"), penalised("b", "a"), 0.0)
+    drawn = drawn_by(estimator, here, cloud("a"), cloud("b"))
+    (block,) = drawn.problem.blocks
+    assert (block.interfaces, block.servers) == (("wlan0", "wwan0"), ("a", "b")), "one must be asked"
+    assert drawn.notes[KEY].penalised == ()
+    assert estimator.merge(NodeName("robot"), penalised(), 0.0)
+    (block,) = drawn_by(estimator, here, cloud("a"), cloud("b")).problem.blocks
+    assert block.servers == ("a", "b")
+
+
+@pytest.mark.audit("sec-2")
+def test_no_robot_penalises_a_server_for_ever() -> None:
+    estimator = Estimator(half_life_s=60.0)
+    told = Report(penalties=(PenaltyReport(NodeName("b"), 1e9), PenaltyReport(NodeName("a"), 0.0)))
+    estimator.merge(NodeName("robot"), told, 0.0)
+    assert estimator.penalties(NodeName("robot"), LONGEST_S - 1.0).keys() == {"b"}
+    assert estimator.penalties(NodeName("robot"), LONGEST_S) == {}
+    assert estimator.penalties(NodeName("other"), 0.0) == {}
 
 
 def test_each_use_has_its_own_deadline() -> None:

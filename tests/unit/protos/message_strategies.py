@@ -50,6 +50,7 @@ from protos.model import (
     PathReport,
     Peer,
     PeerSet,
+    PenaltyReport,
     Registration,
     RemovalReason,
     RemovedPeer,
@@ -230,6 +231,11 @@ reports = st.builds(
     _tuples(outcomes),
     _tuples(joint_reports()),
     _tuples(interface_joint_reports()),
+    st.lists(
+        st.builds(PenaltyReport, node_names, durations | st.just(0.0), events),
+        max_size=3,
+        unique_by=lambda penalty: penalty.server,
+    ).map(tuple),
 )
 
 
@@ -305,6 +311,11 @@ explained_pairs = st.builds(
     texts,
     texts,
     st.booleans(),
+    st.integers(0, 2**32 - 1),
+    st.none() | node_names,
+    probabilities,
+    durations | st.just(0.0),
+    events,
 )
 explained_joints = st.builds(
     JointExplanation,

@@ -1,0 +1,44 @@
+"""Servers that a robot's sidecar asks only where no other is, as it told, because their answers could not be delivered.
+
+A mapping that names such a server is not followed. So other servers go before it here as they do there: for this robot
+alone, as nobody else bears out what it says.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from protos.model import PenaltyReport
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from protos.model import NodeName
+
+LONGEST_S = 600.0
+"""No sidecar keeps a server out for longer (`sidecar.core.penalties`), whatever it says."""
+
+
+class Penalties:
+    """What one robot told last, and until when it holds. Times are monotonic seconds."""
+
+    __slots__ = ("_until",)
+
+    def __init__(self) -> None:
+        self._until: dict[NodeName, tuple[float, int]] = {}
+
+    def replace(self, told: Iterable[PenaltyReport], now: float) -> bool:
+        """These are all that are in force; True if the servers are not those of before."""
+        before = self._until.keys()
+        self._until = {
+            one.server: (now + min(one.left_s, LONGEST_S), one.bad_answers) for one in told if one.left_s > 0.0
+        }
+        return self._until.keys() != before
+
+    def in_force(self, now: float) -> dict[NodeName, PenaltyReport]:
+        """Return those that still hold, by server."""
+        return {
+            server: PenaltyReport(server, until - now, bad_answers)
+            for server, (until, bad_answers) in self._until.items()
+            if until > now
+        }
