@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import sdnotify
 
 from protos import interpreter
+from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
 from protos.errors import ConfigError
 from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Version
@@ -69,11 +70,13 @@ class Sidecar:
         self._store = _open_store(config)
         identity = self._store.identity
         tls = self._tls
+        self._clock = ClockFloor(time.time, self._store.clock_floor, self._store.remember_clock_floor, log.error)
         own = start_session(
             config.node_name,
             config.role,
             identity.incarnation,
             None if tls is None else lambda: tls.current,
+            self._clock,
             config.max_revocation_age,
         )
         self._own = own
@@ -157,7 +160,7 @@ class Sidecar:
             if self._store.revocations:
                 self._revocations.take_or_log(self._store.revocations, "an earlier run")
             self._revocations.tell()
-            self._revocations.look(time.time())
+            self.look_at_revocations()
         self._interfaces.set_stun_servers(self._stun_servers(last.welcome))
         self._interfaces.start()
         if last.peers is not None:
@@ -288,12 +291,14 @@ class Sidecar:
 
     def look_at_revocations(self) -> None:
         """A second has passed: judge the revocation lists that peers sent, and how old those in use are."""
-        if self._revocations is not None:
-            self._revocations.look(time.time())
+        if self._revocations is not None and self._tls is not None:
+            self._clock.note_lists(self._tls.current.trust)
+            self._clock.note(self._tls.current.identity.not_before)
+            self._revocations.look(self._clock.now())
 
     def end_expired(self) -> None:
         """Part with peers whose certificates have ended by now."""
-        self._data_plane.end_expired()
+        self._data_plane.end_expired(self._clock.now())
 
     def judge_again(self) -> None:
         """Time has passed, or our clock was set: refused peers may be good now."""

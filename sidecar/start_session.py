@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +16,7 @@ from sidecar.core.session import OwnSession, public_key
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from protos.clock_floor import ClockFloor
     from protos.identity import Identity
     from protos.model import NodeName, Role
     from protos.tls_files import TlsFiles
@@ -30,11 +30,12 @@ def start_session(
     role: Role,
     incarnation: int,
     tls: Callable[[], TlsFiles] | None,
+    clock: ClockFloor,
     max_revocation_age_s: float = math.inf,
 ) -> OwnSession:
     """Return a new session. `tls` returns the present certificate, key and trust; None is the insecure mode.
 
-    No peer is believed whose CA signed no revocation list in the last `max_revocation_age_s`.
+    Peers are judged by `clock`. None is believed whose CA signed no revocation list in the last `max_revocation_age_s`.
 
     Raises:
         ConfigError: the certificate is too long for introductions.
@@ -48,9 +49,11 @@ def start_session(
 
     def judge(theirs: SessionCredential) -> float:
         def check(certificate: bytes) -> Identity:
-            return tls().trust.check(certificate, time.time(), max_revocation_age_s)
+            return tls().trust.check(certificate, clock.now(), max_revocation_age_s)
 
-        return verify(theirs, check).not_after
+        identity = verify(theirs, check)
+        clock.note(identity.not_before)
+        return identity.not_after
 
     return OwnSession(signed(credential, tls()), private_key, judge)
 

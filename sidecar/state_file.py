@@ -2,7 +2,8 @@
 
     offset  size
          0     8  magic: "plr-id\\0\\0" identity, "plr-last" last good messages of the control plane,
-                  "plr-ctrl" addresses of the control plane that worked, "plr-crls" revocation lists
+                  "plr-ctrl" addresses of the control plane that worked, "plr-crls" revocation lists,
+                  "plr-clck" the time before which the clock is not believed
          8     2  format version: 2 of last good messages, 1 of the others
         10     4  length of the body
         14    32  SHA-256 of the body
@@ -12,6 +13,7 @@
     addresses    number of names (1), the configured host:port names, number of addresses (1), for each its host and
                  its port (2); texts have their length (1) before them
     revocations  revocation lists, PEM
+    clock        microseconds since 1970 (8)
     last good    owner: length (1), name of the sidecar; then ControlMessages that hold a Welcome, a PeerSet, a
                  MappingSet (the last of a kind counts): length (4), protobuf
 
@@ -46,6 +48,8 @@ _IDENTITY_MAGIC = b"plr-id\0\0"
 _LAST_GOOD_MAGIC = b"plr-last"
 _ADDRESSES_MAGIC = b"plr-ctrl"
 _REVOCATIONS_MAGIC = b"plr-crls"
+_CLOCK_MAGIC = b"plr-clck"
+_MICROSECONDS = struct.Struct("!Q")
 _HEADER = struct.Struct("!8sHI32s")
 _IDENTITY = struct.Struct(f"!{TOKEN_BYTES}sQ")
 _PORT = struct.Struct("!H")
@@ -138,6 +142,20 @@ def encode_revocations(pem: bytes) -> bytes:
 def decode_revocations(data: bytes) -> bytes:
     """Read the file's content; raises DecodeError."""
     return _open(_REVOCATIONS_MAGIC, data)
+
+
+def encode_clock_floor(floor: float) -> bytes:
+    """Return the file's content; `floor` in seconds since 1970."""
+    return _seal(_CLOCK_MAGIC, _MICROSECONDS.pack(int(floor * 1e6)))
+
+
+def decode_clock_floor(data: bytes) -> float:
+    """Read the file's content; raises DecodeError."""
+    try:
+        (microseconds,) = _MICROSECONDS.unpack(_open(_CLOCK_MAGIC, data))
+    except struct.error:
+        raise DecodeError("the clock's floor is not of 8 bytes") from None
+    return float(microseconds) / 1e6
 
 
 def encode_addresses(known: ControlAddresses) -> bytes:

@@ -23,10 +23,12 @@ from sidecar.state_file import (
     Identity,
     LastGood,
     decode_addresses,
+    decode_clock_floor,
     decode_identity,
     decode_last_good,
     decode_revocations,
     encode_addresses,
+    encode_clock_floor,
     encode_identity,
     encode_last_good,
     encode_revocations,
@@ -44,6 +46,7 @@ IDENTITY_FILE = "identity"
 LAST_GOOD_FILE = "last-good"
 ADDRESSES_FILE = "control-addresses"
 REVOCATIONS_FILE = "revocations"
+CLOCK_FILE = "clock-floor"
 LOCK_FILE = "lock"
 SET_ASIDE_SUFFIX = ".refused"
 
@@ -52,6 +55,7 @@ FAILURES = (
     "last_good_refused",
     "control_addresses_refused",
     "revocations_refused",
+    "clock_floor_refused",
     "write_failed",
 )
 """The keys of `StateStore.failures`."""
@@ -88,6 +92,8 @@ class StateStore:
         self._addresses = self._read(ADDRESSES_FILE, decode_addresses) or ControlAddresses(())
         self.revocations = self._read(REVOCATIONS_FILE, decode_revocations) or b""
         """Revocation lists (PEM) as found on disk when opened."""
+        self.clock_floor = self._read(CLOCK_FILE, decode_clock_floor) or 0.0
+        """See `ClockFloor`; seconds since 1970, as found on disk when opened."""
         self._condition = threading.Condition()
         self._dirty: dict[str, bytes | LastGood] = {}
         """What to write, by file."""
@@ -119,6 +125,12 @@ class StateStore:
         """Keep the revocation lists that are in use; returns at once."""
         with self._condition:
             self._dirty[REVOCATIONS_FILE] = encode_revocations(pem)
+            self._condition.notify()
+
+    def remember_clock_floor(self, floor: float) -> None:
+        """Keep the time (s since 1970) before which the clock is not believed; returns at once."""
+        with self._condition:
+            self._dirty[CLOCK_FILE] = encode_clock_floor(floor)
             self._condition.notify()
 
     def close(self) -> None:

@@ -2,7 +2,8 @@
 
 The control plane relays them. What it adds, changes or plays again is not used, so that it can not aim a fleet at an
 address of its choosing; the addresses that the peer signed before stay in use. They are remembered for longer than the
-peer is known: taking it out of the view and putting it back brings no old ones into use.
+peer is known: taking it out of the view and putting it back brings no old ones into use. What was signed with a
+certificate that is revoked by now is forgotten with the next run that the view tells of.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
+from protos.identity import REVOKED, CertificateError
 from protos.model import MAX_CANDIDATES_OF_INTERFACE
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ class _Announcement(NamedTuple):
     told: tuple[Candidate, ...]
     used: tuple[Candidate, ...]
     signed: bool
+    by: Peer
+    """Who announced it, with the credential of that run."""
 
 
 class Announced:
@@ -36,12 +40,19 @@ class Announced:
         self._own = own
         self._dropped = dropped
         self._newest: OrderedDict[NodeName, _Announcement] = OrderedDict()
+        self.eras: Counter[NodeName] = Counter()
+        """How often a name was given to somebody new, after what its owner signed was revoked."""
         self.ignored: dict[NodeName, str] = {}
         """Why what was told last of a peer's addresses is not used; of peers that are remembered, or in the view."""
 
     def candidates_of(self, told: Peer) -> tuple[Candidate, ...]:
         """Return the addresses to use for a peer of which this is told now."""
         newest = self._newest.get(told.name)
+        if newest is not None and newest.incarnation != told.incarnation and self._is_revoked(newest.by):
+            # A thief may have signed with the largest incarnation there is.
+            del self._newest[told.name]
+            self.eras[told.name] += 1
+            newest = None
         if newest is None or newest[:3] != (told.incarnation, told.candidates_serial, told.candidates):
             fault, newest = self._judge(told, newest)
         else:
@@ -77,7 +88,14 @@ class Announced:
         used = _cut(told.candidates)
         if len(used) < len(told.candidates):
             self._dropped["candidates_full"] += len(told.candidates) - len(used)
-        return "", _Announcement(told.incarnation, told.candidates_serial, told.candidates, used, signed)
+        return "", _Announcement(told.incarnation, told.candidates_serial, told.candidates, used, signed, told)
+
+    def _is_revoked(self, peer: Peer) -> bool:
+        try:
+            self._own.admit(peer)
+        except DecodeError as error:
+            return isinstance(error, CertificateError) and error.reason == REVOKED
+        return False
 
     def forget_all_but(self, names: set[NodeName]) -> None:
         """Only these are peers now: nothing is said of others any more."""

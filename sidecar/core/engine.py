@@ -6,7 +6,7 @@ application). Nothing here builds, seals or parses a datagram.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -59,6 +59,7 @@ from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.peers import MAX_PEERS, Peers
+from sidecar.core.penalties import Penalties
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.revocation_exchange import RevocationExchange
@@ -113,6 +114,7 @@ class Engine:
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
         self.revocations = RevocationExchange(self.routes, self._outbox, self.stats)
         self._measurements = Measurements(self.stats.dropped)
+        self._penalties = Penalties()
         self._serving = Serving(
             ServingParts(
                 self._rules,
@@ -136,6 +138,7 @@ class Engine:
                 self._seek,
                 config.budgets,
                 self._backlog,
+                penalties=self._penalties,
             )
         )
 
@@ -315,9 +318,10 @@ class Engine:
         """Robot: (service, server, type) of servers left out because the others offer another type."""
         return frozenset(self._offers.conflicts)
 
-    def take_report(self) -> Report:
+    def take_report(self, now: float) -> Report:
         """Return what was measured since the last report."""
-        return self._measurements.take(self.routes, self.peers.names())
+        measured = self._measurements.take(self.routes, self.peers.names())
+        return replace(measured, penalties=self._penalties.report(now))
 
     @property
     def service_mappings(self) -> tuple[ServiceMapping, ...]:

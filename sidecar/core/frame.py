@@ -41,7 +41,8 @@ A message of `total size` bytes is cut into symbols of `symbol size` bytes, the 
 `left` is how long the message is still of use when the datagram arrives, as far as its sender can tell: written when
 the datagram is built, so that it is true for each copy and each retransmission, while the symbol's bytes never change.
 Only FRAGMENT, REPAIR and FINISHED are ack-eliciting (RFC 9002 section 2): a PROBE is answered by its reply, the rest
-is not waited for. A datagram holds one ACK at most: each is work, and the newest says what all before it did.
+is not waited for. A datagram holds one ACK at most, and one KEY_OFFER or KEY_ANSWER: each is work, and the newest ACK
+says what all before it did.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ MAX_FRAMES = 64
 """Frames in one datagram; an honest one holds a handful."""
 
 _PADDING, _PROBE, _PROBE_REPLY, _ACK, FRAGMENT_TYPE, REPAIR_TYPE, FINISHED_TYPE, _ABANDON = range(8)
-_CLOSE, _FORGOTTEN, _KEY_OFFER, _KEY_ANSWER = 8, 10, 11, 12
+_CLOSE, _FORGOTTEN, _KEY_OFFER, KEY_ANSWER_TYPE = 8, 10, 11, 12
 
 _U64 = struct.Struct(">Q")
 _ACK_HEAD = struct.Struct(">QIB")
@@ -252,7 +253,7 @@ def encode_key_offer(frame: KeyOffer) -> bytes:
 
 def encode_key_answer(frame: KeyAnswer) -> bytes:
     """Return the frame's bytes."""
-    return bytes([_KEY_ANSWER]) + _NEW_KEY.pack(*frame)
+    return bytes([KEY_ANSWER_TYPE]) + _NEW_KEY.pack(*frame)
 
 
 def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
@@ -321,7 +322,7 @@ def decode_frames(view: memoryview) -> list[Frame]:
     frames: list[Frame] = []
     position = 0
     end = len(view)
-    acknowledged = False
+    acknowledged = exchanging = False
     try:
         while position < end:
             kind = view[position]
@@ -346,11 +347,11 @@ def decode_frames(view: memoryview) -> list[Frame]:
                 position += 8
             elif kind == _CLOSE:
                 frames.append(Close())
-            elif kind == _KEY_OFFER:
-                frames.append(KeyOffer(*_NEW_KEY.unpack_from(view, position)))
-                position += _NEW_KEY.size
-            elif kind == _KEY_ANSWER:
-                frames.append(KeyAnswer(*_NEW_KEY.unpack_from(view, position)))
+            elif kind in (_KEY_OFFER, KEY_ANSWER_TYPE):
+                if exchanging:
+                    raise DecodeError("more than one offer or answer of keys")
+                exchanging = True
+                frames.append((KeyOffer if kind == _KEY_OFFER else KeyAnswer)(*_NEW_KEY.unpack_from(view, position)))
                 position += _NEW_KEY.size
             else:
                 raise DecodeError(f"unknown frame type {kind}")

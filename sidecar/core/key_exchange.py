@@ -27,12 +27,15 @@ from sidecar.core.key_schedule import next_root, proof, proof_of_offer
 if TYPE_CHECKING:
     import random
 
+    from protos.token_bucket import TokenBucket
     from sidecar.core.key_schedule import PairKeys
 
 RENEW_AFTER_S = 120.0
 """Age of a phase at which the next one is offered: as WireGuard does."""
 RENEW_AFTER_DATAGRAMS = 1 << 21
 """Datagrams of one phase, either way, after which the next one is offered: by the next probe, half a second later."""
+MAX_PHASE = 0xFFFFFFFF
+"""The last one that an offer can name: two minutes each, some 16,000 years."""
 MAX_SEALED = 1 << 23
 """Datagrams that one phase seals (RFC 9001 section 6.6, for AES-GCM and the longest). A peer that agrees on no new keys
 until then gets nothing but probes."""
@@ -43,6 +46,17 @@ AGAIN_S = 1.0
 """As long for one that was sent and not answered."""
 OTHER_OFFER_AFTER_S = 1.0
 """An honest leader repeats its offer: another one before this costs us nothing, and it nothing but time."""
+
+
+EXCHANGES_PER_S = 10.0
+"""Exchanges worked on for all paths of a link to one peer: each is 0.3 ms of public-key work for a datagram of some
+hundred bytes. An honest peer needs one for each path every two minutes, ..."""
+EXCHANGES_AT_ONCE = 64.0
+"""... or for all its paths at once, after a restart."""
+
+
+class TooManyExchangesError(DecodeError):
+    """The peer asks for more exchanges than are worked on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +123,7 @@ class KeyExchange:
             return None
         if self._exchange is None:
             due = now >= self._changed_at + self._limits.seconds or datagrams >= self._limits.datagrams
-            if self.phase and not due:
+            if (self.phase and not due) or self.phase == MAX_PHASE:
                 return None
             private = X25519PrivateKey.from_private_bytes(rng.randbytes(32))
             phase, key = self.phase + 1, private.public_key().public_bytes_raw()
@@ -118,15 +132,19 @@ class KeyExchange:
         self._exchange.offered_at = now
         return self._exchange.offer
 
-    def take(self, answer: KeyAnswer, now: float) -> bytes | None:
+    def take(self, answer: KeyAnswer, now: float, budget: TokenBucket | None = None) -> bytes | None:
         """Return the new root that an answer completes; None if it answers nothing that is asked.
+
+        `budget` holds how many may be worked on; None: as many as come.
 
         Raises:
             DecodeError: it is not of one who has the peer's session key.
+            TooManyExchangesError: the budget is spent.
         """
         exchange = self._exchange
         if not self._leads or exchange is None or exchange.private is None or answer.phase != exchange.offer.phase:
             return None
+        _pay(budget, now)
         theirs = _public(answer.key)
         shared = (
             _shared(exchange.private, theirs)
@@ -141,11 +159,16 @@ class KeyExchange:
 
     # -- the other end --------------------------------------------------------------------------------------------
 
-    def answer(self, offer: KeyOffer, now: float, rng: random.Random) -> tuple[KeyAnswer, bytes] | None:
+    def answer(
+        self, offer: KeyOffer, now: float, rng: random.Random, budget: TokenBucket | None = None
+    ) -> tuple[KeyAnswer, bytes] | None:
         """Return the answer to an offer, and the root to expect from now on; None if it is not answered.
+
+        `budget` as of `take`.
 
         Raises:
             DecodeError: it is not of one who knows the keys in use, or its key is of small order.
+            TooManyExchangesError: the budget is spent.
         """
         if self._leads or offer.phase != self.phase + 1:
             return None
@@ -157,6 +180,7 @@ class KeyExchange:
                 return before.answer, before.root
             if now < before.began_at + OTHER_OFFER_AFTER_S:
                 return None
+        _pay(budget, now)
         private, theirs = X25519PrivateKey.from_private_bytes(rng.randbytes(32)), _public(offer.key)
         shared = _shared(private, theirs) + _shared(self._pair.own, theirs) + _shared(private, self._pair.theirs)
         key = private.public_key().public_bytes_raw()
@@ -164,6 +188,11 @@ class KeyExchange:
         answer = KeyAnswer(offer.phase, key, proof(root))
         self._exchange = _Exchange(offer, now, now, answer=answer, root=root)
         return answer, root
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether the leader may have gone on with what our answer agreed on."""
+        return self._exchange is not None and self._exchange.answer is not None
 
     def confirmed(self, now: float) -> bytes:
         """The leader seals with what our answer agreed on: return its root, and go on with it."""
@@ -177,6 +206,11 @@ class KeyExchange:
         self._exchange = None
         self._changed_at = now
         self.phase += 1
+
+
+def _pay(budget: TokenBucket | None, now: float) -> None:
+    if budget is not None and not budget.take(now):
+        raise TooManyExchangesError("too many exchanges of keys")
 
 
 def _public(key: bytes) -> X25519PublicKey:

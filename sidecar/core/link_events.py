@@ -27,6 +27,8 @@ class LinkPeer:
     keys: PairKeys
     addresses: tuple[tuple[InterfaceId, tuple[Address, ...]], ...]
     """For each of the peer's interfaces, where it may be reached."""
+    era: int = 0
+    """How often the name was given to somebody new, because the one before was revoked: its sessions never return."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ MAX_FORGOTTEN_PEERS = 65_536
 class LinkMemory:
     """What an interface's next link, in the same run of the sidecar, must know of the one before."""
 
-    __slots__ = ("_count", "_forgotten", "_paths", "next_number")
+    __slots__ = ("_count", "_eras", "_forgotten", "_paths", "next_number")
 
     def __init__(self, next_number: int = 0) -> None:
         self.next_number = next_number
@@ -36,23 +36,38 @@ class LinkMemory:
         self._count = 0
         self._forgotten: OrderedDict[NodeName, int] = OrderedDict()
         """The newest incarnation of each peer of which a path was forgotten."""
+        self._eras: dict[NodeName, int] = {}
 
     def __len__(self) -> int:
         return self._count
 
     def keep_all(self, other: LinkMemory) -> None:
         """Take over what another one keeps."""
+        for peer, era in list(other._eras.items()):
+            self.begin_era(peer, era)
         for peer, incarnation in list(other._forgotten.items()):
             self._forget_up_to(peer, incarnation)
         for peer, paths in list(other._paths.items()):
             for (session, remote), keys in list(paths.items()):
                 self.keep(peer, session, remote, keys.copy())
 
+    def begin_era(self, peer: NodeName, era: int) -> None:
+        """What is known of a peer is of one that was revoked, if its era is another one.
+
+        That one may have used the largest incarnations there are, and none of its sessions can come back.
+        """
+        if era == self._eras.get(peer, 0):
+            return
+        self._eras[peer] = era
+        self._count -= len(self._paths.pop(peer, ()))
+        self._forgotten.pop(peer, None)
+
     def keep(self, peer: NodeName, session: SessionId, remote: InterfaceId, keys: PathKeys) -> None:
         """The path with these keys, to this interface of a peer's session, is no more."""
-        if keys.received.largest < 0:
-            # Nothing of the peer was ever opened, so its window is empty, and our keys are those of the beginning: a
-            # change of keys waits for an answer. Whoever introduces interfaces that do not exist leaves nothing here.
+        keys.opening.forget_previous()
+        if keys.received.largest < 0 and not keys.has_answered:
+            # Nothing of the peer was ever opened, so its window is empty, and both ends' keys are those of the
+            # beginning. Who introduces interfaces that do not exist, without its session's key, leaves nothing here.
             return
         paths = self._paths.setdefault(peer, {})
         self._count += (session, remote) not in paths

@@ -12,6 +12,7 @@ from sidecar.core import frame
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAGRAM_BYTES, NONCE_OFFSET
 from sidecar.core.introduction import UnauthenticError, open_introduction, read_hello_id
+from sidecar.core.key_exchange import TooManyExchangesError
 from sidecar.core.link_events import PeerRenewed, PeerRestarted
 from sidecar.core.path_id import PathState
 from sidecar.core.path_keys import MAX_FAILED
@@ -70,15 +71,25 @@ class LinkOpener:
             if opening.failed >= MAX_FAILED:
                 dropped["keys_worn_out"] += 1
                 continue
-            open_into = opening.decrypt_into if head == opening.head else opening.open_other
+            in_use = head == opening.head
+            open_into = opening.decrypt_into if in_use else opening.open_other
             try:
                 open_into(data[start + NONCE_OFFSET : body], data[body:stop], data[start:body], out)
             except InvalidTag:
                 dropped["unauthentic"] += 1
                 opening.failed += 1
                 continue
+            if not in_use and opening.phase == 1:
+                self._leave_out(opened, path)
             opened.append((path, number, out))
         return opened
+
+    def _leave_out(self, opened: list[Opened], path: Path) -> None:
+        """A path's first fresh keys came into use: what was opened before is not to be read as if sealed with these."""
+        fresh = [one for one in opened if one[0] is not path]
+        if len(fresh) < len(opened):
+            self._dropped["before_fresh_keys"] += len(opened) - len(fresh)
+            opened[:] = fresh
 
     def _path_of(self, head: int, session: int) -> Path | None:
         """Return the path that datagrams of this clear head (the first four bytes) and session come over."""
@@ -139,17 +150,25 @@ class LinkOpener:
         path = table.introduced(peer, header.sender_interface, now)
         if path is None:
             return None  # counted
-        if header.packet_number <= max(path.received.largest, path.keys.introduced):
+        number, keys, received = header.packet_number, path.keys, path.received.largest
+        is_late = number <= max(received, keys.introduced)
+        if is_late and (offer is None or number <= max(received, keys.offered)):
             return "duplicate"
-        path.keys.introduced = header.packet_number
+        keys.introduced = max(keys.introduced, number)
         if table.closing:
             return None  # an answer would bring us back to life over there
         if len(path.introductions) >= MAX_INTRODUCTIONS:
             return "introductions_full"
         try:
             answer = None if offer is None else path.answer_keys(offer, now)
+        except TooManyExchangesError:
+            return "exchanges_full"
         except DecodeError:
             return "bad_keys"
+        if answer is not None:
+            keys.offered = number
+        elif is_late:
+            return "duplicate"
         path.note_introduction(source, probe_id, answer, now)
         if path.state is PathState.DOWN:
             path.hasten_probe(now)

@@ -21,6 +21,7 @@ from sidecar.core.frame import (
     Fragment,
     is_repair_index,
 )
+from sidecar.core.key_exchange import TooManyExchangesError
 from sidecar.core.link_events import (
     FragmentsReceived,
     MessageAbandoned,
@@ -226,6 +227,8 @@ class LinkReader:
     def _exchange(self, step: Callable[[Path, T, float], None], path: Path, item: T, now: float) -> None:
         try:
             step(path, item, now)
+        except TooManyExchangesError:
+            self._stats.dropped["exchanges_full"] += 1
         except DecodeError:
             self._stats.dropped["bad_keys"] += 1
 

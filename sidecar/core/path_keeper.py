@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.frame import encode_key_answer
+from sidecar.core.frame import KEY_ANSWER_TYPE, encode_key_answer
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
@@ -78,11 +78,13 @@ class PathKeeper:
         """The peer, who leads, offers new keys. Raises DecodeError."""
         answer = path.answer_keys(offer, now)
         if answer is not None:
+            # The same offer may have come twice by now, and a datagram holds one answer.
+            path.pending = [encoded for encoded in path.pending if encoded[0] != KEY_ANSWER_TYPE]
             self._table.owe(path, encode_key_answer(answer))
 
     def keys_answered(self, path: Path, answer: frame.KeyAnswer, now: float) -> None:
         """The peer answers our offer of new keys. Raises DecodeError."""
-        if path.keys.take(answer, now):
+        if path.take_keys(answer, now):
             self._answers(path, now)
 
     def follow_keys(self, path: Path, now: float) -> None:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from protos.credential import Aead
     from protos.model import InterfaceId
+    from protos.token_bucket import TokenBucket
     from sidecar.core.aead import Cipher
     from sidecar.core.frame import KeyAnswer, KeyOffer
     from sidecar.core.key_exchange import KeyLimits
@@ -129,6 +130,7 @@ class PathKeys:
         "_pair",
         "incarnation",
         "introduced",
+        "offered",
         "opening",
         "received",
         "sealing",
@@ -158,13 +160,17 @@ class PathKeys:
         self.incarnation = incarnation
         """Of the peer's session: a later session's is larger."""
         self.introduced = -1
-        """The largest packet number of the peer's introductions: a smaller one is a replay, or overtaken."""
+        """The largest packet number of the peer's introductions: a smaller one is a replay, or overtaken, ..."""
+        self.offered = -1
+        """... or was the peer's own after one that somebody else made up, who knows the token alone: then it is larger
+        than those before that made an offer with a true proof."""
 
     def copy(self) -> PathKeys:
         """Return the same, apart from these from now on."""
         sealing, opening = copy(self.sealing), copy(self.opening)
         other = PathKeys(self._pair, copy(self._exchange), sealing, opening, self._most, self.incarnation)
-        other.received, other.introduced = deepcopy(self.received), self.introduced
+        other.received = deepcopy(self.received)
+        other.introduced, other.offered = self.introduced, self.offered
         other._opened_phase, other._forget_at = self._opened_phase, self._forget_at
         return other
 
@@ -191,18 +197,29 @@ class PathKeys:
         """Datagrams of this phase, either way: what the peer sealed is about as much as came."""
         return max(self.sealing.sealed, self.received.largest - self.opening.first)
 
-    def answer(self, offer: KeyOffer, now: float, rng: random.Random) -> KeyAnswer | None:
-        """Return the answer to an offer, if there is one; raises DecodeError."""
-        answered = self._exchange.answer(offer, now, rng)
+    @property
+    def has_answered(self) -> bool:
+        """Whether the peer may have gone on with keys of which nothing has come yet."""
+        return self._exchange.has_answered
+
+    def answer(
+        self, offer: KeyOffer, now: float, rng: random.Random, budget: TokenBucket | None = None
+    ) -> KeyAnswer | None:
+        """Return the answer to an offer, if there is one; raises DecodeError. `budget`: see `KeyExchange.take`."""
+        if self.opening.phase > self.sealing.phase:
+            # The peer went on with what it offered, in a datagram that nobody has read (yet). Expected once more, the
+            # same key would open a phase that no exchange agreed on.
+            return None
+        answered = self._exchange.answer(offer, now, rng, budget)
         if answered is None:
             return None
         answer, root = answered
         self.opening.expect(self._pair.opening_key(root))
         return answer
 
-    def take(self, answer: KeyAnswer, now: float) -> bool:
+    def take(self, answer: KeyAnswer, now: float, budget: TokenBucket | None = None) -> bool:
         """Go on with the keys that an answer completes; False if nothing is asked. Raises DecodeError."""
-        root = self._exchange.take(answer, now)
+        root = self._exchange.take(answer, now, budget)
         if root is None:
             return False
         self.opening.expect(self._pair.opening_key(root))

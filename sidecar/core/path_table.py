@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from protos.model import Role
 from protos.token_bucket import TokenBucket
 from sidecar.core.introduction import hello_id
+from sidecar.core.key_exchange import EXCHANGES_AT_ONCE, EXCHANGES_PER_S
 from sidecar.core.link_memory import LinkMemory
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keys import make_path_keys
@@ -30,6 +31,11 @@ MAX_PENDING_FINISHED = 8192
 MAX_PATHS_OF_A_PEER = 32
 """Those that a peer introduces itself by included. A further introduction takes the place of one that nothing
 authentic followed; if there is none, it waits for the control plane's word."""
+NEW_PATHS = 64
+"""Paths that one peer may begin by introductions at once: all that it may have, and all of them again, ..."""
+NEW_PATHS_PER_S = 8.0
+"""... and so many a second after that, as if it were restarted each second with 8 interfaces. Each costs public-key
+work, some 0.3 ms: without this a member that goes on to another interface with each introduction takes a processor."""
 HANGING_LINK_NUMBERS = 1 << 32
 """Packet numbers left to a link whose driver does not return, lest its next one seals with the same."""
 UNPROVEN_BYTES = 65_536
@@ -44,8 +50,8 @@ class PathTable:
     """Paths, who may use them, and what came of them."""
 
     __slots__ = (
-        "_by_peer", "_limits", "_memory", "_rng", "_unproven", "by_hello", "by_session", "closing", "dirty", "events",
-        "identity", "paths", "stats",
+        "_by_peer", "_exchanges", "_limits", "_memory", "_new_paths", "_rng", "_unproven", "by_hello", "by_session",
+        "closing", "dirty", "events", "identity", "paths", "stats",
     )  # fmt: skip
 
     def __init__(self, identity: LinkIdentity, memory: LinkMemory, limits: KeyLimits, rng: random.Random) -> None:
@@ -54,6 +60,10 @@ class PathTable:
         self._rng = rng
         self._unproven: dict[NodeName, TokenBucket] = {}
         """What may go to addresses of each peer at which it has never proven to be, in bytes."""
+        self._new_paths: dict[NodeName, TokenBucket] = {}
+        """How many paths each peer may begin by introductions."""
+        self._exchanges: dict[NodeName, TokenBucket] = {}
+        """How many exchanges of keys with each peer are worked on."""
         self.identity = identity
         self.stats = LinkStats(identity.interface)
         self.events: deque[LinkEvent] = deque()
@@ -87,6 +97,9 @@ class PathTable:
         path = self.paths.get((peer.name, remote))
         if path is not None:
             return path
+        if not self._may_begin_path(peer.name, now):
+            self.stats.dropped["new_paths_too_often"] += 1
+            return None
         others = self.to(peer.name)
         if len(others) >= MAX_PATHS_OF_A_PEER:
             # The peer, or whoever stole its token for us, could fill the table with interfaces that do not exist.
@@ -99,6 +112,12 @@ class PathTable:
         if path is not None:
             self._enter(path)
         return path
+
+    def _may_begin_path(self, peer: NodeName, now: float) -> bool:
+        bucket = self._new_paths.get(peer)
+        if bucket is None:
+            bucket = self._new_paths[peer] = TokenBucket(rate=NEW_PATHS_PER_S, burst=NEW_PATHS, now=now)
+        return bucket.take(now)
 
     def to(self, peer: NodeName) -> Sequence[Path]:
         """The paths to one peer."""
@@ -125,13 +144,12 @@ class PathTable:
             ours = self.identity.interface_id
             keys = make_path_keys(peer.keys, ours, remote, self._limits, now, peer.incarnation, leads=leads)
         path_id = PathId(self.identity.interface, peer.name, remote)
-        unproven = self._unproven.get(peer.name) or self._new_budget(peer.name, now)
-        return Path(path_id, peer.session, keys, addresses, first_number, now, self._rng, unproven, leads=leads)
-
-    def _new_budget(self, peer: NodeName, now: float) -> TokenBucket:
-        bucket = TokenBucket(rate=UNPROVEN_BYTES_PER_S, burst=UNPROVEN_BYTES, now=now)
-        self._unproven[peer] = bucket
-        return bucket
+        if peer.name not in self._unproven:
+            self._unproven[peer.name] = TokenBucket(rate=UNPROVEN_BYTES_PER_S, burst=UNPROVEN_BYTES, now=now)
+        if peer.name not in self._exchanges:
+            self._exchanges[peer.name] = TokenBucket(rate=EXCHANGES_PER_S, burst=EXCHANGES_AT_ONCE, now=now)
+        budgets = self._unproven[peer.name], self._exchanges[peer.name]
+        return Path(path_id, peer.session, keys, addresses, first_number, now, self._rng, *budgets, leads=leads)
 
     def way_changed(self, now: float) -> None:
         """Our own side of all paths is another: peers that could not be reached may be now."""
@@ -178,6 +196,7 @@ class PathTable:
         self.paths.clear()
         self._by_peer.clear()
         for peer in peers:
+            self._memory.begin_era(peer.name, peer.era)
             crowd = sum(len(addresses) for _, addresses in peer.addresses)
             for remote, addresses in peer.addresses:
                 path = before.pop((peer.name, remote), None)
@@ -199,5 +218,9 @@ class PathTable:
                 self._enter(before.pop(key))
         for path in before.values():
             self._forget(path)
-        self._unproven = {name: bucket for name, bucket in self._unproven.items() if name in self._by_peer}
+        names = {peer.name for peer in peers}
+        for buckets in (self._unproven, self._exchanges, self._new_paths):
+            # Who leaves and comes back, as often as it likes, has what was left: only full ones are forgotten.
+            for name in [name for name, one in buckets.items() if name not in names and one.is_full(now)]:
+                del buckets[name]
         return list(before.values())

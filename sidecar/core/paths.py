@@ -42,6 +42,7 @@ class Path:
     """Sender's and receiver's state of one path. Owned by its link."""
 
     __slots__ = (
+        "_exchanges",
         "_introduced_at",
         "_introducer",
         "_oldest_at",
@@ -87,17 +88,20 @@ class Path:
         now: float,
         rng: random.Random,
         unproven: TokenBucket,
+        exchanges: TokenBucket,
         *,
         leads: bool,
     ) -> None:
         """`leads`: this end is the one that keeps the path alive (see `Probing`).
 
         `unproven` holds what may go to where the peer has never proven to be, in bytes; all its paths share it.
+        `exchanges` holds how many exchanges of keys are worked on; they share it too.
         """
         self.id = path_id
         self.remote_id: InterfaceId = path_id.remote
         self.session = session
         self._rng = rng
+        self._exchanges = exchanges
         self.keys = keys
         self.sealing = keys.sealing
         self.opening = keys.opening
@@ -227,7 +231,11 @@ class Path:
 
     def answer_keys(self, offer: KeyOffer, now: float) -> KeyAnswer | None:
         """Return the answer to an offer, if there is one; raises DecodeError."""
-        return self.keys.answer(offer, now, self._rng)
+        return self.keys.answer(offer, now, self._rng, self._exchanges)
+
+    def take_keys(self, answer: KeyAnswer, now: float) -> bool:
+        """Go on with the keys that an answer completes; False if nothing is asked. Raises DecodeError."""
+        return self.keys.take(answer, now, self._exchanges)
 
     def plan_probe(self, now: float) -> None:
         """A probe left: plan the next one."""
@@ -391,4 +399,5 @@ class Path:
         """It is as good as dead. What was asked before may still be answered, if the path is slow rather than dead."""
         self.state = PathState.DOWN
         self._waiting_since = None
+        self.opening.forget_previous()
         self.mtu.stop()

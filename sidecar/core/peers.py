@@ -282,13 +282,13 @@ class Peers:
             keys = self._keys[name]
             before = self._told.get(name)
             if before is None or before[0] is not peer or before[1] is not keys:
-                before = peer, keys, _link_peer(peer, keys)
+                before = peer, keys, _link_peer(peer, keys, self._announced.eras[name])
             told[name] = before
         self._told = told
         return tuple(link_peer for _, _, link_peer in told.values())
 
 
-def _link_peer(peer: Peer, keys: PairKeys) -> LinkPeer:
+def _link_peer(peer: Peer, keys: PairKeys, era: int) -> LinkPeer:
     by_interface: dict[InterfaceId, list[Address]] = {}
     for candidate in peer.candidates:
         addresses = by_interface.setdefault(candidate.interface_id, [])
@@ -302,4 +302,5 @@ def _link_peer(peer: Peer, keys: PairKeys) -> LinkPeer:
         peer.credential,
         keys,
         tuple((interface, tuple(addresses)) for interface, addresses in sorted(by_interface.items())),
+        era,
     )

@@ -11,6 +11,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from protos.model import PenaltyReport
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -69,6 +71,14 @@ class Penalties:
         """When it is back in favour; the past, if it is."""
         record = self._records.get(server)
         return -math.inf if record is None else record.until
+
+    def report(self, now: float) -> tuple[PenaltyReport, ...]:
+        """Return those that are out of favour, for the control plane."""
+        return tuple(
+            PenaltyReport(server, record.until - now, math.ceil(record.now(now)))
+            for server, record in self._records.items()
+            if record.until > now
+        )
 
     def favoured(self, servers: Iterable[NodeName], now: float) -> tuple[NodeName, ...]:
         """Return those that are in favour; all, where none is."""

@@ -32,9 +32,12 @@ class VerificationBudget:
     def __init__(self) -> None:
         self._all: TokenBucket | None = None
         self._of_peer: dict[tuple[NodeName, bool], TokenBucket] = {}
+        self._at = 0.0
+        """When the last credential was to be looked at."""
 
     def take(self, peer: NodeName, now: float, *, at_home: bool) -> bool:
         """Whether a credential of this peer may be looked at now; `at_home`: it comes from a known address of it."""
+        self._at = now
         if self._all is None:
             self._all = TokenBucket(rate=ALL_LOOKS_PER_S, burst=ALL_LOOKS_AT_ONCE, now=now)
         own = self._of_peer.get((peer, at_home))
@@ -44,5 +47,7 @@ class VerificationBudget:
         return own.take(now) and self._all.take(now)
 
     def keep(self, peers: Container[NodeName]) -> None:
-        """Forget all others."""
-        self._of_peer = {key: bucket for key, bucket in self._of_peer.items() if key[0] in peers}
+        """Forget all others, once they have all their looks again: who comes and goes gets no new ones by it."""
+        self._of_peer = {
+            key: bucket for key, bucket in self._of_peer.items() if key[0] in peers or not bucket.is_full(self._at)
+        }

@@ -272,12 +272,12 @@ class ThreadedDataPlane:
         with self._lock:
             self._engine.revocations.on_judged(peer, self._clock(), good=good)
 
-    def end_expired(self) -> None:
-        """Part with peers whose certificates have ended by now, at next to no cost while there are none.
+    def end_expired(self, now_wall: float) -> None:
+        """Part with peers whose certificates have ended by now (seconds since 1970), at next to no cost without any.
 
         Say who else is not talked to any more.
         """
-        if self._own.forget_ended(time.time()):
+        if self._own.forget_ended(now_wall):
             with self._lock:
                 known = self._engine.peers.all()
             self._judge(known)
@@ -320,7 +320,7 @@ class ThreadedDataPlane:
     def take_report(self) -> Report:
         """Return what was measured since the last call."""
         with self._lock:
-            return self._engine.take_report()
+            return self._engine.take_report(self._clock())
 
     def check_paths(self, interface: InterfaceName) -> None:
         """The control stream is not answered over this interface: find out whether anything else is."""

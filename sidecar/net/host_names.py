@@ -9,9 +9,11 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+import time
 from typing import TYPE_CHECKING
 
 from protos.config_fields import numeric_host, split_host_port
+from protos.token_bucket import TokenBucket
 from sidecar.net.sockets import normalise
 
 if TYPE_CHECKING:
@@ -25,6 +27,12 @@ LOOK_UP_EVERY_S = 60.0
 """How soon a name that leads somewhere else is noticed."""
 RETRY_S = 2.0
 """While some name has no address."""
+NEW_NAMES_PER_S = 0.1
+"""Other sets of names that are used: whoever tells the names aims us at whom they name. After ..."""
+NEW_NAMES_AT_ONCE = 4.0
+"""... a start: those of the configuration, of the control plane, of the next one."""
+HELD_BACK_S = 1.0
+"""How often it is looked whether others may be used."""
 
 
 class HostNames:
@@ -38,6 +46,8 @@ class HostNames:
         self._by_name: dict[str, tuple[Address, ...]] = {}
         self._told: tuple[Address, ...] = ()
         self._failing: frozenset[str] = frozenset()
+        self._used: tuple[str, ...] = ()
+        self._changes = TokenBucket(rate=NEW_NAMES_PER_S, burst=NEW_NAMES_AT_ONCE, now=time.monotonic())
         self._wake = threading.Event()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="plr-names", daemon=True)
@@ -52,18 +62,25 @@ class HostNames:
         self._wake.set()
 
     def look_up(self, names: tuple[str, ...]) -> None:
-        """Use these names from now on; at once, also when they are the same (the network may have changed)."""
+        """Use these names from now on; at once, also when they are the same (the network may have changed).
+
+        Other names, again and again, wait.
+        """
         self._names = names
         self._wake.set()
 
     def _run(self) -> None:
         while not self._stopping:
-            self._look_up_all()
-            self._wake.wait(RETRY_S if self._failing else LOOK_UP_EVERY_S)
+            if self._names == self._used or self._changes.take(time.monotonic()):
+                self._used = self._names
+                self._look_up_all()
+                self._wake.wait(RETRY_S if self._failing else LOOK_UP_EVERY_S)
+            else:
+                self._wake.wait(HELD_BACK_S)
             self._wake.clear()
 
     def _look_up_all(self) -> None:
-        names = self._names
+        names = self._used
         self._by_name = {name: self._by_name[name] for name in names if name in self._by_name}
         self._by_name |= {name: (address,) for name in names if (address := numeric_host(name)) is not None}
         self._tell()  # these need not wait for a name server that does not answer
@@ -84,7 +101,7 @@ class HostNames:
         self._failing = frozenset(failing)
 
     def _tell(self) -> None:
-        unique = tuple(dict.fromkeys(address for name in self._names for address in self._by_name.get(name, ())))
+        unique = tuple(dict.fromkeys(address for name in self._used for address in self._by_name.get(name, ())))
         if unique and unique != self._told and not self._stopping:
             self._told = unique
             self._found(unique)

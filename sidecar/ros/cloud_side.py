@@ -112,7 +112,7 @@ class CloudSide:
             self.refuse(event, RejectReason.BAD_PAYLOAD, str(error), now)
             return
         execution = Execution(
-            event.execution, request, now, event.priority, now + event.deadline_s, now + event.expires_s
+            event.execution, event.robot, request, now, event.priority, now + event.deadline_s, now + event.expires_s
         )
         self._executions[event.execution] = (runner, execution)
         self._stats.pending = len(self._executions)

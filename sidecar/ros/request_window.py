@@ -23,8 +23,8 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from sidecar.ros.request_queue import RequestQueue
 from sidecar.ros.server_capacity import FIRST_LIMIT, SAFE_SIZE, ServerCapacity
+from sidecar.ros.shared_queue import SharedQueue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator
@@ -77,7 +77,7 @@ class RequestWindow(Generic[T]):
         """`alive_since`: whether the server has shown a sign of life since then (s), other than an answer."""
         self._alive_since = alive_since
         self._capacity = ServerCapacity(first)
-        self._waiting: RequestQueue[T] = RequestQueue()
+        self._waiting: SharedQueue[T] = SharedQueue()
         self._unseen: deque[int] = deque()
         """Numbers of the sent requests that may still lie in the server's queue, ascending."""
         self._given_up: set[int] = set()
@@ -108,9 +108,11 @@ class RequestWindow(Generic[T]):
         wanted = self._capacity.limit - self._capacity.overtaken
         return max(1, min(wanted + self._silences, SAFE_SIZE))
 
-    def add(self, request: T, priority: Priority, deadline: float, expires: float, now: float) -> None:
-        """Let a request wait for its turn; the caller removes it when it `expires`."""
-        self._waiting.add(request, priority, deadline, expires)
+    def add(
+        self, request: T, priority: Priority, deadline: float, expires: float, now: float, robot: Hashable = None
+    ) -> None:
+        """Let a robot's request wait for its turn; the caller removes it when it `expires`."""
+        self._waiting.add(request, robot, priority, deadline, expires)
         if deadline > now + self._capacity.usual_s:
             self._only_late_since = None
         elif self._only_late_since is None:

@@ -13,7 +13,7 @@ from sidecar.ros.request_window import RequestWindow
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import ServiceName
+    from protos.model import NodeName, ServiceName
     from sidecar.core.events import ExecutionId
     from sidecar.core.priority import Priority
     from sidecar.ros.rcl import Message
@@ -25,6 +25,7 @@ class Execution:
     """One request on its way through a local server."""
 
     id: ExecutionId
+    robot: NodeName
     request: Message | None
     arrived_at: float
     priority: Priority
@@ -83,9 +84,12 @@ class ServiceRunner:
 
     def add(self, execution: Execution, now: float) -> bool:
         """Send `execution` now, or as soon as the server has room; return False when it has to wait."""
-        self.window.add(execution, execution.priority, execution.deadline_at, execution.expires_at, now)
+        window = self.window
+        window.add(
+            execution, execution.priority, execution.deadline_at, execution.expires_at, now, robot=execution.robot
+        )
         self.release(now)
-        return not self.window.holds(execution)
+        return not window.holds(execution)
 
     def release(self, now: float) -> None:
         """Send what may be sent now."""

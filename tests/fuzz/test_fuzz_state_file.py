@@ -12,14 +12,23 @@ from hypothesis import strategies as st
 
 from protos.errors import DecodeError
 from protos.model import MappingSet, NodeName, PeerSet, Version, Welcome
-from sidecar.state_file import LastGood, decode_addresses, decode_identity, decode_last_good, encode_last_good
+from sidecar.state_file import (
+    FORMAT_VERSION,
+    LAST_GOOD_VERSION,
+    LastGood,
+    decode_addresses,
+    decode_identity,
+    decode_last_good,
+    encode_last_good,
+)
 
 OWNER = NodeName("robot-1")
 GOOD = encode_last_good(LastGood(OWNER, Welcome(3.0, 0.5, ("s:1",)), PeerSet(Version(1), 2), MappingSet(Version(3), 4)))
 
 
 def sealed(magic: bytes, body: bytes) -> bytes:
-    return struct.pack("!8sHI32s", magic, 1, len(body), hashlib.sha256(body).digest()) + body
+    version = LAST_GOOD_VERSION if magic == b"plr-last" else FORMAT_VERSION
+    return struct.pack("!8sHI32s", magic, version, len(body), hashlib.sha256(body).digest()) + body
 
 
 @given(st.binary(max_size=300))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
+from protos.clock_floor import ClockFloor
 from protos.identity import IdentityRole
 from protos.tls_files import load_tls_files
 from sidecar.announcement import Announcer
@@ -29,6 +31,7 @@ class CertifiedMesh(Mesh):
         self._folder = folder
         self._authority = Authority.create()
         self.files: dict[str, TlsFiles] = {}
+        self.clock = ClockFloor(time.time)
         self.begin_session = self._begin_certified
 
     def renew(self, node: Node) -> SessionCredential:
@@ -43,5 +46,5 @@ class CertifiedMesh(Mesh):
             path = self._folder / node.name
             self._authority.write_tls_dir(path, node.name, IdentityRole(node.role.value))
             self.files[node.name] = load_tls_files(path)
-        own = start_session(node.name, node.role, node.incarnation, lambda: self.files[node.name])
+        own = start_session(node.name, node.role, node.incarnation, lambda: self.files[node.name], self.clock)
         return own, Announcer(own.credential.session, lambda: self.files[node.name], lambda _: ())

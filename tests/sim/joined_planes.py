@@ -86,7 +86,7 @@ class JoinedPlanes:
             if self.told.get(node.name) != services:
                 self.told[node.name] = services
                 self.core.receive(stream, services, now)
-            report = node.engine.take_report() if node.role is Role.ROBOT else Heartbeat()
+            report = node.engine.take_report(now) if node.role is Role.ROBOT else Heartbeat()
             self.core.receive(stream, report, now)
         self.core.handle_timer(now)
         picture = self.core.start_solving(now)

@@ -161,7 +161,7 @@ def happenings(world: World) -> Iterator[str]:
     yield "all clouds restart"
     world.mesh.run(5.0)
     yield "all deadlines are over"
-    world.robot.engine.take_report()
+    world.robot.engine.take_report(world.mesh.now)
     yield "a report"
     world.remove_clouds()
     yield "all clouds leave"

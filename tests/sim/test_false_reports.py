@@ -9,6 +9,7 @@ from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.explanation_text import render
 from protos.histogram import MAX_COUNT, Histogram
 from protos.model import (
+    Assignment,
     CandidateSet,
     InterfaceName,
     LatencyReport,
@@ -135,3 +136,22 @@ def test_explain_does_not_tell_a_robot_that_it_is_its_own_witness() -> None:
     world.say(robot, Report(latencies=(latency("wlan0", "a", histogram(0.01), processing=histogram(0.01)),)))
     world.run(3.0)
     assert "who says" not in render(world.core.explain(robot.name, ServiceName("/plan"), world.now))
+
+
+def test_a_server_that_changes_its_offers_evicts_nothing_of_another() -> None:
+    fleet = Fleet(permitted=True)
+    fleet.call(10)
+    world, rogue = fleet.world, fleet.world.join(registration("rogue", Role.CLOUD))
+    world.say(rogue, CandidateSet(interfaces("eth0")))
+    evidence = world.core.estimator.evidence
+    quick = Assignment(InterfaceName("wlan0"), NodeName(QUICK))
+    known = evidence(NodeName("victim0"), quick, ServiceName("/plan"), world.now).compute.total
+    lies = CallRule(("evil",), ("*",), ("rogue",))
+    world.core.set_policy(Policy((lies,), (OfferRule(("*",), ("*",)),)), world.now)
+    for change in range(10):
+        names = [f"/evil{change}/{number}" for number in range(1024)]
+        world.say(rogue, ServiceSet(tuple(offer(name) for name in names)))
+        told = (latency("wlan0", "rogue", histogram(0.01), processing=histogram(0.01), service=name) for name in names)
+        world.say(fleet.evil, Report(latencies=tuple(told)))
+    left = evidence(NodeName("victim0"), quick, ServiceName("/plan"), world.now).compute.total
+    assert left > 0.5 * known > 0

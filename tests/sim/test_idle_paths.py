@@ -88,7 +88,7 @@ def test_each_end_knows_the_round_trip_of_a_path_that_rests() -> None:
     assert len(paths) == 4
     for path in paths:
         assert path.recovery.rtt.smoothed == pytest.approx(0.4, rel=0.3)
-    report = robot.engine.take_report()
+    report = robot.engine.take_report(mesh.now)
     assert all(path.up and path.rtt.total > 0 for path in report.paths)
 
 

@@ -133,7 +133,7 @@ def test_a_pair_that_carries_nothing_is_known_by_exploration_only(explores: bool
     for delay_s in (0.001, 0.15):
         slow.server_delay = lambda delay_s=delay_s: delay_s  # type: ignore[misc]  # mypy infers no type for a default
         call_at(mesh, robot, 10, 45, size=100)
-        estimator.merge(robot.name, robot.engine.take_report(), mesh.now)
+        estimator.merge(robot.name, robot.engine.take_report(mesh.now), mesh.now)
         estimate = estimator.estimate(robot.name, InterfaceName("wwan0"), slow.name, SERVICE, 0.1, mesh.now)
         misses.append(estimate.mean)
     assert len(slow.executed) <= 0.06 * 900

@@ -243,6 +243,22 @@ def test_a_member_that_announces_addresses_of_others_gets_few_bytes_there(addres
     assert cloud.executed
 
 
+def test_a_member_that_leaves_and_comes_back_gets_no_more_bytes_there() -> None:
+    mesh = Mesh(1)
+    robot, evil = mesh.robot("wlan0", "wwan0"), mesh.cloud("cloud-e")
+    announce(evil, 256)
+    evil.asleep = True  # no path to it lives: it is no peer as long as it is away
+    received = watch(mesh)
+    for _ in range(60):
+        evil.alive = True
+        mesh.push_views()
+        mesh.run(0.25)
+        evil.alive = False
+        mesh.push_views()
+        mesh.run(0.25)
+    assert 0 < received.bytes <= len(robot.links) * (UNPROVEN_BYTES + 30 * UNPROVEN_BYTES_PER_S)
+
+
 def test_after_a_nat_gave_a_new_port_nothing_waits_longer_than_a_round_trip() -> None:
     mesh = Mesh(1)
     robot, cloud = mesh.robot("wlan0"), mesh.cloud("cloud-a")

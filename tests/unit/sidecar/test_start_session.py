@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
+from protos.clock_floor import ClockFloor
 from protos.credential import SessionCredential, verify
 from protos.errors import ConfigError, DecodeError
 from protos.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, CertificateError, IdentityRole, Trust
@@ -39,7 +41,9 @@ class Fleet:
         return load_tls_files(self.folder / name)
 
     def session(self, files: TlsFiles, incarnation: int = 1) -> OwnSession:
-        return start_session(files.identity.name, Role(files.identity.role.value), incarnation, lambda: files)
+        return start_session(
+            files.identity.name, Role(files.identity.role.value), incarnation, lambda: files, ClockFloor(time.time)
+        )
 
     def trust(self) -> Trust:
         return Trust(self.ca.ca_pem, self.ca.crl_pem())

@@ -43,6 +43,7 @@ from sidecar.state_file import (
 )
 from sidecar.state_store import (
     ADDRESSES_FILE,
+    CLOCK_FILE,
     IDENTITY_FILE,
     LAST_GOOD_FILE,
     REVOCATIONS_FILE,
@@ -164,6 +165,21 @@ def test_revocation_lists_are_found_again_wherever_they_came_from(tmp_path: Path
     store = StateStore(tmp_path, OWNER)
     assert store.revocations == b""
     assert store.failures == {"revocations_refused": 1}
+    store.close()
+
+
+@pytest.mark.audit("sec-9")
+def test_the_clocks_floor_is_found_again(tmp_path: Path) -> None:
+    store = StateStore(tmp_path, OWNER)
+    assert store.clock_floor == 0.0
+    store.remember_clock_floor(1_800_000_000.5)
+    store = reopen(store, tmp_path)
+    assert store.clock_floor == 1_800_000_000.5
+    store.close()
+    (tmp_path / CLOCK_FILE).write_bytes(b"spoilt")
+    store = StateStore(tmp_path, OWNER)
+    assert store.clock_floor == 0.0
+    assert store.failures == {"clock_floor_refused": 1}
     store.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -9,11 +10,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.candidate_signature import sign_candidates, verify_candidates
+from protos.clock_floor import ClockFloor
 from protos.identity import IdentityRole
-from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, NodeName, Peer, Role
+from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, NodeName, Peer, PeerSet, Role, Version
 from sidecar.core import announced as module
 from sidecar.core import session
 from sidecar.core.announced import Announced
+from sidecar.core.peers import Peers
 from sidecar.start_session import start_session
 from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import peer
@@ -37,10 +40,11 @@ class Cloud:
     """A cloud with a certificate, and a robot that hears of it."""
 
     def __init__(self, folder: Path) -> None:
-        fleet = Fleet(folder)
+        self.fleet = fleet = Fleet(folder)
         self.files: TlsFiles = fleet.issue("cloud-a", IdentityRole.CLOUD)
         self.own = fleet.session(self.files)
-        self.robot = fleet.session(fleet.issue("robot-1"))
+        self.trusted = fleet.issue("robot-1")
+        self.robot = start_session(NodeName("robot-1"), Role.ROBOT, 1, lambda: self.trusted, ClockFloor(time.time))
         self.dropped: Counter[str] = Counter()
         self.announced = Announced(self.robot, self.dropped)
 
@@ -103,10 +107,50 @@ def test_nothing_said_is_no_fault_and_changes_nothing(cloud: Cloud) -> None:
 def test_a_new_run_counts_from_the_start(cloud: Cloud) -> None:
     assert cloud.hosts(cloud.told(9, "a")) == ["a"]
     old = cloud.told(10, "old")
-    cloud.own = start_session(cloud.files.identity.name, Role.CLOUD, 2, lambda: cloud.files)
+    cloud.own = start_session(cloud.files.identity.name, Role.CLOUD, 2, lambda: cloud.files, ClockFloor(time.time))
     assert cloud.hosts(cloud.told(1, "b")) == ["b"]
     assert cloud.hosts(old) == ["b"]
     assert cloud.dropped == {"old_candidates": 1}
+
+
+def test_what_a_thief_announced_last_does_not_outlive_the_revocation_of_its_key(cloud: Cloud, tmp_path: Path) -> None:
+    """It signs with the largest incarnation there is; the node that gets a new certificate has a smaller one."""
+    assert cloud.hosts(cloud.told(1, "a")) == ["a"]
+    cloud.own = start_session(
+        cloud.files.identity.name, Role.CLOUD, 2**64 - 1, lambda: cloud.files, ClockFloor(time.time)
+    )
+    assert cloud.hosts(cloud.told(2**64 - 1, "thief")) == ["thief"]
+    fleet = cloud.fleet
+    fleet.ca.revoke("cloud-a")
+    cloud.trusted = replace(cloud.trusted, trust=fleet.trust())
+    cloud.robot.forget_admitted()
+    cloud.files = fleet.issue("cloud-a", IdentityRole.CLOUD)
+    cloud.own = start_session(cloud.files.identity.name, Role.CLOUD, 2, lambda: cloud.files, ClockFloor(time.time))
+    assert cloud.hosts(cloud.told(0, signed=False)) == []
+    assert cloud.hosts(cloud.told(1, "b")) == ["b"]
+    assert not cloud.dropped
+
+
+@pytest.mark.audit("sec-1")
+def test_links_hear_that_a_name_is_somebody_elses_now(cloud: Cloud) -> None:
+    """They may have forgotten a path of a session with the largest incarnation, and would refuse all later ones."""
+    peers = Peers(cloud.robot, cloud.dropped)
+    name = cloud.files.identity.name
+    cloud.own = start_session(name, Role.CLOUD, 2**64 - 1, lambda: cloud.files, ClockFloor(time.time))
+
+    def era(version: int) -> int:
+        assert peers.apply(PeerSet(Version(version), version, (cloud.told(1, "a"),)), lambda _: False) is None
+        (told,) = peers.for_links()
+        return told.era
+
+    assert era(1) == 0
+    cloud.fleet.ca.revoke("cloud-a")
+    cloud.trusted = replace(cloud.trusted, trust=cloud.fleet.trust())
+    cloud.robot.forget_admitted()
+    assert peers.recheck() == [name]
+    cloud.files = cloud.fleet.issue("cloud-a", IdentityRole.CLOUD)
+    cloud.own = start_session(name, Role.CLOUD, 2, lambda: cloud.files, ClockFloor(time.time))
+    assert [era(2), era(3)] == [1, 1]
 
 
 def test_each_signature_is_looked_at_once(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:

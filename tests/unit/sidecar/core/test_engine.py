@@ -234,7 +234,7 @@ def test_news_of_paths_to_peers_or_over_interfaces_that_are_gone_leave_no_trace(
         sidecar.engine.on_link_event(PathMeasured(stray, 0.1, (0.1,), 1, 0), 0.1)
         sidecar.engine.on_link_event(PathChanged(stray, PathState.UP, ""), 0.1)
     assert sidecar.engine.routes._routes == known
-    assert len(sidecar.engine.take_report().paths) == 1
+    assert len(sidecar.engine.take_report(0.2).paths) == 1
 
 
 def test_the_same_news_of_a_path_twice_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -269,7 +269,7 @@ def test_a_request_for_a_service_that_is_not_offered_fails_at_once() -> None:
     assert isinstance(failed, RequestFailed)
     assert failed.outcome == "rejected"
     assert sidecar.engine.stats.requests[ServiceName("/none"), "rejected"] == 1
-    (told,) = sidecar.engine.take_report().outcomes
+    (told,) = sidecar.engine.take_report(0.2).outcomes
     assert (told.service, told.failed) == ("/none", 1), "the control plane learns of it as of any other"
 
 

@@ -102,3 +102,21 @@ def test_the_next_link_inherits_copies_and_what_was_forgotten() -> None:
     assert original is not None
     assert inherited.incarnation == original.incarnation == 3
     assert inherited.received is not original.received, "the link before may not have ended"
+
+
+def test_whoever_has_a_name_after_one_that_was_revoked_begins_anew() -> None:
+    """A thief may have used, and left behind, the largest incarnations there are."""
+    last = 2**64 - 1
+    memory = filled(range(last - MAX_PATHS_OF_A_PEER, last + 1))
+    memory.begin_era(A, 0)
+    assert memory.forgot(A, 1)
+    memory.keep(B, SessionId(7), REMOTE, path_keys(7))
+    memory.begin_era(A, 1)
+    assert not memory.forgot(A, 1)
+    assert len(memory) == 1
+    memory.keep(A, SessionId(3), REMOTE, path_keys(3))
+    memory.begin_era(A, 1)
+    heir = LinkMemory()
+    heir.keep_all(memory)
+    heir.begin_era(A, 1)
+    assert heir.take(A, SessionId(3), REMOTE) is not None

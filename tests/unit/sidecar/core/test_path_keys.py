@@ -181,6 +181,27 @@ def test_offers_of_other_phases_and_answers_that_nobody_asked_for_are_nothing() 
     assert not robot.take(answer, 0.0)
 
 
+def test_there_is_no_phase_after_the_last() -> None:
+    rng = random.Random(1)
+    robot, cloud = ends()
+    agree(robot, cloud, 0.0, rng)
+    for keys in (robot, cloud):
+        keys._exchange.phase = keys.sealing.phase = keys.opening.phase = 2**32 - 1
+    assert robot.offer(1000.0, rng) is None
+    assert cloud.answer(KeyOffer(0, bytes(32), bytes(16)), 1000.0, rng) is None
+
+
+def test_nothing_of_an_exchange_that_is_over_is_kept() -> None:
+    rng = random.Random(1)
+    robot, cloud = ends()
+    before = robot._exchange._root
+    agree(robot, cloud, 0.0, rng)
+    for keys in (robot, cloud):
+        assert keys._exchange._exchange is None
+        assert keys._exchange._root != before
+        assert keys.opening._previous is None
+
+
 @pytest.mark.parametrize("key", [bytes(32), (1).to_bytes(32, "little")])
 def test_keys_of_small_order_are_refused(key: bytes) -> None:
     rng = random.Random(1)
@@ -255,3 +276,26 @@ def test_nothing_is_lost_to_changes_of_keys_whatever_the_order(seed: int) -> Non
             elif said is not None:
                 robot.take(said, now)
     assert robot.sealing.phase > 10
+
+
+@pytest.mark.audit("sec-9")
+@pytest.mark.parametrize("other", [False, True])
+def test_an_offer_is_not_answered_once_more_when_its_keys_have_opened_something(*, other: bool) -> None:
+    """Nobody may have read that yet, as when it was malformed: expected again, the key would open one phase too far."""
+    rng = random.Random(1)
+    robot, cloud = ends()
+    offer = robot.offer(0.0, rng)
+    assert offer is not None
+    answer = cloud.answer(offer, 0.0, rng)
+    assert answer is not None
+    if other:
+        key = bytes(31) + b"\x09"
+        offer = KeyOffer(1, key, proof_of_offer(robot._exchange._root, 1, key))
+    assert robot.take(answer, 0.0)
+    assert opens(cloud.opening, sealed(robot, 4))
+    assert cloud.answer(offer, OTHER_OFFER_AFTER_S, rng) is None
+    robot.sealing.head ^= PHASE_FLAG << 16
+    assert not opens(cloud.opening, sealed(robot, 5))
+    assert cloud.follow(2.0)
+    assert not cloud.follow(2.0)
+    assert cloud.opening.phase == cloud.sealing.phase == 1

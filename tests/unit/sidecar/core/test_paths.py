@@ -31,8 +31,8 @@ def new() -> Path:
         for pair in (of_cloud, of_robot)
     )
     agree(keys, theirs, 100.0, RNG)
-    budget = TokenBucket(rate=1200.0, burst=65_536, now=100.0)
-    return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0, RNG, budget, leads=True)
+    budget, exchanges = (TokenBucket(rate=1200.0, burst=65_536, now=100.0) for _ in range(2))
+    return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0, RNG, budget, exchanges, leads=True)
 
 
 def ask(subject: Path, now: float) -> int:

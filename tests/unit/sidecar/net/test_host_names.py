@@ -3,6 +3,7 @@ from __future__ import annotations
 import queue
 import socket
 import threading
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -23,6 +24,23 @@ def found() -> Iterator[tuple[HostNames, queue.Queue[tuple[Address, ...]]]]:
     results: queue.Queue[tuple[Address, ...]] = queue.Queue()
     names = HostNames("STUN server", results.put)
     yield names, results
+    names.stop()
+
+
+@pytest.mark.audit("sec-5")
+def test_names_that_change_all_the_time_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who tells them aims us at whom they name."""
+    monkeypatch.setattr(host_names, "NEW_NAMES_AT_ONCE", 1.0)
+    monkeypatch.setattr(host_names, "HELD_BACK_S", 0.1)
+    results: queue.Queue[tuple[Address, ...]] = queue.Queue()
+    names = HostNames("STUN server", results.put)
+    names.look_up(("192.0.2.1:1",))
+    names.start()
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.1", 1),)
+    for port in range(2, 200):
+        names.look_up((f"192.0.2.1:{port}",))
+        time.sleep(0.001)
+    assert results.get(timeout=TIMEOUT_S) == (("192.0.2.1", 199),), "none in between"
     names.stop()
 
 
