@@ -4,6 +4,7 @@ examples:
   make bench-dataplane                                     the data plane against its targets, with a page of plots
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
   make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
+  make bench-insiders BENCH_ARGS='--minutes 2'              a robot and a cloud of the fleet attack the others
   make bench-quick                                         15 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
   python -m bench report --out bench/results               verdicts, page and summary anew from the records of runs
@@ -22,6 +23,7 @@ from bench.dataplane import command as dataplane
 from bench.evaluation import command as evaluate
 from bench.evaluation import report_command as report
 from bench.evaluation import scenarios_command as scenarios
+from bench.insiders import command as insiders
 from bench.matcher import command as matcher
 
 
@@ -33,15 +35,23 @@ def main() -> int:
     commands = parser.add_subparsers(dest="command", metavar="MEASUREMENT")
     dataplane.add_arguments(commands.add_parser("dataplane", help="the data plane against its targets"))
     churn.add_arguments(commands.add_parser("churn", help="minutes of trouble: requests lost or doubled, memory grown"))
+    insiders.add_arguments(
+        commands.add_parser("insiders", help="two members attack all the others in every way at once")
+    )
     matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
     scenarios.add_arguments(commands.add_parser("scenarios", help="what is replayed; the generator beside traces"))
     evaluate.add_arguments(commands.add_parser("evaluate", help="the system beside others on replayed networks"))
     report.add_arguments(commands.add_parser("report", help="what the records of the evaluation say, without a run"))
-    given = [sys.argv[1:]] if sys.argv[1:] else [[name] for name in ("dataplane", "churn", "matcher", "evaluate")]
+    given = (
+        [sys.argv[1:]]
+        if sys.argv[1:]
+        else [[name] for name in ("dataplane", "churn", "insiders", "matcher", "evaluate")]
+    )
     runs = {
         "churn": churn.run,
         "dataplane": dataplane.run,
         "evaluate": evaluate.run,
+        "insiders": insiders.run,
         "matcher": matcher.run,
         "report": report.run,
         "scenarios": scenarios.run,

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.null_cipher import null_cipher
+from protos.clock_floor import ClockFloor
 from protos.model import (
     ALL_CALLS,
     Candidate,
@@ -58,7 +59,7 @@ class Side:
         self.name, self.role = NodeName(name), role
         self.token = session.to_bytes(16, "big")
         self.address = (name, 1)
-        self.own = start_session(self.name, role, 1, None)
+        self.own = start_session(self.name, role, 1, None, ClockFloor(time.time))
         self.session = self.own.credential.session
         self.engine = Engine(EngineConfig(role, (ServiceRule("/*", 10.0, 60.0, idempotent=True),)), self.own, now)
         interface = InterfaceName("eth0")

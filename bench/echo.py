@@ -24,11 +24,14 @@ SERVICE = "/echo"
 def answer(request: Any, response: Any) -> dict[str, Any]:
     """Answer with a checksum of the payload, after as many milliseconds, and with as many bytes, as `format` says."""
     delay_ms, _, size = request.image.format.partition(" ")
-    time.sleep(float(delay_ms or 0) / 1e3)
-    response.message = "." * int(size or 0)
+    try:
+        time.sleep(float(delay_ms or 0) / 1e3)
+        response.message = "." * int(size or 0)
+        response.success = True
+    except (ValueError, OverflowError):  # whoever may call may also say what means nothing
+        response.success = False
     data = bytes(request.image.data)
     response.header = request.image.header
-    response.success = True
     response.image_width = zlib.crc32(data)
     response.image_height = len(data)
     return {"id": request.image.header.frame_id}

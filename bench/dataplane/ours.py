@@ -41,11 +41,13 @@ class Ours:
         answer_bytes: int = HEADER.size,
         name: str = "ours",
         null_cipher: bool = False,
+        rekey_after_s: int | None = None,
         before: Sequence[str] = (),
     ) -> None:
         """Start them; hosts are the lab's, None is this machine. Without `mapping` the engine picks the paths.
 
-        `null_cipher`: nothing is sealed. `before`: a command that starts each program, chrt say.
+        `null_cipher`: nothing is sealed. `rekey_after_s`: as in a sidecar's configuration. `before`: a command that
+        starts each program, chrt say.
         """
         self._stack = contextlib.ExitStack()
         start = self._stack.enter_context
@@ -56,7 +58,9 @@ class Ours:
             }
             self.robot = start(Remote.start("engine", folder, host=robot, name=f"{name}.robot", before=before))
             seal = {"null_cipher": null_cipher}
-            common = {"stun": {"enabled": False}, "udp_port": 0, "log_level": "warning"}
+            common: dict[str, Any] = {"stun": {"enabled": False}, "udp_port": 0, "log_level": "warning"}
+            if rekey_after_s is not None:
+                common["rekey_after_s"] = rekey_after_s
             self._peers: list[Any] = []
             for cloud, program in self.clouds.items():
                 config = {"name": cloud, "role": "cloud", "interfaces": [cloud_interface], **common}

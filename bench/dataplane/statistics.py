@@ -6,6 +6,7 @@ themselves (the bootstrap). It knows nothing of what differs from run to run.
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 import statistics
@@ -19,6 +20,8 @@ MS = 1000.0
 DRAWS = 400
 """How often samples are drawn again for an interval."""
 CONFIDENCE = 0.95
+STRETCH = 5
+"""Messages whose arrivals make one sample of goodput."""
 BLOCK = 10
 """Requests in a row that are drawn together: what disturbs one often disturbs the next."""
 
@@ -77,6 +80,12 @@ def difference(one: float | None, other: float | None) -> float | None:
 def worst(values: Iterable[float | None]) -> float | None:
     """Largest of what was measured; None when nothing was."""
     return max((value for value in values if value is not None), default=None)
+
+
+def goodput_of_stretches(calls: Calls, message_bytes: int) -> list[float]:
+    """Mbit/s of each stretch of STRETCH messages that arrived one after the other."""
+    ends = sorted(calls.arrivals())[::STRETCH]
+    return [STRETCH * message_bytes * 8 / 1e6 / max(end - start, 1e-9) for start, end in itertools.pairwise(ends)]
 
 
 def interval(

@@ -57,5 +57,12 @@ TARGETS = (
         "P99 meanwhile, over what is allowed: 5 ms more than undisturbed, or twice as much",
         at_most=1,
     ),
+    Target(
+        "keys_p99_renewed_over_kept",
+        "P99 of 1 kB with keys renewed every second (120 times as often as by default), over that with keys kept",
+        at_most=1.15,
+    ),
+    Target("keys_goodput_renewed_over_kept", "goodput likewise", at_least=0.95),
+    Target("keys_lost", "requests lost in both", at_most=0),
     Target("tcp_share_ratio", "goodput of one TCP flow over ours at one bottleneck", at_least=0.25, at_most=4),
 )

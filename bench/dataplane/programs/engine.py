@@ -19,6 +19,7 @@ from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
 from bench.null_cipher import install
 from protos import interpreter
+from protos.clock_floor import ClockFloor
 from protos.model import (
     ALL_CALLS,
     Assignment,
@@ -83,7 +84,7 @@ class EngineProgram:
         self._role, self._answer_bytes = parsed.role, answer_bytes
         logging.basicConfig(level=parsed.log_level.name, stream=sys.stderr, format="%(asctime)s %(name)s %(message)s")
         interpreter.share()
-        self._own = start_session(parsed.node_name, parsed.role, 1, None)
+        self._own = start_session(parsed.node_name, parsed.role, 1, None, ClockFloor(time.time))
         self._token = random.randbytes(16)
         hooks = DataPlaneHooks(
             self, lambda _interface, _event: None, lambda: None, lambda: None, lambda _: None, lambda *_: None

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
-from bench.dataplane.sections import blackhole, busy, flood, goodput, loss, one_way, outage, overload, ros_calls, share
+from bench.dataplane.sections import (
+    blackhole,
+    busy,
+    flood,
+    goodput,
+    keys,
+    loss,
+    one_way,
+    outage,
+    overload,
+    ros_calls,
+    share,
+)
 
 SECTIONS = (
     one_way.SECTION,
@@ -15,5 +27,6 @@ SECTIONS = (
     outage.SECTION,
     share.SECTION,
     flood.SECTION,
+    keys.SECTION,
 )
 """In the order in which they run."""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.dataplane.ours import SERVICE, Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section
-from bench.dataplane.statistics import MS, Calls, interval, median, median_ratio, ratio
+from bench.dataplane.statistics import MS, Calls, goodput_of_stretches, interval, median, median_ratio, ratio
 from bench.dataplane.topology import cables, ethernet_loopback
 from bench.netlab import Lab
 from bench.reporting.tables import Table
@@ -23,8 +22,6 @@ AT_ONCE = 8
 OURS_COUNT = 100
 AIOQUIC_COUNT = 25
 """It needs many times longer for each."""
-SLICE = 5
-"""Messages that arrive one after the other: the goodput of each such stretch is a sample of the intervals."""
 WARM_UP = 10
 SMALL_BYTES = 1_000
 SMALL_COUNT = 3_000
@@ -162,12 +159,11 @@ def _costed(programs: tuple[Remote, ...], count: int) -> Bulk:
     calls = _bulk(programs[0], count)
     cpu_s = sum(program.ask("usage")["cpu_s"] for program in programs) - before
     megabytes = _answered(calls) * BULK_BYTES / 1e6
-    return Bulk(ratio(megabytes * 8, calls.duration_s()), cpu_s * MS / max(megabytes, 1e-9), _slices(calls))
-
-
-def _slices(calls: Calls) -> list[float]:
-    ends = sorted(calls.arrivals())[::SLICE]
-    return [SLICE * BULK_BYTES * 8 / 1e6 / max(end - start, 1e-9) for start, end in itertools.pairwise(ends)]
+    return Bulk(
+        ratio(megabytes * 8, calls.duration_s()),
+        cpu_s * MS / max(megabytes, 1e-9),
+        goodput_of_stretches(calls, BULK_BYTES),
+    )
 
 
 def _answered(calls: Calls) -> int:

@@ -1,0 +1,126 @@
+"""Introductions that a member can make beside its own: of interfaces and sessions that do not exist, true or forged."""
+
+from __future__ import annotations
+
+import os
+import random
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+
+from protos.credential import decode_credential, session_number
+from protos.model import InterfaceId, Role
+from protos.pair_token import pair_token
+from sidecar.core import frame
+from sidecar.core.aead import TAG_BYTES
+from sidecar.core.frame import HEADER_BYTES, NONCE_OFFSET, Header
+from sidecar.core.introduction import encode_introduction
+from sidecar.core.key_exchange import DEFAULT_LIMITS
+from sidecar.core.key_schedule import pair_keys
+from sidecar.core.path_keys import make_path_keys
+from sidecar.core.session import public_key
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    from protos.credential import SessionCredential
+    from sidecar.core.datagrams import LinkIdentity
+    from sidecar.core.key_schedule import PairKeys
+    from sidecar.core.link_events import LinkPeer
+    from sidecar.core.path_keys import SealingKeys
+    from sidecar.core.paths import Path
+
+PHANTOMS = range(200, 231)
+"""Numbers of interfaces that no host here has: with its own one as many as a peer may introduce."""
+
+
+class FalseSessions:
+    """Makes the datagrams of one member."""
+
+    def __init__(self, identity: LinkIdentity, key: ec.EllipticCurvePrivateKey) -> None:
+        """`key`: its certificate's, with which it signs what it likes."""
+        self._identity = identity
+        self._key = key
+        self._rng = random.Random(identity.session)
+        self._number = 0
+        self._later = 0
+        self._private = b""
+        self._credential: SessionCredential | None = None
+        self._known: dict[tuple[str, int, int, int], tuple[SealingKeys, frame.KeyOffer | None]] = {}
+        """What is made once for each phantom: so the attack costs the attacker little."""
+
+    def phantoms(self, path: Path, peer: LinkPeer) -> Iterator[bytes]:
+        """Introduce interfaces in the present session, each with an offer of keys that is never followed, and probe."""
+        yield from self._introduced(path, peer, decode_credential(self._identity.credential), peer.keys)
+
+    def forged_restart(self, path: Path, peer: LinkPeer) -> bytes:
+        """Introduce a newer session whose credential nobody has signed."""
+        own = decode_credential(self._identity.credential)
+        newer = self._newer(own, os.urandom(32))
+        forged = replace(newer, signature=self._rng.randbytes(len(own.signature)))
+        return self._introduction(path, peer, forged, self._identity.interface_id)
+
+    def replay(self, path: Path, peer: LinkPeer) -> bytes:
+        """An introduction with a packet number of long ago, as somebody may have recorded it."""
+        own = decode_credential(self._identity.credential)
+        return self._introduction(path, peer, own, self._identity.interface_id, number=1)
+
+    def begin(self) -> None:
+        """Begin another session, as a sidecar does that is restarted."""
+        own = decode_credential(self._identity.credential)
+        self._private = os.urandom(32)
+        self._credential = self._newer(own, public_key(self._private)).sign(self._key)
+
+    def restarted(self, path: Path, peer: LinkPeer) -> Iterator[bytes]:
+        """Introduce the interfaces of the session begun last."""
+        if self._credential is None:
+            return
+        own, theirs = self._credential, decode_credential(peer.credential)
+        private = X25519PrivateKey.from_private_bytes(self._private)
+        keys = pair_keys(private, X25519PublicKey.from_public_bytes(theirs.public_key), own, theirs)
+        # The first one makes the session known.
+        yield self._introduction(path, peer, own, InterfaceId(PHANTOMS[0]))
+        yield from self._introduced(path, peer, own, keys)
+
+    def _newer(self, own: SessionCredential, public: bytes) -> SessionCredential:
+        self._later += 1
+        number = session_number(own.name, own.role, public)
+        return replace(own, session=number, incarnation=own.incarnation + self._later, public_key=public)
+
+    def _introduced(self, path: Path, peer: LinkPeer, own: SessionCredential, keys: PairKeys) -> Iterator[bytes]:
+        for interface in map(InterfaceId, PHANTOMS):
+            key = peer.name, path.remote_id, own.session, interface
+            if key not in self._known:
+                leads = own.role is Role.ROBOT
+                phantom = make_path_keys(keys, interface, path.remote_id, DEFAULT_LIMITS, 0.0, leads=leads)
+                self._known[key] = phantom.sealing, phantom.offer(0.0, self._rng)
+            sealing, offer = self._known[key]
+            yield self._introduction(path, peer, own, interface, offer=offer)
+            self._number += 1
+            head = Header(interface, path.remote_id, own.session, self._number)
+            yield seal(sealing, head, frame.encode_probe(frame.Probe(self._rng.getrandbits(64))))
+
+    def _introduction(
+        self,
+        path: Path,
+        peer: LinkPeer,
+        own: SessionCredential,
+        interface: InterfaceId,
+        number: int | None = None,
+        offer: frame.KeyOffer | None = None,
+    ) -> bytes:
+        self._number += 1
+        head = Header(interface, path.remote_id, own.session, self._number if number is None else number)
+        token = pair_token(self._identity.token, peer.name, Role.CLOUD if own.role is Role.ROBOT else Role.ROBOT)
+        return encode_introduction(head, token, peer.name, self._rng.getrandbits(64), own.encode(), offer)
+
+
+def seal(sealing: SealingKeys, header: Header, plain: bytes) -> bytes:
+    """Return a datagram sealed with these keys."""
+    clear = frame.encode_header(header)
+    out = bytearray(len(plain) + TAG_BYTES)
+    sealing.encrypt_into(clear[NONCE_OFFSET:HEADER_BYTES], plain, clear, out)
+    return clear + out

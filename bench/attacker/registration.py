@@ -1,0 +1,46 @@
+"""What a sidecar says first to the control plane, under whatever name, role, session and key it likes."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from typing import TYPE_CHECKING
+
+from protos.convert import sidecar_message_to_proto
+from protos.credential import Aead, SessionCredential, session_number
+from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, SessionId, Version
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+
+def registration(
+    certificate_der: bytes,
+    key: ec.EllipticCurvePrivateKey,
+    name: str,
+    role: Role,
+    incarnation: int | None = None,
+    *,
+    session: int | None = None,
+    software_version: str = "attack",
+) -> bytes:
+    """An encoded registration with a credential signed by this certificate's key; `session`: not its key's number."""
+    incarnation = int(time.time() * 1000.0) if incarnation is None else incarnation
+    public_key = hashlib.sha256(f"{name} {incarnation}".encode()).digest()
+    number = session_number(NodeName(name), role, public_key) if session is None else SessionId(session)
+    credential = SessionCredential(
+        NodeName(name), role, number, incarnation, public_key, Aead.AES_256_GCM, certificate_der
+    ).sign(key)
+    said = Registration(
+        protocol_version=PROTOCOL_VERSION,
+        name=NodeName(name),
+        role=role,
+        session=number,
+        token=bytes(range(16)),
+        incarnation=incarnation,
+        software_version=software_version,
+        peers_version=Version(0),
+        mapping_version=Version(0),
+        credential=credential.encode(),
+    )
+    return sidecar_message_to_proto(said).SerializeToString()
