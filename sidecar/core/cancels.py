@@ -28,7 +28,8 @@ class EarlyCancels:
         self._stats = stats
         self._shares = Shares(MAX_EARLY_CANCELS)
         # In the order in which they are forgotten: all are kept equally long.
-        self._ids: OrderedDict[RequestId, tuple[NodeName, float]] = OrderedDict()
+        self._ids: OrderedDict[tuple[NodeName, RequestId], float] = OrderedDict()
+        """And when each is forgotten."""
 
     def __len__(self) -> int:
         return len(self._ids)
@@ -36,24 +37,23 @@ class EarlyCancels:
     def add(self, robot: NodeName, request_id: RequestId, now: float) -> None:
         """`robot` does not want this request any more."""
         self._forget_old(now)
-        if request_id in self._ids:
+        if (robot, request_id) in self._ids:
             return
         if not self._shares.fits(robot):
             self._stats.dropped["early_cancels_full"] += 1
             return
         self._shares.take(robot)
-        self._ids[request_id] = robot, now + REMEMBER_CANCEL_S
+        self._ids[robot, request_id] = now + REMEMBER_CANCEL_S
 
     def holds(self, robot: NodeName, request_id: RequestId, now: float) -> bool:
         """Whether this robot called the request off."""
         self._forget_old(now)
-        known = self._ids.get(request_id)
-        return known is not None and known[0] == robot and known[1] > now
+        return self._ids.get((robot, request_id), now) > now
 
     def _forget_old(self, now: float) -> None:
         for _ in range(min(FORGOTTEN_AT_ONCE, len(self._ids))):
-            request_id, (robot, forget_at) = next(iter(self._ids.items()))
+            key, forget_at = next(iter(self._ids.items()))
             if forget_at > now:
                 return
-            del self._ids[request_id]
-            self._shares.give_back(robot)
+            del self._ids[key]
+            self._shares.give_back(key[0])

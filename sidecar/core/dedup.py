@@ -5,6 +5,9 @@ kept as a tombstone after the answer had to go, so that a very late copy is refu
 only when no copy can come any more: its sender gives a request up when its lifetime is over. Of a request that was
 refused unrun the copies are remembered, not the id (`refused_copies.py`): another copy may run.
 
+An id counts for the robot that sent it only: a member that learns another's ids, and sends them first, takes nothing
+from it.
+
 A robot that has its answer calls a request off. It does not run then if the local server has not got it yet; nobody
 is answered any more, and copies that still come are ignored.
 """
@@ -12,10 +15,10 @@ is answered any more, and copies that still come are ignored.
 from __future__ import annotations
 
 import heapq
-from collections import OrderedDict
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+from sidecar.core.answer_cache import AnswerCache
 from sidecar.core.cancels import EarlyCancels
 from sidecar.core.events import (
     AbandonExecution,
@@ -48,7 +51,7 @@ MAX_RUNNING_BYTES = 512 * 1024 * 1024
 MAX_WAITERS = 16
 """Copies that wait for one result; a robot sends one for each of its interfaces."""
 MAX_CACHED_BYTES = 64 * 1024 * 1024
-"""Answers kept for late copies."""
+"""Answers kept for late copies; of the robot that holds the most, the oldest goes first."""
 MAX_REMEMBERED = 262_144
 """Ids remembered; one robot may fill half: 2000 requests a second for MIN_REMEMBER_S."""
 REMEMBER_LIFETIMES = 2.0
@@ -60,6 +63,13 @@ SAY_WITHIN_S = 0.5
 
 TIMER_SLACK = 1024
 """Timers of answered requests that may lie around before they are swept out."""
+
+
+class _Key(NamedTuple):
+    """A request, by who asked and the id that it gave."""
+
+    robot: NodeName
+    request_id: RequestId
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +95,7 @@ class Reply:
 @dataclass(slots=True)
 class _Execution:
     id: ExecutionId
-    request_id: RequestId
-    robot: NodeName
+    key: _Key
     service: ServiceName
     priority: Priority
     deadline: float
@@ -108,6 +117,16 @@ class _Execution:
     """Its patience is over: whoever knows whether the local server got it is asked."""
 
     @property
+    def robot(self) -> NodeName:
+        """Who asked."""
+        return self.key.robot
+
+    @property
+    def request_id(self) -> RequestId:
+        """What the robot calls it."""
+        return self.key.request_id
+
+    @property
     def ends(self) -> float:
         """When this execution is given up."""
         return min(self.expires, self.patience_ends)
@@ -118,18 +137,16 @@ class ExecutionTable:
 
     def __init__(self, stats: EngineStats) -> None:
         self._stats = stats
-        self._by_request: dict[RequestId, _Execution] = {}
+        self._by_request: dict[_Key, _Execution] = {}
         """Running."""
-        self._finished: dict[RequestId, _Execution] = {}
-        self._forget_at: list[tuple[float, RequestId]] = []
+        self._finished: dict[_Key, _Execution] = {}
+        self._forget_at: list[tuple[float, _Key]] = []
         """When each finished one is forgotten: a heap."""
         self._running: dict[ExecutionId, _Execution] = {}
         self._running_shares = Shares(MAX_RUNNING)
         self._running_bytes = Shares(MAX_RUNNING_BYTES)
         self._finished_shares = Shares(MAX_REMEMBERED)
-        # Ordered for cheap removal of the oldest: a dict walks over the holes at its front.
-        self._cached: OrderedDict[RequestId, int] = OrderedDict()
-        self._cached_bytes = 0
+        self._cache = AnswerCache(MAX_CACHED_BYTES)
         self._timers: list[tuple[float, ExecutionId]] = []
         self._next_id = 0
         self._early_cancels = EarlyCancels(stats)
@@ -144,9 +161,13 @@ class ExecutionTable:
         """How many of those being worked on one of these robots still waits for."""
         return sum(1 for execution in self._running.values() if not execution.cancelled and execution.robot in robots)
 
-    def knows(self, request_id: RequestId) -> bool:
-        """Whether a copy of this request came before."""
-        return request_id in self._by_request or request_id in self._finished
+    def knows(self, robot: NodeName, request_id: RequestId) -> bool:
+        """Whether a copy of this robot's request came before."""
+        return self._find(robot, request_id) is not None
+
+    def _find(self, robot: NodeName, request_id: RequestId) -> _Execution | None:
+        key = _Key(robot, request_id)
+        return self._by_request.get(key) or self._finished.get(key)
 
     def on_request(
         self, path: PathId, message: RequestMessage, now: float, *, patience_s: float = MAX_LIFETIME_S
@@ -158,12 +179,13 @@ class ExecutionTable:
         The local server is waited for as long as the robot waits, but at most `patience_s`.
         """
         waiter = Waiter(path, message.copy)
-        running = self._by_request.get(message.request_id)
-        execution = running or self._finished.get(message.request_id)
+        key = _Key(path.peer, message.request_id)
+        running = self._by_request.get(key)
+        execution = running or self._finished.get(key)
         lifetime = min(message.lifetime_left_s, MAX_LIFETIME_S)
         count = self._stats.executions
         if execution is not None:
-            if execution.service != message.service or execution.robot != path.peer:
+            if execution.service != message.service:
                 self._stats.dropped["request_id_mismatch"] += 1
                 return None
             if execution.cancelled:
@@ -198,8 +220,7 @@ class ExecutionTable:
             return self.refuse_unseen(waiter, message, RejectReason.OVERLOADED, "too many requests", now)
         execution = _Execution(
             ExecutionId(self._next_id),
-            message.request_id,
-            path.peer,
+            key,
             message.service,
             message.priority,
             now + message.deadline_left_s,
@@ -212,7 +233,7 @@ class ExecutionTable:
         self._next_id += 1
         self._running_shares.take(path.peer)
         self._running_bytes.take(path.peer, size)
-        self._by_request[message.request_id] = execution
+        self._by_request[key] = execution
         self._running[execution.id] = execution
         self._arm(execution)
         count[message.service, "run"] += 1
@@ -262,7 +283,7 @@ class ExecutionTable:
             return []
         execution.payload = payload
         execution.processing_s = processing_s
-        self._cache(execution)
+        self._keep(execution)
         return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
 
     def refuse(self, execution_id: ExecutionId, reason: RejectReason, text: str, now: float) -> list[Reply]:
@@ -289,24 +310,18 @@ class ExecutionTable:
 
     def cancel(self, robot: NodeName, request_id: RequestId, now: float) -> CancelExecution | None:
         """The robot wants no further answer; returns what to tell the application, if anything."""
-        execution = self._by_request.get(request_id) or self._finished.get(request_id)
-        if execution is None:
+        if not self.knows(robot, request_id):
             self._early_cancels.add(robot, request_id, now)
             return None
         return self.call_off(robot, request_id)
 
     def call_off(self, robot: NodeName, request_id: RequestId) -> CancelExecution | None:
         """Answer this request no more; returns what to tell the application, if anything."""
-        execution = self._by_request.get(request_id) or self._finished.get(request_id)
-        if execution is None:
-            return None
-        if execution.robot != robot:
-            self._stats.dropped["request_id_mismatch"] += 1
-            return None
-        if execution.cancelled:
+        execution = self._find(robot, request_id)
+        if execution is None or execution.cancelled:
             return None
         self._cancel(execution)
-        return CancelExecution(execution.id) if execution.id in self._running else None
+        return CancelExecution(execution.id, robot) if execution.id in self._running else None
 
     def of_robot(self, robot: NodeName) -> list[RequestId]:
         """Return the robot's requests that are being worked on for somebody."""
@@ -316,7 +331,7 @@ class ExecutionTable:
         execution.cancelled = True
         execution.waiters.clear()
         execution.payload = None
-        self._uncache(execution.request_id)
+        self._cache.remove(*execution.key)
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is wanted."""
@@ -343,7 +358,7 @@ class ExecutionTable:
             awaited = bool(execution.waiters) and execution.expires > now
             if not execution.given_up:
                 self._stats.executions[execution.service, "abandoned"] += 1
-                abandoned.append(AbandonExecution(execution_id, awaited))
+                abandoned.append(AbandonExecution(execution_id, execution.robot, awaited))
                 if awaited:
                     execution.given_up = True
                     execution.patience_ends = now + SAY_WITHIN_S
@@ -362,17 +377,17 @@ class ExecutionTable:
         if execution is None:
             self._stats.dropped["answer_to_unknown_execution"] += 1
             return None
-        del self._by_request[execution.request_id]
+        del self._by_request[execution.key]
         self._running_shares.give_back(execution.robot)
         self._running_bytes.give_back(execution.robot, execution.size)
         return execution
 
     def _remember(self, execution: _Execution, now: float) -> None:
         """It ran or may have run: never again."""
-        self._finished[execution.request_id] = execution
+        self._finished[execution.key] = execution
         self._finished_shares.take(execution.robot)
         forget_at = now + max(REMEMBER_LIFETIMES * execution.lifetime_s, MIN_REMEMBER_S)
-        heapq.heappush(self._forget_at, (forget_at, execution.request_id))
+        heapq.heappush(self._forget_at, (forget_at, execution.key))
 
     def _reply(self, execution: _Execution, waiter: Waiter, expires: float) -> Reply:
         request_id = execution.request_id
@@ -383,14 +398,9 @@ class ExecutionTable:
         rejection = RejectionMessage(request_id, waiter.copy, reason, text)
         return Reply(waiter, execution.service, rejection, execution.priority, execution.deadline, expires)
 
-    def _cache(self, execution: _Execution) -> None:
-        size = len(execution.payload or b"")
-        self._cached[execution.request_id] = size
-        self._cached_bytes += size
-        while self._cached_bytes > MAX_CACHED_BYTES:
-            oldest, its_size = self._cached.popitem(last=False)
-            self._cached_bytes -= its_size
-            self._finished[oldest].payload = None
+    def _keep(self, execution: _Execution) -> None:
+        for robot, request_id in self._cache.add(*execution.key, len(execution.payload or b"")):
+            self._finished[_Key(robot, request_id)].payload = None
             self._stats.dropped["cached_answer_evicted"] += 1
 
     def _forget_old(self, now: float) -> None:
@@ -398,9 +408,7 @@ class ExecutionTable:
         for _ in range(FORGOTTEN_AT_ONCE):
             if not self._forget_at or self._forget_at[0][0] > now:
                 return
-            request_id = heapq.heappop(self._forget_at)[1]
-            self._finished_shares.give_back(self._finished.pop(request_id).robot)
-            self._uncache(request_id)
-
-    def _uncache(self, request_id: RequestId) -> None:
-        self._cached_bytes -= self._cached.pop(request_id, 0)
+            key = heapq.heappop(self._forget_at)[1]
+            del self._finished[key]
+            self._finished_shares.give_back(key.robot)
+            self._cache.remove(*key)

@@ -140,6 +140,7 @@ class AbandonExecution:
     """The local server took too long with this execution, or nobody waits for it any more: forget it."""
 
     execution: ExecutionId
+    robot: NodeName
     awaited: bool = False
     """A robot waits still: refuse it, for a reason that says whether the local server got it."""
 
@@ -149,6 +150,7 @@ class CancelExecution:
     """The robot has its answer: refuse this execution as CANCELLED unless the local server has it already."""
 
     execution: ExecutionId
+    robot: NodeName
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,7 +79,7 @@ class Serving:
     def on_request(self, path: PathId, message: RequestMessage, now: float) -> None:
         """A copy of a request arrived."""
         refusal = self._refusal(path.peer, message, now)
-        if refusal and not self.executions.knows(message.request_id):
+        if refusal and not self.executions.knows(path.peer, message.request_id):
             waiter = Waiter(path, message.copy)
             self.answers.send([self.executions.refuse_unseen(waiter, message, *refusal, now)], now)
             return

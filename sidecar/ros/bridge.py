@@ -9,12 +9,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
 from protos.model import Role
 from sidecar.core.events import ExecuteRequest, RejectReason
 from sidecar.ros.cloud_side import CloudSide
+from sidecar.ros.event_queue import EventQueue
 from sidecar.ros.graph import sidecar_node_name
 from sidecar.ros.log_limit import LimitedLog
 from sidecar.ros.looks import Looks
@@ -25,14 +25,12 @@ from sidecar.ros.stats import BridgeStats
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import ServiceName
-    from sidecar.core.events import ApplicationEvent, ExecutionId
+    from sidecar.core.events import ApplicationEvent
     from sidecar.core.rules import ServiceRule
     from sidecar.ports import Application, DataPlane
 
-MAX_QUEUED_EVENTS = 4096
-"""With so many events unseen by the ROS thread, further requests of robots are refused as OVERLOADED. The other kinds
-are bounded by the requests and executions that the bridge itself has pending."""
+DRAIN_S = 0.005
+"""Of the ROS thread for what the data plane tells, before the servers' answers have their turn again."""
 STOP_TIMEOUT_S = 5.0
 """Destroying some hundred DDS endpoints takes less than a second."""
 _ERROR_PAUSE_S = 0.1
@@ -64,8 +62,7 @@ class RosBridge:
         self.stats = BridgeStats()
         self._rules = rules
         self._domain_id = domain_id
-        self._events: deque[ApplicationEvent] = deque()
-        self._refused_unseen: deque[tuple[ExecutionId, ServiceName]] = deque()
+        self._events = EventQueue()
         self._stopping = False
         self._loop: RosLoop | None = None
         self._thread: threading.Thread | None = None
@@ -106,11 +103,7 @@ class RosBridge:
 
     def handle(self, event: ApplicationEvent) -> None:
         """Queue an event for the ROS thread; from any thread, never blocks."""
-        if isinstance(event, ExecuteRequest) and len(self._events) >= MAX_QUEUED_EVENTS:
-            # Refused from the ROS thread: the caller may hold the data plane's lock.
-            self._refused_unseen.append((event.execution, event.service))
-        else:
-            self._events.append(event)
+        self._events.put(event)
         loop = self._loop
         if loop is not None and not self._stopping:
             loop.wake()
@@ -143,7 +136,7 @@ class RosBridge:
                 looks.turn(now)
                 look_at, due = looks.next_due(), side.next_due()
                 until = look_at if due is None else min(look_at, due)
-                ready = loop.wait(until - time.monotonic())
+                ready = loop.wait(0.0 if self._events else until - time.monotonic())
             # A wait or a look that failed is tried again; requests at the servers and answers stay as they are.
             except Exception:
                 self._note_error("wait", time.monotonic())
@@ -155,7 +148,7 @@ class RosBridge:
                     entity.take(now)
                 except Exception:
                     self._note_error("take", now)
-            self._drain(side, data_plane, now)
+            self._drain(side, now)
             try:
                 side.on_timer(now)
             except Exception:
@@ -166,23 +159,21 @@ class RosBridge:
         finally:
             loop.close()
 
-    def _drain(self, side: _Side, data_plane: DataPlane, now: float) -> None:
-        events = self._events
-        while events:
-            event = events.popleft()
+    def _drain(self, side: _Side, now: float) -> None:
+        """Hand over what the data plane told, for DRAIN_S at most."""
+        ends = now + DRAIN_S
+        while (event := self._events.take()) is not None:
             try:
                 side.handle(event, now)
             # Whatever one event does wrong, the others go on.
             except Exception:
                 self._note_error("event", now)
-        while self._refused_unseen:
-            execution, service = self._refused_unseen.popleft()
-            self.stats.refused[service, "overloaded"] += 1
-            data_plane.refuse(execution, RejectReason.OVERLOADED, "too many requests at once")
+            now = time.monotonic()
+            if now >= ends:
+                return
 
     def _refuse_queued(self, data_plane: DataPlane) -> None:
-        while self._events:
-            event = self._events.popleft()
+        while (event := self._events.take()) is not None:
             if isinstance(event, ExecuteRequest):
                 self.stats.refused[event.service, "draining"] += 1
                 data_plane.refuse(event.execution, RejectReason.DRAINING, "the sidecar is going away")

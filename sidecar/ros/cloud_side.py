@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from protos.model import ServiceOffer
 from sidecar.core.events import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest, RejectReason
 from sidecar.core.rules import Rules
+from sidecar.core.shares import Shares
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.roll_call import POLL_S, RollCall
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
     from sidecar.ros.stats import BridgeStats
 
 MAX_EXECUTIONS = 4096
-"""Requests at local servers or waiting for them; more are refused as OVERLOADED, so that another server runs them."""
+"""Requests at local servers or waiting for them; one robot may have half. More are refused as OVERLOADED, so that
+another server runs them."""
 MAX_CARRIED_SERVICES = 512
 """Services of the local graph that are offered; each costs DDS endpoints and a slot in every wait."""
 TYPE_RETRY_S = 30.0
@@ -60,6 +62,7 @@ class CloudSide:
         self._limited = limited_log
         self._runners: dict[ServiceName, ServiceRunner] = {}
         self._executions: dict[ExecutionId, tuple[ServiceRunner, Execution]] = {}
+        self._shares = Shares(MAX_EXECUTIONS)
         self._offers: tuple[ServiceOffer, ...] = ()
         self._missing_types: dict[ServiceName, str] = {}
         self._types_retried_at = 0.0
@@ -103,8 +106,9 @@ class CloudSide:
         if runner.type.name != event.type:
             self.refuse(event, RejectReason.WRONG_TYPE, f"the type here is {runner.type.name}", now)
             return
-        if len(self._executions) >= MAX_EXECUTIONS:
-            self.refuse(event, RejectReason.OVERLOADED, f"{MAX_EXECUTIONS} requests are running", now)
+        if not self._shares.fits(event.robot):
+            why = f"{len(self._executions)} requests are running, {self._shares.held(event.robot)} of this robot"
+            self.refuse(event, RejectReason.OVERLOADED, why, now)
             return
         try:
             request = runner.type.request.deserialize(event.payload)
@@ -115,6 +119,7 @@ class CloudSide:
             event.execution, event.robot, request, now, event.priority, now + event.deadline_s, now + event.expires_s
         )
         self._executions[event.execution] = (runner, execution)
+        self._shares.take(event.robot)
         self._stats.pending = len(self._executions)
         if not runner.add(execution, now):
             self._stats.requests_paced += 1
@@ -139,7 +144,7 @@ class CloudSide:
         self._data_plane.refuse(event.execution, reason, detail)
 
     def _abandon(self, event: AbandonExecution) -> None:
-        known = self._executions.pop(event.execution, None)
+        known = self._forget(event.execution)
         if known is None:
             self._stats.dropped["abandon_without_execution"] += 1
             return
@@ -147,12 +152,18 @@ class CloudSide:
         runner.abandon(execution)
         self._paced.add(runner)  # there may be room now, for those that wait
         self._stats.abandoned[runner.name] += 1
-        self._stats.pending = len(self._executions)
         if event.awaited and execution.number is None:
             why = "its time here was over before the server had room for it"
             self._data_plane.refuse(execution.id, RejectReason.OVERLOADED, why)
         elif event.awaited:
             self._data_plane.refuse(execution.id, RejectReason.SERVER_LOST, "the server gave no answer in time")
+
+    def _forget(self, execution: ExecutionId) -> tuple[ServiceRunner, Execution] | None:
+        known = self._executions.pop(execution, None)
+        if known is not None:
+            self._shares.give_back(known[1].robot)
+            self._stats.pending = len(self._executions)
+        return known
 
     def _cancel(self, event: CancelExecution) -> None:
         """The robot has its answer: what its server has not got yet needs not run."""
@@ -167,8 +178,7 @@ class CloudSide:
     # -- what the local servers answer -----------------------------------------------------------------------------
 
     def _answered(self, runner: ServiceRunner, execution: Execution, payload: bytes, now: float) -> None:
-        self._executions.pop(execution.id, None)
-        self._stats.pending = len(self._executions)
+        self._forget(execution.id)
         self._stats.answers_taken[runner.name] += 1
         self._data_plane.complete(execution.id, payload, now - execution.arrived_at)
 
@@ -290,10 +300,9 @@ class CloudSide:
         self, executions: list[Execution], service: ServiceName, reason: RejectReason, detail: str
     ) -> None:
         for execution in executions:
-            self._executions.pop(execution.id, None)
+            self._forget(execution.id)
             self._stats.refused[service, reason.name.lower()] += 1
             self._data_plane.refuse(execution.id, reason, detail)
-        self._stats.pending = len(self._executions)
 
     def _publish_state(self) -> None:
         ready = {name: runner for name, runner in self._runners.items() if runner.server.ready}

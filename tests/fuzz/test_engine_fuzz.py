@@ -146,7 +146,7 @@ def assert_bounded(node: Node) -> None:
     assert executions.running <= MAX_RUNNING
     assert len(executions._finished) <= MAX_REMEMBERED + MAX_RUNNING
     assert len(executions._timers) <= 2 * executions.running + TIMER_SLACK + 1
-    assert executions._cached_bytes <= MAX_CACHED_BYTES
+    assert executions._cache.held_bytes <= MAX_CACHED_BYTES
     assert len(executions._refused) <= MAX_REFUSED_COPIES
     assert len(engine.stats.executions) < 20
     assert len(engine.stats.dropped) < 40

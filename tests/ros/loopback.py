@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SERVER = NodeName("cloud")
+ROBOT = NodeName("robot")
 INTERFACE = InterfaceName("lo-test")
 
 
@@ -73,6 +74,8 @@ class Loopback:
         self.carried: frozenset[ServiceName] = frozenset()
         self.refusals: list[tuple[RejectReason, str]] = []
         self.answered_here: list[RequestId] = []
+        self.asker = ROBOT
+        """Whose requests the cloud is told these are."""
         self.counts: Counter[str] = Counter()
         self.processing_s: list[float] = []
         self.requests: dict[RequestId, _Request] = {}
@@ -134,7 +137,7 @@ class Loopback:
                 request.service,
                 kind,
                 payload,
-                NodeName("robot"),
+                self.asker,
                 Priority.NORMAL,
                 self.faults.deadline_s,
                 self.faults.lifetime_s,
@@ -184,7 +187,7 @@ class Loopback:
             return
         request.answered = True
         for execution in [e for e, request_id in self.executions.items() if request_id == request.id]:
-            self.cloud_app.handle(AbandonExecution(execution))
+            self.cloud_app.handle(AbandonExecution(execution, self.asker))
         self.robot_app.handle(
             RequestFailed(request.id, request.service, "failed", "lifetime over", self.faults.lifetime_s)
         )

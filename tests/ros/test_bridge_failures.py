@@ -14,6 +14,7 @@ import pytest
 from protos.model import ServiceName
 from sidecar.core.events import AbandonExecution, CancelExecution, RejectReason
 from sidecar.ros import graph
+from tests.ros.loopback import ROBOT
 from tests.ros.mesh import wait_until
 from tests.ros.notice_listener import NoticeListener
 
@@ -46,7 +47,7 @@ def test_what_the_robot_calls_off_runs_only_if_the_server_has_it_already(mesh: M
     calls = mesh.call("/plan", "--count", "40", "--timeout-s", "8")
     wait_until(lambda: mesh.cloud.stats.requests_sent[PLAN] == 40, "all at the bridge")
     for execution in tuple(mesh.link.executions):
-        mesh.cloud.handle(CancelExecution(execution))
+        mesh.cloud.handle(CancelExecution(execution, ROBOT))
     result = mesh.result(calls)
     refused = mesh.cloud.stats.refused[PLAN, "cancelled"]
     assert refused >= 20
@@ -65,7 +66,7 @@ def test_who_is_given_up_learns_whether_the_server_got_it(mesh: Mesh) -> None:
     calls = mesh.call("/plan", "--count", "40", "--timeout-s", "8")
     wait_until(lambda: mesh.cloud.stats.requests_sent[PLAN] == 40, "all at the bridge")
     for execution in tuple(mesh.link.executions):
-        mesh.cloud.handle(AbandonExecution(execution, awaited=True))
+        mesh.cloud.handle(AbandonExecution(execution, ROBOT, awaited=True))
     answered = mesh.result(calls)["answered"]
     reasons = Counter(reason for reason, _ in mesh.link.refusals)
     assert set(reasons) == {RejectReason.OVERLOADED, RejectReason.SERVER_LOST}

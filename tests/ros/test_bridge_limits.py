@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import ServiceName, SessionId
+from protos.model import NodeName, ServiceName, SessionId
 from sidecar.core.events import OfferService, RejectReason
 from sidecar.core.rules import ServiceRule
 from sidecar.ros.rcl import RmwRequestId
@@ -34,7 +34,7 @@ def test_more_requests_than_a_robot_may_have_pending(mesh: Mesh, monkeypatch: py
 
 
 def test_more_requests_than_a_server_may_have(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.ros.cloud_side.MAX_EXECUTIONS", 10)
+    monkeypatch.setattr("sidecar.ros.cloud_side.MAX_EXECUTIONS", 20)
     mesh.start()
     mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
@@ -44,15 +44,18 @@ def test_more_requests_than_a_server_may_have(mesh: Mesh, monkeypatch: pytest.Mo
     assert mesh.cloud.stats.refused == {(PLAN, "overloaded"): 20}
 
 
-def test_more_requests_than_the_ros_thread_has_looked_at(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_that_fills_its_share_leaves_the_others_theirs(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its requests lie at a slow server; the other robot asks another one, which is idle."""
+    monkeypatch.setattr("sidecar.ros.cloud_side.MAX_EXECUTIONS", 20)
     mesh.start()
     mesh.serve("--plan", "/plan")
-    mesh.wait_carried("/plan")
-    with monkeypatch.context() as full:
-        full.setattr("sidecar.ros.bridge.MAX_QUEUED_EVENTS", 0)
-        assert mesh.result(mesh.call("/plan", "--count", "30", "--timeout-s", "2"))["answered"] == 0
-    assert mesh.cloud.stats.refused == {(PLAN, "overloaded"): 30}
+    mesh.serve("--plan", "/slow", "--busy-s", "0.5")
+    mesh.wait_carried("/plan", "/slow")
+    greedy = mesh.call("/slow", "--count", "100", "--timeout-s", "20")
+    wait_until(lambda: mesh.cloud.stats.pending >= 9, "the share to be full")
+    mesh.link.asker = NodeName("another")
     assert mesh.result(mesh.call("/plan", "--count", "5"))["answered"] == 5
+    assert mesh.result(greedy)["answered"] <= 20
 
 
 def test_more_services_than_may_be_offered(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -49,7 +49,7 @@ class SerialServer:
                 self.requests[event.execution] = event
                 self.expires_at[event.execution] = now + event.expires_s
                 self.window.add(event.execution, event.priority, now + event.deadline_s, now + event.expires_s, now)
-            case CancelExecution(execution) | AbandonExecution(execution):
+            case CancelExecution(execution=execution) | AbandonExecution(execution=execution):
                 if self.window.holds(execution):
                     self.window.remove(execution)
                     self._forget(execution)

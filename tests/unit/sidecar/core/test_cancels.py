@@ -15,7 +15,6 @@ def test_an_id_holds_for_its_robot_until_it_is_forgotten() -> None:
     cancels = EarlyCancels(EngineStats())
     cancels.add(ROBOT, request_id(1), 5.0)
     cancels.add(ROBOT, request_id(1), 9.0)
-    cancels.add(OTHER, request_id(1), 9.0)
     assert cancels.holds(ROBOT, request_id(1), 5.0)
     assert not cancels.holds(OTHER, request_id(1), 5.0)
     assert not cancels.holds(ROBOT, request_id(2), 5.0)

@@ -140,10 +140,10 @@ def test_an_id_is_remembered_twice_as_long_as_any_copy_may_come(lifetime_s: floa
     executions.complete(run(executions, request(1, lifetime_s=lifetime_s)).execution, b"answer", 0.0, 2.0)
     remembered_s = max(2 * lifetime_s, MIN_REMEMBER_S)
     run(executions, request(2), 2.0 + remembered_s - 0.1)
-    assert executions.knows(request(1).request_id)
+    assert executions.knows(ROBOT.peer, request(1).request_id)
     run(executions, request(3), 2.0 + remembered_s)
-    assert not executions.knows(request(1).request_id)
-    assert executions._cached_bytes == 0
+    assert not executions.knows(ROBOT.peer, request(1).request_id)
+    assert executions._cache.held_bytes == 0
 
 
 def test_cached_answers_are_capped_in_bytes_and_their_ids_stay() -> None:
@@ -151,7 +151,7 @@ def test_cached_answers_are_capped_in_bytes_and_their_ids_stay() -> None:
     size = 16 * 1024 * 1024
     for number in range(MAX_CACHED_BYTES // size + 1):
         executions.complete(run(executions, request(number)).execution, bytes(size), 0.0, 1.0)
-    assert executions._cached_bytes == MAX_CACHED_BYTES
+    assert executions._cache.held_bytes == MAX_CACHED_BYTES
     assert executions._stats.dropped["cached_answer_evicted"] == 1
     reply = executions.on_request(ROBOT, request(0, copy=1), 1.1)
     assert isinstance(reply, Reply)
@@ -159,21 +159,44 @@ def test_cached_answers_are_capped_in_bytes_and_their_ids_stay() -> None:
     assert reply.message.reason is RejectReason.FORGOTTEN
 
 
-def test_an_id_used_for_another_service_or_by_another_robot_is_dropped() -> None:
+def test_an_id_used_for_another_service_is_dropped() -> None:
     executions = table()
     run(executions, request(1))
     assert executions.on_request(ROBOT, request(1, service=ServiceName("/else")), 1.1) is None
-    assert executions.on_request(OTHER, request(1, copy=1), 1.1) is None
-    assert executions._stats.dropped["request_id_mismatch"] == 2
-    (reply,) = executions.complete(ExecutionId(0), b"secret", 0.0, 1.2)
+    assert executions._stats.dropped["request_id_mismatch"] == 1
+
+
+def test_who_sends_the_id_of_anothers_request_first_takes_nothing_from_it() -> None:
+    executions = table()
+    theirs = executions.on_request(OTHER, request(1, service=ServiceName("/else")), 1.0)
+    assert isinstance(theirs, ExecuteRequest)
+    executions.cancel(OTHER.peer, request(2).request_id, 1.0)
+    executions.cancel(OTHER.peer, request(1).request_id, 1.0)
+    mine = run(executions, request(1), 1.1)
+    run(executions, request(2), 1.1)
+    (reply,) = executions.complete(mine.execution, b"secret", 0.0, 1.2)
     assert reply.waiter.path == ROBOT
-    assert executions.on_request(OTHER, request(1, copy=1), 1.3) is None, "nor does the cache tell strangers"
+    again = executions.on_request(OTHER, request(1, service=ServiceName("/else"), copy=1), 1.3)
+    assert again is None, "nor does the cache tell others"
+
+
+def test_who_fills_the_cache_pushes_out_its_own_answers() -> None:
+    executions = table()
+    executions.complete(run(executions, request(0)).execution, b"mine", 0.0, 1.0)
+    for number in range(1, 200):
+        theirs = executions.on_request(OTHER, request(number), 1.0)
+        assert isinstance(theirs, ExecuteRequest)
+        executions.complete(theirs.execution, bytes(MAX_CACHED_BYTES // 100), 0.0, 1.0)
+    reply = executions.on_request(ROBOT, request(0, copy=1), 1.1)
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.message, ResponseMessage)
+    assert executions._cache.held_bytes <= MAX_CACHED_BYTES
 
 
 def test_a_request_called_off_before_its_server_got_it_never_runs_and_nobody_is_told() -> None:
     executions = table()
     execution = run(executions, request()).execution
-    assert executions.cancel(ROBOT.peer, request().request_id, 1.1) == CancelExecution(execution)
+    assert executions.cancel(ROBOT.peer, request().request_id, 1.1) == CancelExecution(execution, ROBOT.peer)
     assert executions.cancel(ROBOT.peer, request().request_id, 1.1) is None, "a duplicate"
     assert executions.on_request(ROBOT_2ND, request(copy=1), 1.2) is None
     assert executions.refuse(execution, RejectReason.CANCELLED, "", 1.3) == []
@@ -187,7 +210,7 @@ def test_a_request_called_off_while_it_runs_is_remembered_and_its_answer_is_not(
     execution = run(executions, request()).execution
     executions.cancel(ROBOT.peer, request().request_id, 1.1)
     assert executions.complete(execution, b"answer", 0.05, 1.3) == []
-    assert executions._cached_bytes == 0
+    assert executions._cache.held_bytes == 0
     assert executions.on_request(ROBOT_2ND, request(copy=1), 1.4) is None
 
 
@@ -195,10 +218,10 @@ def test_a_request_called_off_after_it_ran_frees_its_cached_answer() -> None:
     executions = table()
     executions.complete(run(executions, request()).execution, b"answer", 0.05, 1.1)
     assert executions.cancel(ROBOT.peer, request().request_id, 1.2) is None
-    assert executions._cached_bytes == 0
+    assert executions._cache.held_bytes == 0
     assert executions.on_request(ROBOT_2ND, request(copy=1), 1.4) is None
     run(executions, request(2), 1.2 + 2 * MIN_REMEMBER_S)
-    assert not executions.knows(request().request_id)
+    assert not executions.knows(ROBOT.peer, request().request_id)
 
 
 def test_a_robot_that_said_goodbye_is_not_waited_for() -> None:
@@ -209,7 +232,7 @@ def test_a_robot_that_said_goodbye_is_not_waited_for() -> None:
     assert executions.awaited(both) == 2
     assert executions.awaited((OTHER.peer,)) == 1
     (awaited,) = executions.of_robot(ROBOT.peer)
-    assert executions.call_off(ROBOT.peer, awaited) == CancelExecution(mine.execution)
+    assert executions.call_off(ROBOT.peer, awaited) == CancelExecution(mine.execution, ROBOT.peer)
     assert executions.of_robot(ROBOT.peer) == []
     assert (executions.awaited(both), executions.running) == (1, 2)
     assert executions.complete(mine.execution, b"answer", 0.0, 1.1) == []
@@ -230,7 +253,6 @@ def test_a_cancel_by_another_robot_changes_nothing() -> None:
     execution = run(executions, request()).execution
     run(executions, request(2))
     assert executions.cancel(OTHER.peer, request().request_id, 1.1) is None
-    assert executions._stats.dropped["request_id_mismatch"] == 1
     assert len(executions.complete(execution, b"answer", 0.05, 1.2)) == 1
     assert executions.cancel(OTHER.peer, request().request_id, 1.3) is None
     assert isinstance(executions.on_request(ROBOT, request(copy=1), 1.4), Reply)
@@ -253,7 +275,7 @@ def test_a_full_table_refuses_one_robot_and_still_serves_another() -> None:
     assert isinstance(reply.message, RejectionMessage)
     assert reply.message.reason is RejectReason.OVERLOADED
     assert executions._stats.dropped["executions_full"] == 1
-    assert not executions.knows(request(99_999).request_id)
+    assert not executions.knows(ROBOT.peer, request(99_999).request_id)
     assert isinstance(executions.on_request(OTHER, request(100_000), 1.0), ExecuteRequest)
     executions.complete(ExecutionId(0), b"", 0.0, 1.1)
     executions.complete(ExecutionId(1), b"", 0.0, 1.1)
@@ -292,7 +314,7 @@ def test_what_many_requests_leave_is_not_forgotten_in_one_call() -> None:
         executions.handle_timer(now, Backlog())
         left.append(len(executions._finished))
     assert max(before - after for before, after in pairwise(left)) <= FORGOTTEN_AT_ONCE
-    assert not executions._cached
+    assert not executions._cache.held_bytes
 
 
 def test_unknown_services_make_no_counters() -> None:
@@ -315,7 +337,10 @@ def test_a_server_is_given_up_before_the_robot_gives_up_and_the_robot_is_told() 
     assert isinstance(outcome, ExecuteRequest)
     assert outcome.expires_s == 3.0
     assert executions.handle_timer(3.9, Backlog()) == ([], [])
-    assert executions.handle_timer(4.0, Backlog()) == ([AbandonExecution(outcome.execution, awaited=True)], [])
+    assert executions.handle_timer(4.0, Backlog()) == (
+        [AbandonExecution(outcome.execution, ROBOT.peer, awaited=True)],
+        [],
+    )
     assert executions.next_timer() == 4.0 + SAY_WITHIN_S
     nothing, (reply,) = executions.handle_timer(4.0 + SAY_WITHIN_S, Backlog())
     assert nothing == [], "it was told before"

@@ -207,7 +207,7 @@ def test_a_cancel_stops_what_has_not_started_and_what_is_being_sent() -> None:
     assert sidecar.engine.busy == 2
     for number in (1, 2, 1, 2, 3):
         sidecar.receive(CancelMessage(request_id(number)))
-    assert sidecar.take()[1] == [CancelExecution(second.execution)]
+    assert sidecar.take()[1] == [CancelExecution(second.execution, second.robot)]
     assert sidecar.engine.busy == 0, "nobody waits for what runs, and the answer is not sent any more"
     sidecar.engine.refuse(second.execution, RejectReason.CANCELLED, "", 0.3)
     sidecar.receive(request(3))
@@ -353,7 +353,7 @@ def test_an_execution_that_never_answers_is_abandoned() -> None:
     _, (execution,) = sidecar.take()
     assert isinstance(execution, ExecuteRequest)
     sidecar.engine.handle_timer(3.2)
-    assert sidecar.take()[1] == [AbandonExecution(execution.execution)]
+    assert sidecar.take()[1] == [AbandonExecution(execution.execution, execution.robot)]
     sidecar.engine.complete(execution.execution, b"late", 3.0, 3.3)
     assert sidecar.replies() == []
 

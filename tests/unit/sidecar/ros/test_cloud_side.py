@@ -8,9 +8,11 @@ from unittest.mock import Mock
 
 import pytest
 
+from protos.model import NodeName
 from sidecar.core.events import AbandonExecution, ExecutionId
 from sidecar.core.priority import Priority
-from sidecar.ros.cloud_side import CloudSide
+from sidecar.core.shares import Shares
+from sidecar.ros.cloud_side import MAX_EXECUTIONS, CloudSide
 from sidecar.ros.request_window import RequestWindow
 from sidecar.ros.service_runner import ServiceRunner
 from sidecar.ros.stats import BridgeStats
@@ -22,6 +24,7 @@ def side() -> Any:
     made: Any = CloudSide.__new__(CloudSide)
     made._stats = BridgeStats()
     made._executions = {}
+    made._shares = Shares(MAX_EXECUTIONS)
     made._paced = set()
     return made
 
@@ -47,8 +50,10 @@ def test_what_is_given_up_makes_room_for_those_that_wait(side: Any) -> None:
     runner = Mock()
     runner.name = "/plan"
     execution = ExecutionId(1)
-    side._executions[execution] = (runner, SimpleNamespace(id=execution, number=1))
-    side._abandon(AbandonExecution(execution, awaited=False))
+    robot = NodeName("robot")
+    side._executions[execution] = (runner, SimpleNamespace(id=execution, robot=robot, number=1))
+    side._shares.take(robot)
+    side._abandon(AbandonExecution(execution, robot, awaited=False))
     assert side._paced == {runner}
 
 
