@@ -65,6 +65,8 @@ class Copy:
     """It was refused unrun, or nothing of it left before it was dead."""
     in_time: bool = False
     """It was answered before the deadline."""
+    session_over: bool = False
+    """Its server's session ended since: whoever comes back under that name knows nothing of it."""
     answer: Answer | None = None
     """Which the application judges at present."""
     ended_at: float | None = None
@@ -82,6 +84,11 @@ class Copy:
 
     def __post_init__(self) -> None:
         self.progress_at = self.sent_at
+
+    @property
+    def refused(self) -> bool:
+        """Whether its server would refuse it again."""
+        return self.state is CopyState.REJECTED and not self.session_over
 
 
 @dataclass(slots=True)
@@ -175,7 +182,7 @@ class Request:
         draining, full) and may do so now.
         """
         busy = {copy.path.peer for copy in self.relied_on()}
-        refused = {copy.path.peer for copy in self.copies if copy.state is CopyState.REJECTED}
+        refused = {copy.path.peer for copy in self.copies if copy.refused}
         asked = busy | refused
         others = tuple(server for server in servers if server not in asked)
         if others or rejected:

@@ -212,7 +212,7 @@ class Dispatching:
     def _next_withheld(self, request: Request, now: float) -> PathId | None:
         """The best path that is up of those its mapping names and that carry no copy, to a server that may run it."""
         waiting = {copy.path.peer for copy in request.relied_on()}
-        refused = {copy.path.peer for copy in request.copies if copy.state is CopyState.REJECTED}
+        refused = {copy.path.peer for copy in request.copies if copy.refused}
         for path in request.withheld:
             if self._parts.routes.state(path) is not PathState.UP or path.peer in refused:
                 continue

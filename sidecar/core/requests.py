@@ -26,6 +26,7 @@ from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.dispatching import MAX_COPIES, Dispatching
 from sidecar.core.events import (
     DeadlineMissed,
+    RejectReason,
     RequestFailed,
     RequestId,
     ResponseArrived,
@@ -314,8 +315,11 @@ class RequestTable:
                 reason = f"{server}: {rejection.reason.name.lower().replace('_', ' ')}: {rejection.text}"
                 if rejection.reason.may_pass and request.may_be_sent():
                     self._wait_out(request, reason, now)
-                elif request.may_be_sent() and self._dispatching.candidates(request, rejected=True):
-                    # Another server offers it, and is out of reach at present: its first path that is up takes it.
+                elif request.may_be_sent() and (
+                    rejection.reason is RejectReason.SERVER_LOST or self._dispatching.candidates(request, rejected=True)
+                ):
+                    # Another server offers it, and is out of reach at present, or will, as the only one died: the first
+                    # path to it that is up takes it.
                     request.refusal = reason
                     self._requests.strand(request)
                     self._tell_unreachable(request)
@@ -358,6 +362,7 @@ class RequestTable:
             self._backlog.add(lambda: (partial(self._on_copy_dead, *each) for each in copies), now)
 
     def _on_copy_dead(self, request: Request, copy: Copy, now: float) -> None:
+        copy.session_over = True
         if copy.state is not CopyState.PENDING:
             return
         if copy.message.may_have_left:

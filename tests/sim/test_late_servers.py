@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import ServiceOffer
-from sidecar.core.events import RequestFailed, WithdrawService
+from sidecar.core.events import ApplicationEvent, ExecuteRequest, RejectReason, RequestFailed, WithdrawService
 from sidecar.core.offers import WITHDRAW_AFTER_S
 from sidecar.core.redundancy_mode import RedundancyMode
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
@@ -52,6 +52,42 @@ def test_requests_of_a_time_without_servers_are_answered_by_the_first_that_comes
     lost = 0 if known_dead or idempotent else 20  # what the dead one may have run, nobody else may run
     assert len(robot.responses()) >= 20 + waiting - lost
     assert len({answer.request_id for answer in robot.responses()}) == len(robot.responses())
+
+
+@pytest.mark.parametrize("mode", RedundancyMode)
+@pytest.mark.parametrize("successor", ["another", "the same anew"])
+def test_what_the_only_server_had_when_its_process_ended_runs_on_the_next_one(
+    mode: RedundancyMode, successor: str
+) -> None:
+    """The cloud's sidecar lives and says so: it may have run, which does no harm to what is idempotent."""
+    mesh = Mesh(1)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(redundancy=mode, lifetime_s=30.0),))
+    starting, dying = mesh.cloud("cloud-a"), mesh.cloud("cloud-b")
+    starting.offers = ()
+    starting.engine.set_offers(())
+    mesh.push_views()
+    mesh.run(1.0)
+    mapped(mesh, robot, ("wlan0", "cloud-b"), ("wwan0", "cloud-b"))
+
+    def lose(event: ApplicationEvent) -> None:
+        if isinstance(event, ExecuteRequest):
+            dying.engine.refuse(event.execution, RejectReason.SERVER_LOST, "the server's process ended", mesh.now)
+
+    dying.server = lose
+    asked = call_at(mesh, robot, 20, 0.2)
+    mesh.run(1.0)
+    assert not [event for event in robot.events if isinstance(event, RequestFailed)]
+    if successor == "another":
+        offer_later(mesh, starting)
+    else:
+        dying.alive = False
+        mesh.push_views()
+        mesh.run(5.0)
+        dying.server = None
+        dying.start()
+        mesh.push_views()
+    mesh.run(3.0)
+    assert len(robot.responses()) == asked
 
 
 def test_the_restart_of_the_only_cloud_costs_no_request() -> None:
