@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not options.insecure_i_know:
             refuse_exposed(config, str(options.config))
         if options.check_config:
-            _check_interfaces(config, str(options.config))
+            _warn_of_missing_interfaces(config)
             sys.stdout.write(f"{options.config}: ok\n")
             return EXIT_OK
         return _run(config)
@@ -107,14 +107,11 @@ def software_version() -> str:
         return "0"
 
 
-def _check_interfaces(config: SidecarConfig, source: str) -> None:
-    from sidecar.net.interfaces import choose, list_interfaces
+def _warn_of_missing_interfaces(config: SidecarConfig) -> None:
+    from sidecar.net.interfaces import list_interfaces, missing_interfaces
 
-    interfaces = list_interfaces()
-    for name in choose(interfaces, config.interfaces).missing:
-        existing = ", ".join(interface.name for interface in interfaces)
-        index = (config.interfaces or ()).index(name)
-        raise ConfigError(source, f"interfaces[{index}]", f"expected one of {existing}, got '{name}'")
+    for line in missing_interfaces(list_interfaces(), config.interfaces):
+        sys.stderr.write(f"{PROGRAM}: warning: {line}\n")
 
 
 def _run(config: SidecarConfig) -> int:

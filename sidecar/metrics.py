@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from prometheus_client import Metric
 
     from protos.identity import Identity
-    from protos.model import ServiceName
+    from protos.model import InterfaceName, ServiceName
     from sidecar.core.control_session import ControlStats
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.revocations import RevocationState
@@ -49,6 +49,8 @@ class MetricSources:
     version: str
     engine: Callable[[], EngineStats]
     links: Callable[[], Iterable[LinkStats]]
+    interfaces: Callable[[], Mapping[InterfaceName, bool]]
+    """Those wanted, and whether each can carry something."""
     control: Callable[[], ControlStats]
     connected: Callable[[], bool]
     """Whether the control plane is within reach."""
@@ -74,6 +76,12 @@ class SidecarCollector(Collector):
         info.add_metric((), {"name": sources.name, "role": sources.role, "version": sources.version})
         yield info
         yield from _requests(sources.engine())
+        yield gauge(
+            "plr_interface_in_use",
+            "1 while the interface can carry something; 0: it is wanted, but not there, down or without address.",
+            ("interface",),
+            {(name,): float(used) for name, used in sources.interfaces().items()},
+        )
         yield from _links(list(sources.links()))
         yield from _control(sources.control(), sources.connected(), sources.engine())
         if sources.bridge is not None:

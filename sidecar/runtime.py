@@ -149,7 +149,6 @@ class Sidecar:
         """Start every part; what the disk remembers is in force before the control plane is asked.
 
         Raises:
-            ConfigError: the configuration does not fit this machine.
             OSError: a socket or the metrics' port is refused.
         """
         interpreter.share()
@@ -199,6 +198,7 @@ class Sidecar:
             version=self._version,
             engine=lambda: self._data_plane.engine_stats,
             links=self._data_plane.link_stats,
+            interfaces=self._interfaces.in_use,
             control=lambda: self._control.stats,
             connected=lambda: self._control.connected,
             bridge=lambda: self._bridge.stats,

@@ -11,29 +11,28 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.errors import ConfigError
-from protos.model import Candidate, InterfaceId
+from protos.model import Candidate, InterfaceId, InterfaceName
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.key_exchange import KeyLimits
 from sidecar.core.readiness import Readiness
 from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.stun_events import Failed, Mapped, MappingChanged
 from sidecar.net.host_names import HostNames
-from sidecar.net.interfaces import choose, list_interfaces
+from sidecar.net.interfaces import choose, list_interfaces, missing_interfaces
 from sidecar.net.managed_interface import STOP_TIMEOUT_S, ManagedInterface
 from sidecar.net.netlink_watch import NetlinkWatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address, InterfaceName
+    from protos.model import Address
     from sidecar.config import SidecarConfig
     from sidecar.core.link_memory import LinkMemory
     from sidecar.core.session import OwnSession
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane
     from sidecar.net.interface_thread import InterfaceThread
-    from sidecar.net.interfaces import Interface, InterfaceChoice, SkippedInterface
+    from sidecar.net.interfaces import Interface, InterfaceChoice
 
 log = logging.getLogger(__name__)
 
@@ -80,6 +79,8 @@ class InterfaceManager:
         self._candidates: tuple[Candidate, ...] = ()
         self._readiness = Readiness(stun_enabled=config.stun.enabled)
         self._skipped: dict[InterfaceName, str] = {}
+        self._idle: frozenset[InterfaceName] = frozenset()
+        """Wanted, and not there or not able to carry anything when looked at last."""
         self._warned = False
         self._socket_refused = False
         self._lock = threading.Lock()
@@ -90,19 +91,9 @@ class InterfaceManager:
         self._thread = threading.Thread(target=self._run, name="plr-interfaces", daemon=True)
 
     def start(self) -> None:
-        """Look once, then keep looking in the background.
-
-        Raises:
-            ConfigError: an interface that the configuration names does not exist.
-        """
-        missing = choose(list_interfaces(), self._config.interfaces).missing
-        if missing:
-            existing = ", ".join(interface.name for interface in list_interfaces())
-            raise ConfigError(
-                "the configuration",
-                "interfaces",
-                f"expected an existing interface, got '{missing[0]}' (there are: {existing})",
-            )
+        """Look once, then keep looking in the background. What is not there yet is used as soon as it comes."""
+        for line in missing_interfaces(list_interfaces(), self._config.interfaces):
+            log.warning("%s", line)
         try:
             self._watch.subscribe()
             self._schedule = ScanSchedule(time.monotonic(), has_news=True)
@@ -130,6 +121,11 @@ class InterfaceManager:
         if not self._config.stun.servers and names != self._stun_names:
             self._stun_names = names
             self._resolver.look_up(names)
+
+    def in_use(self) -> dict[InterfaceName, bool]:
+        """Return the interfaces that are wanted, and whether each can carry something; from any thread."""
+        states = dict.fromkeys(self._idle, False)
+        return states | {name: not managed.suspended for name, managed in list(self._managed.items())}
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
         """Take what STUN found; called on the interface's thread."""
@@ -219,7 +215,9 @@ class InterfaceManager:
             self._data_plane.set_links(self._links())
         if (changed or added) and self._config.stun.enabled:
             self._resolver.look_up(self._stun_names)  # this network's DNS may know what the last one's did not
-        self._warn_when_none(choice.skipped)
+        idle = {skipped.name for skipped in choice.skipped if skipped.wanted}
+        self._idle = frozenset(idle.union(map(InterfaceName, choice.missing)))
+        self._warn_when_none(choice)
         self._publish_candidates()
         self._schedule.scanned(started, time.monotonic())
         if self._socket_refused:
@@ -301,12 +299,13 @@ class InterfaceManager:
                 log.warning("%s: no STUN server answers; used without it, as far as probes succeed", name)
                 self._managed[name].set_ready()
 
-    def _warn_when_none(self, skipped: tuple[SkippedInterface, ...]) -> None:
+    def _warn_when_none(self, choice: InterfaceChoice) -> None:
         """Without any interface nothing is carried, and nothing else would say so."""
         none = all(managed.suspended for managed in self._managed.values())
         if none and not self._warned:
-            reasons = "; ".join(f"{interface.name}: {interface.reason}" for interface in skipped) or "there are none"
-            log.warning("no interface is in use, nothing can be carried (%s)", reasons)
+            reasons = [f"{interface.name}: {interface.reason}" for interface in choice.skipped]
+            reasons += [f"{name}: there is no such interface" for name in choice.missing]
+            log.warning("no interface is in use, nothing can be carried (%s)", "; ".join(reasons) or "there are none")
         self._warned = none
 
     def _number(self, name: InterfaceName) -> _Number | None:

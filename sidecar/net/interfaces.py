@@ -133,6 +133,15 @@ def choose(interfaces: Iterable[Interface], wanted: Sequence[str] | None) -> Int
     return InterfaceChoice(tuple(usable), tuple(skipped), missing)
 
 
+def missing_interfaces(interfaces: Sequence[Interface], wanted: Sequence[str] | None) -> list[str]:
+    """Return a line for a person about each wanted interface that is not there: a modem comes late, a name is wrong."""
+    there = ", ".join(interface.name for interface in interfaces)
+    return [
+        f"{name}: there is no such interface now (there are: {there}); it is used as soon as it comes"
+        for name in choose(interfaces, wanted).missing
+    ]
+
+
 def _reason_not_to_want(interface: Interface, wanted: Sequence[str] | None) -> str | None:
     name = interface.name
     if wanted is not None and not any(fnmatch.fnmatchcase(name, pattern) for pattern in wanted):

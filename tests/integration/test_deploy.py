@@ -132,7 +132,7 @@ def test_the_units_restart_on_failure_for_ever(unit: str) -> None:
 
 
 def test_a_wrong_configuration_stops_the_control_plane_only() -> None:
-    # The sidecar also says 2 when an interface is missing, which may appear by and by.
+    # The sidecar also says 2 when an address is not there yet, which may appear by and by.
     assert settings("plr-controlplane", "RestartPreventExitStatus") == [str(EXIT_USAGE)]
     assert settings("plr-sidecar", "RestartPreventExitStatus") == []
 
@@ -231,6 +231,7 @@ def exported_metrics() -> dict[str, set[str]]:
             version="0",
             engine=EngineStats,
             links=lambda: (),
+            interfaces=dict,
             control=ControlStats,
             connected=lambda: False,
             bridge=None,

@@ -170,6 +170,21 @@ def test_an_interface_that_comes_back_while_the_control_plane_is_dead(system: Sy
     system.wait("the robot to register again", lambda: log.read_text().count(registered) > 1)
 
 
+@pytest.mark.audit("ops-1")
+def test_a_modem_that_is_missing_when_the_robot_starts(system: System) -> None:
+    """The others carry; it is used when it comes."""
+    assert system.parts["robot.sidecar"].terminate() == 0
+    pull_out(system.lab, "robot", "usb0")
+    system.parts["robot.sidecar"].log.unlink()
+    system.wait_for_offer(system.start_robot([SERVICE], interfaces=INTERFACES))
+    wait_for_log(system, "usb0: there is no such interface now (there are: ")
+    assert counter(system, "plr_interface_in_use", interface="usb0") == 0
+    with flawless_call(system):
+        plug_in(system.lab, "robot", "usb0")
+        wait_for_path(system, "usb0", up=True)
+    assert counter(system, "plr_interface_in_use", interface="usb0") == 1
+
+
 def test_one_path_of_ipv6_only_and_one_of_ipv4_only(system: System) -> None:
     """STUN servers here speak IPv4 only; the IPv6 path is used without."""
     robot = system.lab.host("robot")

@@ -6,7 +6,7 @@ import pytest
 
 from protos.model import InterfaceName
 from sidecar.core.link_events import Rebind
-from sidecar.net.interfaces import LOOPBACK, Interface, SkippedInterface, choose, list_interfaces
+from sidecar.net.interfaces import LOOPBACK, Interface, SkippedInterface, choose, list_interfaces, missing_interfaces
 
 WLAN = Interface(
     InterfaceName("wlan0"),
@@ -111,6 +111,11 @@ def test_a_named_interface_that_does_not_exist_is_missing_but_a_glob_may_match_n
     choice = choose([WLAN], ["wlan0", "wlan1", "wwan*"])
     assert choice.missing == ("wlan1",)
     assert names(choice.usable) == ["wlan0"]
+
+
+def test_what_is_missing_is_told_to_people_with_what_there_is() -> None:
+    (line,) = missing_interfaces([WLAN], ["wlan0", "wlan1", "wwan*"])
+    assert line == "wlan1: there is no such interface now (there are: wlan0); it is used as soon as it comes"
 
 
 def test_an_interface_without_default_route_is_usable() -> None:
