@@ -16,6 +16,7 @@ import asyncio
 import logging
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,7 @@ from controlplane import version
 from controlplane.certificates import load_own_files
 from controlplane.config import load_config, refuse_exposed
 from protos import interpreter
+from protos.certificate_term import term_problem
 from protos.errors import ConfigError
 from protos.log_lines import LineFormatter
 
@@ -53,10 +55,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         sys.stderr.write(f"plr-controlplane: {error}\n")
         return EXIT_USAGE
+    problem = term_problem(files, time.time()) if files is not None else None
     if arguments.check_config:
+        if problem is not None:
+            sys.stderr.write(f"plr-controlplane: {'warning: ' if problem.in_force else ''}{problem.text}\n")
+            if not problem.in_force:
+                return EXIT_USAGE
         sys.stdout.write(f"{arguments.config}: ok\n")
         return EXIT_OK
     _start_logging(config.log_level)
+    if problem is not None:
+        # It starts all the same: a clock is set soon after a boot, and a certificate is read anew when it is replaced.
+        log.log(logging.WARNING if problem.in_force else logging.ERROR, "%s", problem.text)
     return _serve(arguments.config, config, files)
 
 

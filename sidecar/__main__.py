@@ -16,6 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from protos.certificate_term import term_problem
 from protos.errors import ConfigError
 from protos.tls_files import load_tls_files
 from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
@@ -24,6 +25,8 @@ from sidecar.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from protos.certificate_term import TermProblem
 
 log = logging.getLogger("sidecar.main")
 
@@ -69,6 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             refuse_exposed(config, str(options.config))
         if options.check_config:
             _warn_of_missing_interfaces(config)
+            _check_certificate(config)
             sys.stdout.write(f"{options.config}: ok\n")
             return EXIT_OK
         return _run(config)
@@ -114,6 +118,21 @@ def _warn_of_missing_interfaces(config: SidecarConfig) -> None:
         sys.stderr.write(f"{PROGRAM}: warning: {line}\n")
 
 
+def _certificate_problem(config: SidecarConfig) -> TermProblem | None:
+    if config.tls_dir is None:
+        return None
+    return term_problem(load_tls_files(config.tls_dir), time.time())
+
+
+def _check_certificate(config: SidecarConfig) -> None:
+    problem = _certificate_problem(config)
+    if problem is None:
+        return
+    if not problem.in_force:
+        raise ConfigError("", "", problem.text)
+    sys.stderr.write(f"{PROGRAM}: warning: {problem.text}\n")
+
+
 def _run(config: SidecarConfig) -> int:
     faulthandler.enable()
     # gRPC's own lines on stderr have another format, and what they tell is in our log.
@@ -122,6 +141,11 @@ def _run(config: SidecarConfig) -> int:
     with Logging(config.log_level.value, sys.stderr):
         failure = _stop_on_signals_and_crashes(stop)
         try:
+            problem = _certificate_problem(config)
+            if problem is not None:
+                # It starts all the same: a clock is set soon after a boot, and a certificate is read anew when it is
+                # replaced.
+                log.log(logging.WARNING if problem.in_force else logging.ERROR, "%s", problem.text)
             # Late: it takes a second to import, several on a busy machine; a wrong configuration has been told by now,
             # and a signal is heeded meanwhile.
             from sidecar.runtime import run

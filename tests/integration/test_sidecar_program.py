@@ -146,7 +146,6 @@ def test_wrong_usage_is_one_line_and_exit_2(arguments: tuple[str, ...]) -> None:
             {"services": [{"name": "/a", "deadline_ms": "fast"}]},
             "services[0].deadline_ms: expected a number, got 'fast'",
         ),
-        ({"interfaces": ["lo", "wlan99"]}, "got 'wlan99'"),
     ],
 )
 def test_a_bad_config_is_one_line_and_exit_2(
@@ -170,6 +169,14 @@ def test_a_file_that_is_not_there_is_exit_2(tmp_path: Path) -> None:
 def test_a_good_config_is_ok(program: Program) -> None:
     shown = run("--config", str(program.path), "--check-config")
     assert (shown.returncode, shown.stdout, shown.stderr) == (0, f"{program.path}: ok\n", "")
+
+
+@pytest.mark.audit("ops-1")
+def test_an_interface_that_is_missing_is_warned_of(tmp_path: Path) -> None:
+    program = Program(tmp_path, interfaces=["lo", "wwan99"])
+    shown = run("--config", str(program.path), "--check-config")
+    assert (shown.returncode, shown.stdout) == (0, f"{program.path}: ok\n")
+    assert shown.stderr.startswith("plr-sidecar: warning: wwan99: there is no such interface now (there are: lo")
 
 
 @pytest.mark.ros

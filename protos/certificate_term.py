@@ -1,0 +1,52 @@
+"""Whether a node's own certificate is in force, in words for whoever runs the node. Pure: the time is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from protos.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
+
+if TYPE_CHECKING:
+    from protos.tls_files import TlsFiles
+
+SOON_S = 7 * 86_400.0
+"""Before its end, a certificate is warned of for so long; the alert in deploy/prometheus fires as early."""
+
+_REMEDIES = {
+    EXPIRED: "renew it beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem here",
+    NOT_YET_VALID: "set this host's clock if it is wrong, or wait",
+    REVOKED: "issue another beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem here",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TermProblem:
+    """What is wrong with a certificate now, or will be soon."""
+
+    in_force: bool
+    """Peers believe it still."""
+    text: str
+    """One line: the file, what is wrong, what to do."""
+
+
+def term_problem(files: TlsFiles, now_wall: float) -> TermProblem | None:
+    """Return what the node's owner should know of its certificate at `now_wall` (seconds since 1970), if anything."""
+    path, name = files.directory / "cert.pem", files.identity.name
+    try:
+        files.trust.check(files.certificate_der, now_wall)
+    except CertificateError as error:
+        remedy = _REMEDIES.get(error.reason, "see docs/certificates.md").format(name=name)
+        return TermProblem(in_force=False, text=f"{path}: {error}, so that nobody talks to this node; {remedy}")
+    left_s = files.identity.not_after - now_wall
+    if left_s >= SOON_S:
+        return None
+    remedy = _REMEDIES[EXPIRED].format(name=name)
+    return TermProblem(in_force=True, text=f"{path}: {_left(left_s)} until it ends; {remedy}")
+
+
+def _left(left_s: float) -> str:
+    for unit, seconds in (("days", 86_400.0), ("hours", 3600.0), ("minutes", 60.0)):
+        if left_s >= 2 * seconds:
+            return f"{left_s / seconds:.0f} {unit}"
+    return f"{left_s:.0f} seconds"
