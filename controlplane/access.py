@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import grpc
 
+from protos.certificate_term import with_remedy
 from protos.identity import WRONG_ROLE, IdentityRole
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ class AccessGuard(grpc.aio.ServerInterceptor):
         if caller is None:
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, "the connection has ended")
         elif caller.refusal is not None:
-            await context.abort(grpc.StatusCode.UNAUTHENTICATED, str(caller.refusal))
+            text = with_remedy(caller.refusal, caller.identity.name)
+            await context.abort(grpc.StatusCode.UNAUTHENTICATED, text)
         elif caller.identity.role not in _ALLOWED.get(service, frozenset()):
             self._on_refused(WRONG_ROLE)
             name, role = caller.identity.name, caller.identity.role.value

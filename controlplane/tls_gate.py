@@ -14,6 +14,7 @@ import asyncio
 import contextlib
 import ipaddress
 import logging
+import math
 import secrets
 import socket
 import ssl
@@ -25,7 +26,7 @@ from typing import TYPE_CHECKING
 from controlplane.gate_pipe import PipeEnd
 from controlplane.half_open import HalfOpen
 from controlplane.handshakes import server_context, why_failed
-from protos.identity import REVOKED, CertificateError
+from protos.identity import CertificateError
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
@@ -68,6 +69,12 @@ ACCEPT_PAUSE_S = 0.1
 
 TOO_MANY_HANDSHAKES = "too_many_handshakes"
 TOO_MANY_CONNECTIONS = "too_many_connections"
+TELL_AGAIN_S = 60.0
+"""A member that is refused again for the same reason is logged again after so long."""
+
+MAX_TOLD = 4096
+"""Members and reasons noted for that; the one told longest ago goes."""
+
 _LOG_LINES_PER_S = 1.0
 _LOG_BURST = 20.0
 
@@ -111,6 +118,8 @@ class TlsGate:
         # Never the same name twice, in this process or another of this host: a stale one must not become somebody else.
         self._prefix = f"plr-{secrets.token_hex(8)}"
         self._count = 0
+        self._told: OrderedDict[tuple[NodeName, str], float] = OrderedDict()
+        """When each refused member was logged last, by its name and the reason."""
         self._log_lines = TokenBucket(rate=_LOG_LINES_PER_S, burst=_LOG_BURST, now=self._loop.time())
 
     # ── for the server ──
@@ -248,7 +257,7 @@ class TlsGate:
         self._connections[peer] = _Connection(caller, outside, inside)
         if caller.refusal is not None:
             # It may hear from gRPC why, in words that its operator reads.
-            self._refused(address, caller.refusal.reason, str(caller.refusal))
+            self._refused_member(caller.identity.name, address, caller.refusal)
             self._loop.call_later(HANDSHAKE_TIMEOUT_S, outside.abort)
         try:
             await self._connect_inside(name, inside)
@@ -301,14 +310,27 @@ class TlsGate:
         else:
             return
         connection.caller = Caller(caller.identity, caller.certificate, refusal)
-        self._refused(caller.identity.name, refusal.reason, str(refusal))
+        self._refused_member(caller.identity.name, caller.identity.name, refusal)
         self._loop.call_later(LAST_WORDS_S, connection.outside.abort)
         self._loop.call_later(LAST_WORDS_S, connection.inside.abort)
 
+    def _refused_member(self, name: NodeName, who: str, refusal: CertificateError) -> None:
+        """Of our CA's, so one that somebody may look for: told in any case, though not at each attempt."""
+        self._on_refused(refusal.reason)
+        now = self._loop.time()
+        told_at = self._told.get((name, refusal.reason), -math.inf)
+        if now - told_at < TELL_AGAIN_S:
+            return
+        self._told[name, refusal.reason] = now
+        self._told.move_to_end((name, refusal.reason))
+        if len(self._told) > MAX_TOLD:
+            self._told.popitem(last=False)
+        log.warning("refused a connection of %s: %s: %s", who, refusal.reason, refusal)
+
     def _refused(self, who: str, reason: str, text: str) -> None:
         self._on_refused(reason)
-        # A stranger must not fill the disk; what is revoked is worth a line in any case.
-        if reason == REVOKED or self._log_lines.take(self._loop.time()):
+        # A stranger must not fill the disk.
+        if self._log_lines.take(self._loop.time()):
             log.warning("refused a connection of %s: %s: %s", who, reason, text)
 
 

@@ -14,9 +14,9 @@ SOON_S = 7 * 86_400.0
 """Before its end, a certificate is warned of for so long; the alert in deploy/prometheus fires as early."""
 
 _REMEDIES = {
-    EXPIRED: "renew it beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem here",
+    EXPIRED: "renew it beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem to the node",
     NOT_YET_VALID: "set this host's clock if it is wrong, or wait",
-    REVOKED: "issue another beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem here",
+    REVOKED: "issue another beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem to the node",
 }
 
 
@@ -36,13 +36,17 @@ def term_problem(files: TlsFiles, now_wall: float) -> TermProblem | None:
     try:
         files.trust.check(files.certificate_der, now_wall)
     except CertificateError as error:
-        remedy = _REMEDIES.get(error.reason, "see docs/certificates.md").format(name=name)
-        return TermProblem(in_force=False, text=f"{path}: {error}, so that nobody talks to this node; {remedy}")
+        return TermProblem(in_force=False, text=f"{path}: nobody talks to this node: {with_remedy(error, name)}")
     left_s = files.identity.not_after - now_wall
     if left_s >= SOON_S:
         return None
     remedy = _REMEDIES[EXPIRED].format(name=name)
     return TermProblem(in_force=True, text=f"{path}: {_left(left_s)} until it ends; {remedy}")
+
+
+def with_remedy(refusal: CertificateError, name: str) -> str:
+    """Return why a node's certificate is refused and what to do about it, in one line."""
+    return f"{refusal}; {_REMEDIES.get(refusal.reason, 'see docs/certificates.md').format(name=name)}"
 
 
 def _left(left_s: float) -> str:

@@ -72,6 +72,19 @@ def test_certificates_that_are_no_good_are_refused(plane: SecuredControlPlane, c
         refused(plane.address, secured)
 
 
+@pytest.mark.audit("ops-3")
+def test_a_member_that_is_refused_reads_why_and_is_logged_by_its_name_once_a_minute(plane: SecuredControlPlane) -> None:
+    now = time.time()
+    secured = plane.member("ended", validity=Validity(now - 2 * HOUR_S, now - HOUR_S))
+    for _ in range(3):
+        error = refused(plane.address, secured)
+        assert error.code() is grpc.StatusCode.UNAUTHENTICATED
+        assert "the certificate of ended expired" in (error.details() or "")
+    lines = [line for line in plane.lines if "the certificate of ended expired" in line]
+    assert len(lines) == 1
+    assert ": expired: the certificate of ended expired " in lines[0]
+
+
 def test_who_shows_no_certificate_or_speaks_no_tls_is_refused(plane: SecuredControlPlane) -> None:
     host, port = plane.address.split(":")
     with plane.counted("no_certificate"), socket.create_connection((host, int(port))) as raw:

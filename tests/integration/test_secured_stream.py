@@ -189,7 +189,7 @@ def test_what_the_operator_reads_of_a_sidecar_that_does_not_get_in(plane: Secure
     past = Validity(now - 2 * HOUR_S, now - HOUR_S)
     plane.authority.write_tls_dir(tmp_path / "old", "robot-old", IdentityRole.ROBOT, validity=past)
     assert "expired" in (told := failure(plane.address, tmp_path / "old"))
-    assert told.endswith("do: plr ca renew robot-old")
+    assert "plr ca renew robot-old" in told
     assert "it may expect TLS" in failure(plane.address, None)
     plane.authority.write_tls_dir(tmp_path / "good", "robot-good", IdentityRole.ROBOT)
     (tmp_path / "insecure").mkdir()

@@ -37,9 +37,9 @@ def ca() -> Authority:
         (
             -60.0,
             False,
-            "cert.pem: the certificate of robot-1 expired 60 s ago, so that nobody talks to this node; renew",
+            "cert.pem: nobody talks to this node: the certificate of robot-1 expired 60 s ago; renew",
         ),
-        (math.inf, False, "not valid yet, for 100 s, so that nobody talks to this node; set this host's"),
+        (math.inf, False, "not valid yet, for 100 s; set this host's"),
     ],
 )
 def test_the_terms_of_a_certificate(
@@ -60,7 +60,7 @@ def test_a_revoked_one_is_told_so(tmp_path: Path, ca: Authority) -> None:
     problem = term_problem(load_tls_files(tmp_path / "tls"), time.time())
     assert problem is not None
     assert not problem.in_force
-    assert "robot-1 is revoked, so that nobody talks to this node; issue another" in problem.text
+    assert "robot-1 is revoked; issue another" in problem.text
 
 
 @pytest.mark.audit("ops-3")
@@ -82,7 +82,9 @@ def test_a_configuration_with_an_ended_certificate_is_refused_and_one_that_ends_
     assert code == (2 if left_days < 0 else 0)
     assert shown.out == ("" if left_days < 0 else f"{config}: ok\n")
     if left_days < 0:
-        assert shown.err.startswith(f"{name}: {tmp_path}/tls/cert.pem: the certificate of node-1 expired ")
+        assert shown.err.startswith(
+            f"{name}: {tmp_path}/tls/cert.pem: nobody talks to this node: the certificate of node-1 expired "
+        )
         assert shown.err.count("\n") == 1
     elif left_days < 7:
         assert shown.err.startswith(f"{name}: warning: {tmp_path}/tls/cert.pem: 2 days until it ends; renew it")
