@@ -20,15 +20,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import sdnotify
-
 from controlplane import version
 from controlplane.certificates import load_own_files
 from controlplane.config import load_config, refuse_exposed
 from protos import interpreter
 from protos.certificate_term import term_problem
 from protos.errors import ConfigError
-from protos.log_lines import LineFormatter
+from protos.log_lines import line_formatter
+from protos.notifier import Notifier
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -107,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _start_logging(level: str) -> None:
     output = logging.StreamHandler(sys.stderr)
-    output.setFormatter(LineFormatter())
+    output.setFormatter(line_formatter(sys.stderr))
     logging.basicConfig(level=level.upper(), handlers=[output])
     logging.getLogger("grpc._cython.cygrpc").addFilter(_is_not_a_lost_stream)
 
@@ -128,7 +127,7 @@ async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None)
         loop.add_signal_handler(number, stop.set)
     reload = PolicyReload(source, config)
     loop.add_signal_handler(signal.SIGHUP, reload.request)
-    systemd = sdnotify.SystemdNotifier()
+    systemd = Notifier()
 
     def ready(addresses: Addresses) -> None:
         log.info(
@@ -144,18 +143,19 @@ async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None)
                 "unless their own configuration names one"
             )
         interpreter.settle()
-        systemd.notify("READY=1")
+        systemd.ready()
 
     def stopping() -> None:
         log.info("stopping")
-        systemd.notify("STOPPING=1")
+        systemd.stopping()
 
     if files is None:
         log.warning(
             "insecure: true: no encryption towards sidecars and operators, and everybody who reaches %s is believed",
             config.listen,
         )
-    await serve(config, files, reload, stop, ready, stopping)
+
+    await serve(config, files, reload, stop, ready, stopping, systemd.status)
 
 
 if __name__ == "__main__":

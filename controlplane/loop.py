@@ -6,6 +6,7 @@ import asyncio
 import concurrent.futures
 import logging
 import time
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from controlplane.core.claims import check_claims, check_unproven_claims
@@ -24,7 +25,7 @@ from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
 from controlplane.mailbox import Mailbox
 from protos.identity import EXPIRED, REVOKED, CertificateError
-from protos.model import NO_REVOCATIONS, RemovalReason
+from protos.model import NO_REVOCATIONS, RemovalReason, Role
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
@@ -147,6 +148,11 @@ class ControlLoop:
     def status(self) -> list[SidecarStatus]:
         """Every registered sidecar."""
         return self._core.status(self._loop.time())
+
+    def status_line(self) -> str:
+        """Return in a few words how it is, for `systemctl status`."""
+        counts = Counter(sidecar.role for sidecar in self._core.registry)
+        return f"sidecars connected: {counts[Role.ROBOT]} of robots, {counts[Role.CLOUD]} of clouds"
 
     def explain(self, robot: NodeName, service: ServiceName) -> Explanation:
         """Why requests go where they go. Raises UnknownNameError if the robot, or its service, is not known."""

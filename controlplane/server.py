@@ -39,6 +39,9 @@ log = logging.getLogger(__name__)
 STOP_GRACE_S = 1.0
 """For streams to take their last message; what then still hangs is cut."""
 
+STATUS_EVERY_S = 2.0
+"""How often `systemctl status` may learn how it is."""
+
 GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
     # Sidecars behind cellular NATs ping to keep their binding, also with no call open, but not faster than this.
     ("grpc.keepalive_permit_without_calls", 1),
@@ -82,8 +85,11 @@ async def serve(
     stop: asyncio.Event,
     ready: Callable[[Addresses], None],
     stopping: Callable[[], None],
+    tell: Callable[[str], None],
 ) -> None:
     """Serve until `stop`; calls `ready` when everything listens, `stopping` when the end begins.
+
+    `tell` is given a few words on how it is, now and then.
 
     `files` is None in insecure mode. Raises StartError if an address cannot be had.
     """
@@ -111,6 +117,7 @@ async def serve(
             keeper = None
             if files is not None and gate is not None:
                 keeper = tasks.create_task(CertificateKeeper(files, gate, loop, metrics, clock).run())
+            telling = tasks.create_task(_tell_status(loop, tell))
             reloading = tasks.create_task(reload.run(loop.set_policy, metrics))
             for name in _SERVICES:
                 await health_service.set(name, health_pb2.HealthCheckResponse.SERVING)
@@ -122,8 +129,15 @@ async def serve(
             await server.stop(STOP_GRACE_S)
             loop.stop()
             reloading.cancel()
+            telling.cancel()
             if keeper is not None:
                 keeper.cancel()
+
+
+async def _tell_status(loop: ControlLoop, tell: Callable[[str], None]) -> None:
+    while True:
+        tell(loop.status_line())
+        await asyncio.sleep(STATUS_EVERY_S)
 
 
 def _make_server(

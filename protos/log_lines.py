@@ -1,9 +1,35 @@
-"""How both programs write a log line: UTC, level, component, text; nothing that a peer says moves a cursor."""
+"""How both programs write a log line: UTC, level, component, text; nothing that a peer says moves a cursor.
+
+To systemd's journal, which notes the time itself, goes a priority in place of it (sd-daemon(3)), so that
+`journalctl -p warning` shows what it should.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing import TextIO
+
+_PRIORITIES = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
+"""syslog(3)'s."""
+
+
+def line_formatter(stream: TextIO, own_package: str = "") -> logging.Formatter:
+    """Return what formats lines for this stream; `own_package` is left out before components' names."""
+    return JournalFormatter(own_package) if is_journal(stream) else LineFormatter(own_package)
+
+
+def is_journal(stream: TextIO) -> bool:
+    """Whether systemd's journal reads the stream: JOURNAL_STREAM says which file that is (systemd.exec(5))."""
+    try:
+        status = os.fstat(stream.fileno())
+    except (OSError, ValueError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
 class LineFormatter(logging.Formatter):
@@ -25,12 +51,24 @@ class LineFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
+        return f"{self.formatTime(record)} {record.levelname} {self._told(record)}"
+
+    def _told(self, record: logging.LogRecord) -> str:
         component = record.name.removeprefix(self._prefix)
-        line = f"{self.formatTime(record)} {record.levelname} {component}: {escaped(record.getMessage())}"
+        line = f"{component}: {escaped(record.getMessage())}"
         if record.exc_info:
             trace = self.formatException(record.exc_info).split("\n")
             line += "".join(f"\n    {escaped(part)}" for part in trace)
         return line
+
+
+class JournalFormatter(LineFormatter):
+    """<4>control_client: text; each line with its priority, as the journal makes an entry of each."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        priority = f"<{_PRIORITIES.get(record.levelno, 5)}>"
+        return priority + self._told(record).replace("\n", f"\n{priority}")
 
 
 def escaped(text: str) -> str:

@@ -12,7 +12,7 @@ import queue
 from logging.handlers import QueueHandler, QueueListener
 from typing import TYPE_CHECKING
 
-from protos.log_lines import LineFormatter
+from protos.log_lines import line_formatter
 
 if TYPE_CHECKING:
     from typing import TextIO
@@ -82,7 +82,7 @@ class Logging:
 
     def __init__(self, level: str, stream: TextIO, *, max_waiting: int = MAX_WAITING_LINES) -> None:
         output = logging.StreamHandler(stream)
-        output.setFormatter(LineFormatter("sidecar"))
+        output.setFormatter(line_formatter(stream, "sidecar"))
         waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(max_waiting)
         self._handler = _BoundedQueueHandler(waiting)
         self._listener = _PatientListener(waiting, output)

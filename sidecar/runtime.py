@@ -9,13 +9,12 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import sdnotify
-
 from protos import interpreter
 from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
 from protos.errors import ConfigError
 from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Version
+from protos.notifier import Notifier
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient
@@ -57,6 +56,10 @@ log = logging.getLogger(__name__)
 DRAIN_S = 5.0
 """On SIGTERM, requests in flight get this long."""
 DRAIN_POLL_S = 0.02
+STATUS_EVERY_S = 2.0
+"""How often `systemctl status` may learn how it is."""
+MAX_STATUS_CHARACTERS = 500
+"""Names of services may be long."""
 DEFAULT_STUN_PORT = 3478
 """RFC 8489 section 8; used on the control plane's host when nobody names a STUN server."""
 
@@ -169,6 +172,17 @@ class Sidecar:
         self._bridge.start(self._data_plane)
         self._control.start()
         self._control.try_again()  # an interface may have come before it was noted that the mapping lacks it
+
+    def status_line(self) -> str:
+        """Return in a few words how it is, for `systemctl status`."""
+        used = self._interfaces.in_use()
+        carrying = [name for name, carries in used.items() if carries]
+        reached = "reached" if self._control.connected else "not reached"
+        services = " ".join(sorted(self._bridge.stats.carried)) or "none"
+        return (
+            f"{len(carrying)} of {len(used)} interfaces in use ({' '.join(sorted(carrying)) or 'none'}), "
+            f"control plane {reached}, services offered: {services}"
+        )[:MAX_STATUS_CHARACTERS]
 
     def stop(self) -> None:
         """Finish what is in flight, say goodbye, end every thread."""
@@ -338,11 +352,15 @@ def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
     if config.insecure:
         log.warning("insecure: true: the control plane and every peer are believed to be who they say")
     sidecar = Sidecar(config, version)
-    notifier = sdnotify.SystemdNotifier()
+    notifier = Notifier()
     sidecar.start()
     interpreter.settle()
-    notifier.notify("READY=1")
-    log.info("stopping %s: no new requests, finishing those in flight", stopping.wait())
-    notifier.notify("STOPPING=1")
+    notifier.ready()
+    reason = None
+    while reason is None:
+        notifier.status(sidecar.status_line())
+        reason = stopping.wait(STATUS_EVERY_S)
+    log.info("stopping %s: no new requests, finishing those in flight", reason)
+    notifier.stopping()
     sidecar.stop()
     return 0

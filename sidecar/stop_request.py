@@ -19,6 +19,9 @@ class StopRequest:
         """Ask to stop; takes no lock that the caller could hold."""
         self._reasons.put(reason)
 
-    def wait(self) -> str:
-        """Wait until it is set; returns the first reason. For one thread, once."""
-        return self._reasons.get()
+    def wait(self, timeout_s: float) -> str | None:
+        """Wait until it is set, `timeout_s` at most; returns the first reason, or None. For one thread, until set."""
+        try:
+            return self._reasons.get(timeout=timeout_s)
+        except queue.Empty:
+            return None

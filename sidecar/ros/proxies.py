@@ -95,7 +95,7 @@ class Proxies:
         if proxy is not None and fallbacks.get(event.name) == proxy.type.name:
             log.warning("service %s: its fallback alone answers from now on: %s", event.name, event.reason)
         elif self._close_proxy(event.name):
-            log.info("service %s is withdrawn: %s", event.name, event.reason)
+            log.warning("service %s is withdrawn: %s", event.name, event.reason)
         self._publish_state()
 
     def look(

@@ -41,9 +41,16 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         notified.settimeout(PATIENCE_S)
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
         with ControlPlaneProcess(tmp_path) as plane:
-            assert notified.recv(100) == b"READY=1"
+            assert {notified.recv(100), notified.recv(100)} == {
+                b"READY=1",
+                b"STATUS=sidecars connected: 0 of robots, 0 of clouds",
+            }
+            with cloud(plane.address, "cloud-a") as stream:
+                stream.expect(Welcome)
+                assert notified.recv(100) == b"STATUS=sidecars connected: 0 of robots, 1 of clouds"
             assert plane.stop() == 0
-            assert notified.recv(100) == b"STOPPING=1"
+            while (said := notified.recv(100)) != b"STOPPING=1":
+                assert said.startswith(b"STATUS=")
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -206,7 +206,7 @@ class Runtime(types.ModuleType):
         if name != "run":
             raise AttributeError(name)
         signal.raise_signal(signal.SIGTERM)
-        return lambda config, version, stop: print("stopped", stop.wait()) or 0
+        return lambda config, version, stop: print("stopped", stop.wait(60.0)) or 0
 
 sys.modules["sidecar.runtime"] = Runtime("sidecar.runtime")
 from sidecar.__main__ import main

@@ -6,6 +6,7 @@ network namespace that nobody else uses.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -140,11 +141,13 @@ def start(name: str, folder: Path) -> tuple[subprocess.Popen[bytes], socket.sock
 
 
 def wait_for(notify: socket.socket, word: str, patience_s: float) -> bool:
-    notify.settimeout(patience_s)
-    try:
-        return notify.recv(256).decode() == word
-    except TimeoutError:
-        return False
+    end = time.monotonic() + patience_s
+    while (left := end - time.monotonic()) > 0:
+        notify.settimeout(left)
+        with contextlib.suppress(TimeoutError):
+            if notify.recv(1024).decode() == word:
+                return True
+    return False
 
 
 def metrics(name: str) -> dict[str, float]:

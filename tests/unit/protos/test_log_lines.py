@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import logging
+import os
+from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.log_lines import LineFormatter, escaped
+from protos.log_lines import JournalFormatter, LineFormatter, escaped, is_journal, line_formatter
 from sidecar.core.events import RejectReason
 from sidecar.core.messages import RejectionMessage, decode_message, encode_message
 from tests.unit.sidecar.core.builders import request_id
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 pytestmark = pytest.mark.audit("sec-11")
 
@@ -53,3 +59,26 @@ def test_a_rejections_words_are_printable() -> None:
     decoded = decode_message(memoryview(b"".join(encoded)))
     assert isinstance(decoded, RejectionMessage)
     assert decoded.text.isprintable()
+
+
+@pytest.mark.audit("ops-6")
+def test_the_journal_gets_priorities_and_no_second_time() -> None:
+    record = logging.LogRecord("sidecar.net.path_log", logging.WARNING, __file__, 1, "is down", (), None)
+    assert JournalFormatter("sidecar").format(record) == "<4>net.path_log: is down"
+    record.levelno = logging.CRITICAL
+    record.exc_info = (ValueError, ValueError(FORGED), None)
+    told = JournalFormatter("sidecar").format(record).split("\n")
+    assert len(told) > 1
+    assert all(line.startswith("<2>") and line.isprintable() for line in told)
+
+
+@pytest.mark.audit("ops-6")
+def test_the_journal_is_known_by_its_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (tmp_path / "journal").open("w") as stream:
+        status = os.fstat(stream.fileno())
+        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino + 1}")
+        assert not is_journal(stream)
+        assert not isinstance(line_formatter(stream), JournalFormatter)
+        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
+        assert isinstance(line_formatter(stream), JournalFormatter)
+    assert not is_journal(io.StringIO())

@@ -38,7 +38,7 @@ def test_signals_in_quick_succession_end_the_wait(current: list[StopRequest]) ->
     try:
         for _ in range(ROUNDS):
             current[:] = [StopRequest()]
-            assert current[-1].wait() == "on SIGUSR1"
+            assert current[-1].wait(60.0) == "on SIGUSR1"
     finally:
         over.set()
         thread.join()
@@ -48,4 +48,4 @@ def test_the_first_reason_counts() -> None:
     stop = StopRequest()
     stop.set("on SIGTERM")
     stop.set("as a thread died")
-    assert stop.wait() == "on SIGTERM"
+    assert stop.wait(60.0) == "on SIGTERM"
