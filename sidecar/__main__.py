@@ -21,6 +21,7 @@ from protos.errors import ConfigError
 from protos.tls_files import load_tls_files
 from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
 from sidecar.logging_setup import Logging
+from sidecar.ros import environment
 from sidecar.stop_request import StopRequest
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.check_config:
             _warn_of_missing_interfaces(config)
             _check_certificate(config)
+            _check_ros(thorough=True)
             sys.stdout.write(f"{options.config}: ok\n")
             return EXIT_OK
         return _run(config)
@@ -118,6 +120,12 @@ def _warn_of_missing_interfaces(config: SidecarConfig) -> None:
         sys.stderr.write(f"{PROGRAM}: warning: {line}\n")
 
 
+def _check_ros(*, thorough: bool) -> None:
+    problem = environment.problem(thorough=thorough)
+    if problem is not None:
+        raise ConfigError("", "", problem)
+
+
 def _certificate_problem(config: SidecarConfig) -> TermProblem | None:
     if config.tls_dir is None:
         return None
@@ -134,6 +142,7 @@ def _check_certificate(config: SidecarConfig) -> None:
 
 
 def _run(config: SidecarConfig) -> int:
+    _check_ros(thorough=False)
     faulthandler.enable()
     # gRPC's own lines on stderr have another format, and what they tell is in our log.
     os.environ.setdefault("GRPC_VERBOSITY", "ERROR")

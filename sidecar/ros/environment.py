@@ -1,0 +1,68 @@
+"""Whether ROS 2 can be used here, in words for whoever runs the node, before rclpy is asked.
+
+rclpy ends the whole process where RMW_IMPLEMENTATION names what it was not built with, and Fast DDS where the domain's
+ports are too high; both say so in words of their own, deep inside. So the variables are looked at first, and rclpy is
+tried in another process where it could come to that.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+MAX_DOMAIN_ID = 232
+"""DDS derives UDP ports from the domain's number; those of higher ones do not exist (DDSI-RTPS 2.5, 9.6.2)."""
+DEFAULT_RMW = "rmw_fastrtps_cpp"
+"""ROS Jazzy's; it is there with every rclpy, so that naming it needs no trial at each start."""
+TRY_TIMEOUT_S = 60.0
+"""Loading rclpy takes half a second on an idle machine."""
+
+_TRY = "import rclpy; rclpy.init(args=['--ros-args', '--disable-external-lib-logs']); rclpy.shutdown()"
+_MAX_SAID_CHARACTERS = 300
+
+
+def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = False) -> str | None:
+    """Return one line on what keeps ROS 2 from working here, and what to do; None: nothing was found.
+
+    `thorough`: try rclpy in any case, which takes about a second.
+    """
+    domain = environment.get("ROS_DOMAIN_ID", "")
+    if domain and not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN_ID):
+        return f"ROS_DOMAIN_ID: expected a number from 0 to {MAX_DOMAIN_ID}, got {domain!r}"
+    if importlib.util.find_spec("rclpy") is None:
+        return (
+            f"ROS 2's rclpy is not there for {sys.executable}: with ROS from apt, source /opt/ros/jazzy/setup.bash "
+            "before (under systemd: Environment= of the unit); without, pip install 'fogros2-plr[ros]'"
+        )
+    rmw = environment.get("RMW_IMPLEMENTATION", "")
+    if not thorough and rmw in ("", DEFAULT_RMW):
+        return None
+    said = _try(environment)
+    if said is None:
+        return None
+    if rmw:
+        return f"RMW_IMPLEMENTATION: expected an rmw that is installed, got {rmw!r}: {said}"
+    return f"ROS 2 does not start here: {said}"
+
+
+def _try(environment: Mapping[str, str]) -> str | None:
+    """Return the first line of what rclpy says when it does not start."""
+    argv = [sys.executable, "-c", _TRY]
+    try:
+        done = subprocess.run(  # noqa: S603  (our own interpreter and text)
+            argv, env=environment, capture_output=True, text=True, timeout=TRY_TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"rclpy did not start within {TRY_TIMEOUT_S:.0f} s"
+    if done.returncode == 0:
+        return None
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [f"it ends with {done.returncode}"]
+    # Of a traceback the last line says what is wrong; rcl's own message is the only one.
+    said = lines[-1]
+    return "".join(char for char in said if char.isprintable())[:_MAX_SAID_CHARACTERS]

@@ -1,0 +1,65 @@
+"""What a ROS environment that cannot work is told, in one line and with exit code 2."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from sidecar.__main__ import main
+from sidecar.ros import environment
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = [pytest.mark.ros, pytest.mark.audit("ops-4")]
+
+
+@pytest.mark.parametrize("domain", ["", "0", "42", "232"])
+def test_domains_that_exist(domain: str) -> None:
+    assert environment.problem({"ROS_DOMAIN_ID": domain}) is None
+
+
+@pytest.mark.parametrize("domain", ["abc", "300", "233", "-1", "4.5", " 1", "²"])
+def test_domains_that_do_not(domain: str) -> None:
+    assert environment.problem({"ROS_DOMAIN_ID": domain}) == (
+        f"ROS_DOMAIN_ID: expected a number from 0 to 232, got {domain!r}"
+    )
+
+
+def test_an_rmw_that_is_not_installed_is_named() -> None:
+    told = environment.problem({**os.environ, "RMW_IMPLEMENTATION": "rmw_nowhere_cpp"})
+    assert told is not None
+    assert told.startswith("RMW_IMPLEMENTATION: expected an rmw that is installed, got 'rmw_nowhere_cpp': ")
+    assert "rmw_fastrtps_cpp" in told
+
+
+def test_this_environment_works() -> None:
+    assert environment.problem(thorough=True) is None
+    assert environment.problem({**os.environ, "RMW_IMPLEMENTATION": environment.DEFAULT_RMW}, thorough=True) is None
+
+
+def test_without_rclpy_it_says_where_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    told = environment.problem()
+    assert told is not None
+    assert told.startswith(
+        f"ROS 2's rclpy is not there for {sys.executable}: with ROS from apt, source /opt/ros/jazzy/"
+    )
+
+
+@pytest.mark.parametrize("check", [True, False])
+def test_the_program_ends_with_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], check: bool
+) -> None:
+    config = tmp_path / "sidecar.yaml"
+    config.write_text(
+        "name: robot-1\nrole: robot\ninsecure: true\ncontrol_plane: 127.0.0.1:1\ninterfaces: [lo]\n"
+        f"state_dir: {tmp_path}\nservices: [{{name: /plan, deadline_ms: 100}}]\n"
+    )
+    monkeypatch.setenv("ROS_DOMAIN_ID", "abc")
+    assert main(["--config", str(config), *(["--check-config"] if check else [])]) == 2
+    shown = capsys.readouterr()
+    assert shown.err == "plr-sidecar: ROS_DOMAIN_ID: expected a number from 0 to 232, got 'abc'\n"
