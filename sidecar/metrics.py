@@ -55,6 +55,8 @@ class MetricSources:
     connected: Callable[[], bool]
     """Whether the control plane is within reach."""
     bridge: Callable[[], BridgeStats] | None
+    unmet: Callable[[], Iterable[str]]
+    """Services that the configuration names and nobody serves."""
     state_failures: Callable[[], Mapping[str, int]]
     """Files of the state folder that could not be read or written, by what failed."""
     certificate: Callable[[], Identity | None]
@@ -86,6 +88,12 @@ class SidecarCollector(Collector):
         yield from _control(sources.control(), sources.connected(), sources.engine())
         if sources.bridge is not None:
             yield from _bridge(sources.bridge())
+        yield gauge(
+            "plr_service_unmet",
+            "1 for each service that the configuration names and that nobody serves.",
+            ("service",),
+            {(name,): 1.0 for name in sources.unmet()},
+        )
         yield from _certificate(sources.certificate())
         yield from _revocations(sources.revocations(), sources.engine())
         yield counter(

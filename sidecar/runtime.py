@@ -13,7 +13,7 @@ from protos import interpreter
 from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
 from protos.errors import ConfigError
-from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Version
+from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Role, Version
 from protos.notifier import Notifier
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar.announcement import Announcer
@@ -29,6 +29,7 @@ from sidecar.revocations import Revocations
 from sidecar.ros.bridge import RosBridge
 from sidecar.start_session import signed, start_session
 from sidecar.state_store import StateDirError, StateStore
+from sidecar.unmet_services import UnmetServices, told
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -144,6 +145,7 @@ class Sidecar:
             self._data_plane,
             self._tell_candidates,
         )
+        self._unmet = UnmetServices([rule.pattern for rule in rules], time.monotonic())
         self._metrics: MetricsServer | None = None
         self._logged_mappings: dict[ServiceName, tuple[Assignment, ...]] = {}
         self._version = version
@@ -172,6 +174,17 @@ class Sidecar:
         self._bridge.start(self._data_plane)
         self._control.start()
         self._control.try_again()  # an interface may have come before it was noted that the mapping lacks it
+
+    def look_at_services(self) -> None:
+        """Tell, once, of those that the configuration names and nobody serves."""
+        stats = self._bridge.stats
+        met = {*stats.carried, *stats.left_alone, *stats.missing_types}
+        for name in self._unmet.look(met, time.monotonic()):
+            if self._config.role is Role.ROBOT:
+                line = told(name, self._data_plane.services_of_peers(), "no server that this robot knows of")
+            else:
+                line = told(name, stats.carried, "no node of this host's ROS domain")
+            log.warning("%s", line)
 
     def status_line(self) -> str:
         """Return in a few words how it is, for `systemctl status`."""
@@ -216,6 +229,7 @@ class Sidecar:
             control=lambda: self._control.stats,
             connected=lambda: self._control.connected,
             bridge=lambda: self._bridge.stats,
+            unmet=lambda: self._unmet.unmet,
             state_failures=lambda: self._store.failures,
             certificate=lambda: self._tls.current.identity if self._tls is not None else None,
             revocations=lambda: None if self._revocations is None else self._revocations.state,
@@ -359,6 +373,7 @@ def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
     reason = None
     while reason is None:
         notifier.status(sidecar.status_line())
+        sidecar.look_at_services()
         reason = stopping.wait(STATUS_EVERY_S)
     log.info("stopping %s: no new requests, finishing those in flight", reason)
     notifier.stopping()

@@ -294,6 +294,11 @@ class Engine:
         else:
             self._offers.forget_peer(name)
 
+    def services_of_peers(self) -> set[ServiceName]:
+        """Return what the peers offer, of whatever name."""
+        peers = map(self.peers.get, self.peers.names())
+        return {offer.name for peer in peers if peer is not None for offer in peer.offers}
+
     def recheck_peers(self, judged: Iterable[Peer], now: float) -> list[NodeName]:
         """Judgements changed: sessions of those bad now end; returns the refused taken, as they are `judged` good."""
         gone, taken = self.peers.recheck(), self.peers.readmit(judged)

@@ -206,6 +206,11 @@ class ThreadedDataPlane:
         with self._lock:
             return self._engine.offers(), self._engine.uses()
 
+    def services_of_peers(self) -> set[ServiceName]:
+        """Return what the peers offer, of whatever name."""
+        with self._lock:
+            return self._engine.services_of_peers()
+
     def apply_peers(self, peer_set: PeerSet) -> str | None:
         """Take a view of the peers; returns why it is refused, or None."""
         self._judge(peer_set.peers)

@@ -232,6 +232,7 @@ def exported_metrics() -> dict[str, set[str]]:
             engine=EngineStats,
             links=lambda: (),
             interfaces=dict,
+            unmet=tuple,
             control=ControlStats,
             connected=lambda: False,
             bridge=None,

@@ -122,6 +122,7 @@ def _sidecar_metrics() -> Iterator[Metric]:
         version="0",
         engine=lambda: engine,
         links=lambda: [LinkStats(InterfaceName("wlan0"), paths={})],
+        unmet=lambda: ["/plan"],
         interfaces=lambda: {InterfaceName("wlan0"): True},
         control=ControlStats,
         connected=lambda: True,

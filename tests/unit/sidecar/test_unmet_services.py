@@ -1,0 +1,40 @@
+"""A configured name that nobody serves is told of once, with the name that was probably meant."""
+
+from __future__ import annotations
+
+import pytest
+
+from protos.model import ServiceName
+from sidecar.unmet_services import GRACE_S, MAX_NAMES_SHOWN, UnmetServices, told
+
+pytestmark = pytest.mark.audit("ops-5")
+
+PLAN, WHERE = ServiceName("/plan"), ServiceName("/where_i_am")
+
+
+def test_a_name_that_was_never_served_is_told_of_once_after_the_start() -> None:
+    unmet = UnmetServices([PLAN, WHERE, "/arm/*"], 100.0)
+    assert unmet.look(set(), 100.0 + GRACE_S / 2) == []
+    assert unmet.unmet == frozenset()
+    assert unmet.look({PLAN}, 100.0 + GRACE_S) == [WHERE]
+    assert unmet.unmet == {WHERE}
+    assert unmet.look({PLAN}, 200.0) == []
+    assert unmet.look({WHERE}, 300.0) == [], "what is withdrawn is told of by who withdraws it"
+    assert unmet.unmet == {PLAN}
+
+
+def test_a_name_that_was_served_and_went_before_the_first_judgement_is_not_wrong() -> None:
+    unmet = UnmetServices([PLAN], 0.0)
+    unmet.look({PLAN}, 1.0)
+    assert unmet.look(set(), GRACE_S) == []
+    assert unmet.unmet == {PLAN}
+
+
+def test_the_line_names_what_was_probably_meant_or_what_there_is() -> None:
+    whose = "no server that this robot knows of"
+    start = f"service /where_i_am is configured, and {whose} offers it"
+    assert told(WHERE, ["/plan", "/where_am_i"], whose) == f"{start}; did you mean /where_am_i?"
+    assert told(WHERE, [], whose) == f"{start}; offered: nothing"
+    assert told(WHERE, ["/b", "/a", "/a"], whose) == f"{start}; offered: /a /b"
+    many = [f"/s{number:02}" for number in range(MAX_NAMES_SHOWN + 3)]
+    assert told(WHERE, many, whose).endswith("/s08 /s09 and 3 more")
