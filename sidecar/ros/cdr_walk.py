@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 ENCAPSULATION_BYTES = 4
 ALIGNMENT = 8
 """The largest: sizes of what is fixed depend on where it begins, by this."""
-MAX_STEPS = 20_000
-"""Lengths looked at one by one, some 20 ms."""
+MAX_STEPS = 24_000
+"""Lengths looked at one by one, some 20 ms; 21,000 strings, each of another length."""
+COMPARISON_STEPS = 8
+"""What it takes to find out that no more elements look alike, as so many lengths."""
 MAX_ALLOCATIONS = 250_000
 """Strings and sequences of one message, some 30 ms of the type support's time."""
 MEMORY_FACTOR = 3
@@ -71,13 +73,17 @@ class Walk:
         begin = position + 4
         if begin > self.end:
             raise CdrError("cut off")
-        self.steps_left -= 1
-        if self.steps_left < 0:
-            raise CdrError(f"more than {MAX_STEPS} strings and sequences of different lengths")
+        self.step(1)
         found = int.from_bytes(self.data[position:begin], self.order)  # type: ignore[arg-type]  # one of the two
         if self.lengths is not None:
             self.lengths.append(position)
         return found, begin
+
+    def step(self, steps: int) -> None:
+        """Count what takes time."""
+        self.steps_left -= steps
+        if self.steps_left < 0:
+            raise CdrError(f"more than {MAX_STEPS} strings and sequences of different lengths")
 
     def note_lengths(self) -> None:
         """Note from here on where lengths stand."""
@@ -301,24 +307,20 @@ def _walk_elements(element: Layout, walk: Walk, position: int, count: int) -> in
 def _alike(walk: Walk, began: int, size: int, lengths: list[int], most: int) -> int:
     """How many blocks after the one at `began` have the same lengths at the same places."""
     most = min(most, (walk.end - began) // size - 1)
-    first = walk.bytes[began : began + size]
+    where = (np.array(lengths)[:, None] - began + np.arange(4)).reshape(-1)
+    first = walk.bytes[began : began + size][where]
     alike, chunk = 0, _FIRST_CHUNK
     # What is compared in vain is no more than what was found before: hostile bytes must not make this slow.
     while alike < most:
         chunk = min(chunk, most - alike)
         start = began + size * (alike + 1)
         blocks = walk.bytes[start : start + chunk * size].reshape(chunk, size)
-        same = chunk
-        for position in lengths:
-            at = position - began
-            other = (blocks[:same, at : at + 4] != first[at : at + 4]).any(axis=1)
-            found = int(other.argmax())
-            if other[found]:
-                same = found
-            if not same:
-                break
+        other = (blocks[:, where] != first).any(axis=1)
+        found = int(other.argmax())
+        same = found if other[found] else chunk
         alike += same
         if same < chunk:
+            walk.step(COMPARISON_STEPS)
             break
         chunk *= 2
     return alike
