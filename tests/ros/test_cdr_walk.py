@@ -224,7 +224,7 @@ def test_runs_that_end_just_after_they_were_found_take_no_longer_than_lengths(st
     with contextlib.suppress(CdrError):
         cdr_walk.structure([cdr_walk.Elements(cdr_walk.String())]).walk(walk, 0)
     one_by_one_s = 2 * (time.thread_time() - began)
-    assert took_s < 6 * one_by_one_s, (took_s, one_by_one_s)
+    assert took_s < 2 * one_by_one_s, (took_s, one_by_one_s)
 
 
 def test_a_small_message_of_short_strings_is_no_bomb() -> None:
