@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import ServiceUse
 from sidecar.core.events import OfferService, WithdrawService
+from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping
@@ -19,7 +20,10 @@ if TYPE_CHECKING:
     from protos.model import NodeName, Peer, ServiceName
     from sidecar.core.routes import Routes
     from sidecar.core.rules import Rules
+    from sidecar.core.stats import EngineStats
 
+MAX_OFFERED = 512
+"""Services offered on the robot; each costs DDS endpoints and a slot in every wait. One peer may have half."""
 WITHDRAW_AFTER_S = 15.0
 """Longer than a handover, a tunnel or the restart of a server, shorter than a person's patience with a dead service."""
 
@@ -27,9 +31,15 @@ WITHDRAW_AFTER_S = 15.0
 class Offers:
     """Services offered on the robot, and the servers behind each."""
 
-    def __init__(self, rules: Rules) -> None:
+    def __init__(self, rules: Rules, stats: EngineStats) -> None:
         self._rules = rules
+        self._stats = stats
         self._offered: dict[ServiceName, str] = {}
+        self._shares = Shares(MAX_OFFERED)
+        self._charged: dict[ServiceName, NodeName] = {}
+        """In whose share each offered service is: of its servers then, the one that had the fewest."""
+        self._refused: set[ServiceName] = set()
+        """Wanted, and without room at the last look."""
         self._by_peer: dict[NodeName, tuple[dict[ServiceName, str], bool]] = {}
         """Peer -> (the type of each service that it offers, whether it drains)."""
         self._by_service: dict[ServiceName, dict[str, dict[NodeName, bool]]] = {}
@@ -78,15 +88,33 @@ class Offers:
                     events.append(self._withdraw(name, why))
             elif reached[name] != kind:
                 events.append(self._withdraw(name, f"its servers offer it as {reached[name]} now"))
+        refused: set[ServiceName] = set()
         for name, kind in reached.items():
             self._dark_until.pop(name, None)
-            if name not in self._offered:
+            if name in self._offered:
+                continue
+            if self._charge(name):
                 self._offered[name] = kind
                 events.append(OfferService(name, kind))
+            else:
+                refused.add(name)
+        if refused - self._refused:
+            self._stats.dropped["too_many_offers"] += len(refused - self._refused)
+        self._refused = refused
         return events
+
+    def _charge(self, name: ServiceName) -> bool:
+        """Take the service into the share of one of its servers; returns whether there is room."""
+        server = min(self._wanted[name][1], key=self._shares.held)
+        if not self._shares.fits(server):
+            return False
+        self._shares.take(server)
+        self._charged[name] = server
+        return True
 
     def _withdraw(self, name: ServiceName, reason: str) -> WithdrawService:
         del self._offered[name]
+        self._shares.give_back(self._charged.pop(name))
         self._dark_until.pop(name, None)
         return WithdrawService(name, reason)
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from sidecar.ros.ros_loop import RosLoop
     from sidecar.ros.stats import BridgeStats
 
-MAX_OFFERED_SERVICES = 512
-"""Services that peers may offer; each costs DDS endpoints and a slot in every wait."""
 DISCOVERY_SETTLES_S = 1.0
 """After joining the domain, nothing is offered for so long: servers that run here already must be discovered first."""
 NAME_IS_FREE_S = 0.15
@@ -72,10 +70,6 @@ class Proxies:
         if self._rules.find(event.name) is None:
             self._stats.dropped["offer_not_in_rules"] += 1
             log.error("service %s is offered, but no rule of this sidecar carries it", event.name)
-            return
-        if event.name not in self.offers and len(self.offers) >= MAX_OFFERED_SERVICES:
-            self._stats.dropped["too_many_offers"] += 1
-            log.error("service %s is not offered here: there are %d already", event.name, MAX_OFFERED_SERVICES)
             return
         if self.offers.get(event.name) != event.type:
             proxy = self._proxies.get(event.name)

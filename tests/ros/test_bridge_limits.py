@@ -58,15 +58,6 @@ def test_a_robot_that_fills_its_share_leaves_the_others_theirs(mesh: Mesh, monke
     assert mesh.result(greedy)["answered"] <= 20
 
 
-def test_more_services_than_may_be_offered(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.ros.proxies.MAX_OFFERED_SERVICES", 3)
-    mesh.start()
-    for number in range(5):
-        mesh.robot.handle(OfferService(ServiceName(f"/s{number}"), "std_srvs/srv/Empty"))
-    mesh.wait_carried("/s0", "/s1", "/s2")
-    assert mesh.robot.stats.dropped == {"too_many_offers": 2}
-
-
 def test_an_offer_that_no_rule_carries(mesh: Mesh) -> None:
     mesh.use_rules(ServiceRule("/plan", deadline_s=0.1, lifetime_s=1.0))
     mesh.start()

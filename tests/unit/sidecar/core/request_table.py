@@ -52,7 +52,7 @@ class Table:
         self._judged = 0
         self.sought: list[frozenset[NodeName]] = []
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
-        offers = Offers(Rules((self.rule,)))
+        offers = Offers(Rules((self.rule,)), self.stats)
         for one in (peer(A), peer(B, session=2)):
             offers.set_peer(one)
         self.mapping = MappingTable(self.routes)

@@ -103,6 +103,9 @@ def test_the_looks_of_all_peers_together_are_bounded_and_forgotten_with_them() -
             peers.restarted(restart(one.name, 10_000 + step, FORGED), step * 0.01)
     assert judge.looks <= ALL_LOOKS_AT_ONCE + 10 * ALL_LOOKS_PER_S + 1
     view_again(peers, many[0])
+    assert len(peers._budget._of_peer) > 2, "who leaves and comes back at once gets no new looks by it"
+    peers.restarted(restart(many[0].name, 20_000, FORGED), 20.0)
+    view_again(peers, many[0])
     assert len(peers._budget._of_peer) <= 2
 
 

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import pytest
+
 from protos.model import Peer, ServiceName, ServiceOffer
 from sidecar.core.events import OfferService, WithdrawService
-from sidecar.core.offers import WITHDRAW_AFTER_S, Offers
+from sidecar.core.offers import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
 from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules
+from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, TYPE, A, B, path, peer, rule
 
 if TYPE_CHECKING:
@@ -19,9 +22,10 @@ OTHER_TYPE = (ServiceOffer(ECHO, "t/srv/Other"),)
 class Robot:
     """Offers over routes that the test sets."""
 
-    def __init__(self, *peers: Peer, lifetime_s: float = 10.0) -> None:
+    def __init__(self, *peers: Peer, pattern: str = ECHO, lifetime_s: float = 10.0) -> None:
         self.routes = Routes()
-        self.offers = Offers(Rules((rule(ECHO, lifetime_s=lifetime_s),)))
+        self.stats = EngineStats()
+        self.offers = Offers(Rules((rule(pattern, lifetime_s=lifetime_s),)), self.stats)
         for known in (A, B):
             self.reach(known)
         self.set_peers(peers)
@@ -166,3 +170,29 @@ def test_a_service_gains_each_new_server_once() -> None:
     robot.set_peers([peer(B, session=2)])
     robot.set_peers([])
     assert robot.offers.take_gained() == set(), "a service that nobody offers any more has not gained"
+
+
+@pytest.mark.audit("sec-5")
+def test_a_cloud_that_offers_everything_leaves_room_for_what_others_offer() -> None:
+    many = tuple(ServiceOffer(ServiceName(f"/made_up_{number}"), TYPE) for number in range(2 * MAX_OFFERED))
+    robot = Robot(peer(A, offers=many), pattern="/*")
+    assert len(robot.update()) == MAX_OFFERED // 2
+    assert robot.stats.dropped["too_many_offers"] == len(many) - MAX_OFFERED // 2
+    robot.set_peers([peer(A, offers=many), peer(B, session=2)])
+    assert robot.update() == [OfferService(ECHO, TYPE)]
+    assert robot.stats.dropped["too_many_offers"] == len(many) - MAX_OFFERED // 2, "each is counted once"
+    assert robot.update() == []
+
+
+@pytest.mark.audit("sec-5")
+def test_what_found_no_room_is_offered_when_there_is_some() -> None:
+    many = tuple(ServiceOffer(ServiceName(f"/s{number}"), TYPE) for number in range(MAX_OFFERED))
+    robot = Robot(peer(A, offers=many), pattern="/*")
+    assert len(robot.update()) == MAX_OFFERED // 2
+    others = tuple(offer for offer in many if offer.name not in robot.offers.offered)
+    robot.set_peers([peer(A, offers=others)])
+    robot.update(10.0)
+    events = robot.update(10.0 + WITHDRAW_AFTER_S)
+    assert sum(isinstance(event, WithdrawService) for event in events) == MAX_OFFERED // 2
+    assert sum(isinstance(event, OfferService) for event in events) == MAX_OFFERED // 2
+    assert set(robot.offers.offered) == {offer.name for offer in others}
