@@ -66,6 +66,15 @@ class TlsFiles:
 
 def load_tls_files(directory: Path) -> TlsFiles:
     """Return the node's identity; raises ConfigError with one line that tells what to do."""
+    try:
+        return _load(directory)
+    except OSError as error:
+        # A folder that may not be entered, or is replaced while it is looked at.
+        path = str(error.filename or directory)
+        raise ConfigError(path, "", f"cannot be read: {error.strerror or error}") from error
+
+
+def _load(directory: Path) -> TlsFiles:
     if not directory.is_dir():
         raise ConfigError(str(directory), "", "expected a folder with cert.pem, key.pem and ca.pem; see: plr ca issue")
     _refuse_permissions(directory, directory.stat(), FORBIDDEN)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -199,6 +200,22 @@ def test_a_folder_that_vanishes_keeps_the_old_files(folder: Path) -> None:
     files = load_tls_files(folder)
     watch = TlsWatch(files)
     folder.rename(folder.with_name("elsewhere"))
+    assert [watch.poll() for _ in range(3)] == [None] * 3
+    assert watch.current is files
+
+
+@pytest.mark.parametrize("call", ["is_dir", "stat", "exists"])
+def test_a_folder_out_of_reach_keeps_the_old_files(folder: Path, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    """As when a folder above it may not be entered: root enters it all the same, so the system's answer is made up."""
+
+    def denied(path: Path, **_: object) -> NoReturn:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    files = load_tls_files(folder)
+    watch = TlsWatch(files)
+    monkeypatch.setattr(type(folder), call, denied)
+    with pytest.raises(ConfigError, match=f"{folder}.*: cannot be read: Permission denied"):
+        load_tls_files(folder)
     assert [watch.poll() for _ in range(3)] == [None] * 3
     assert watch.current is files
 
