@@ -260,8 +260,8 @@ def _common_name(value: str) -> str:
         text(value, "the name")
     except DecodeError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
-    if not 1 <= len(value) <= _MAX_COMMON_NAME:
-        raise argparse.ArgumentTypeError(f"expected 1 to {_MAX_COMMON_NAME} characters")
+    if not 1 <= len(value.encode()) <= _MAX_COMMON_NAME:
+        raise argparse.ArgumentTypeError(f"expected 1 to {_MAX_COMMON_NAME} bytes (UTF-8)")
     return value
 
 

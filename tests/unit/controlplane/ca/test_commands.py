@@ -137,7 +137,8 @@ def test_a_folder_that_can_not_be_written_is_one_line(shell: Shell, tmp_path: Pa
         (["issue", "robot-1", "--role", "robot", "--days", "0"], "a number of days"),
         (["issue", "robot-1", "--role", "robot", "--days", "nan"], "a number of days"),
         (["revoke", "robot-1", "--reason", "because"], "invalid choice"),
-        (["init", "--name", "n" * 65], "1 to 64 characters"),
+        (["init", "--name", "n" * 65], "1 to 64 bytes"),
+        (["init", "--name", "ä" * 33], "1 to 64 bytes"),
         (["init", "--name", "a\nb"], "not printable"),
     ],
 )
