@@ -19,10 +19,12 @@ denies it, or the plan misses its target, 2 bad usage
 from __future__ import annotations
 
 import argparse
+import base64
 import json
 import subprocess
 import sys
 import time
+from ipaddress import ip_address
 from typing import TYPE_CHECKING
 
 from google.protobuf import json_format
@@ -87,10 +89,21 @@ def _status(arguments: argparse.Namespace) -> int:
         sys.stderr.write(f"plr: {error}\n")
         return error.code
     if arguments.json:
-        print(json_format.MessageToJson(answer, preserving_proto_field_name=True))
+        print(_status_json(answer))
     else:
         print(status_table.render(sidecars, own, time.time()))
     return EXIT_OK
+
+
+def _status_json(answer: admin_pb2.GetStatusResponse) -> str:
+    """Return the answer in protobuf's JSON, but addresses as people write them: bytes would be base64."""
+    shown = json_format.MessageToDict(answer, preserving_proto_field_name=True)
+    for sidecar in shown.get("sidecars", ()):
+        for candidate in sidecar.get("peer", {}).get("candidates", ()):
+            address = candidate.get("address", {})
+            if "ip" in address:
+                address["ip"] = str(ip_address(base64.b64decode(address["ip"])))
+    return json.dumps(shown, indent=2)
 
 
 def _schema(arguments: argparse.Namespace) -> int:

@@ -28,6 +28,11 @@ def announce(policy: Policy | None) -> None:
     """Log what is in force."""
     if policy is None:
         log.warning("there is no policy: every robot may call, and every cloud may offer, every service")
+    elif not policy.calls or not policy.offers:
+        nobody = "no robot may call any service" if not policy.calls else "no cloud may offer any service"
+        log.warning(
+            "policy in force: rules for calls %d, for offers %d: %s", len(policy.calls), len(policy.offers), nobody
+        )
     else:
         log.info("policy in force: rules for calls %d, for offers %d", len(policy.calls), len(policy.offers))
 

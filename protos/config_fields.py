@@ -18,13 +18,13 @@ _UNSPECIFIED = ("0.0.0.0", "::")  # noqa: S104 - refused, not listened on
 
 def split_host_port(text: str) -> tuple[str, int]:
     """Split host:port (name, IPv4, or IPv6 in brackets); raises ValueError that says what was expected."""
+    if "//" in text:
+        raise ValueError(f"expected host:port without {text.partition('//')[0]}//, got {text!r}")
     host, _, port = text.rpartition(":")
     if not host or not _PORT.fullmatch(port) or int(port) > _MAX_PORT:
         raise ValueError(f"expected host:port with a port up to {_MAX_PORT}, got {text!r}")
     if host.startswith("[") and host.endswith("]"):
         return canonical_ip(host[1:-1]), int(port)
-    if "//" in host:
-        raise ValueError(f"expected host:port without {text.partition('//')[0]}//, got {text!r}")
     if ":" in host:
         raise ValueError(f"expected an IPv6 address in brackets, as in [2001:db8::1]:50051, got {text!r}")
     if not _HOST.fullmatch(host):

@@ -124,17 +124,17 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
     )
 
 
-def read_guarded(path: Path, forbidden: int) -> bytes:
-    """Return what the file holds; raises ConfigError, also if it has any of the `forbidden` permissions."""
+def read_guarded(path: Path, forbidden: int, *, most: int = MAX_FILE_BYTES) -> bytes:
+    """Return what the file holds, `most` bytes; raises ConfigError, also if it has any `forbidden` permission."""
     try:
         with path.open("rb") as file:
             # What was opened is checked, not what stood under the name a moment before.
             _refuse_permissions(path, os.fstat(file.fileno()), forbidden)
-            data = file.read(MAX_FILE_BYTES + 1)
+            data = file.read(most + 1)
     except OSError as error:
         raise ConfigError(str(path), "", f"cannot be read: {error.strerror or error}") from error
-    if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(str(path), "", f"expected at most {MAX_FILE_BYTES} bytes")
+    if len(data) > most:
+        raise ConfigError(str(path), "", f"expected at most {most} bytes")
     return data
 
 

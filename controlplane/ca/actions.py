@@ -55,9 +55,9 @@ def issue(arguments: argparse.Namespace) -> None:
     role = IdentityRole(arguments.role)
     with folder.locked() as authority:
         out = arguments.out or folder.node_folder(arguments.name)
-        refuse_taken(out, arguments.name)
+        refuse_taken(out, arguments.name, own=arguments.out is None)
         issued = authority.issue(arguments.name, role, days=arguments.days)
-        folder.save(authority)
+        save(folder, authority)
         write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
     until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
     say(f"issued {arguments.name} ({role.value}), good until {until}: {out}")
@@ -69,10 +69,10 @@ def renew(arguments: argparse.Namespace) -> None:
     with folder.locked() as authority:
         out = arguments.out or folder.node_folder(arguments.name)
         last = authority.latest(arguments.name)
-        refuse_taken(out, arguments.name)
+        refuse_taken(out, arguments.name, own=arguments.out is None)
         key = kept_key(out) if arguments.keep_key else None
         issued = authority.renew(arguments.name, days=arguments.days, key=key)
-        folder.save(authority)
+        save(folder, authority)
         write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
     until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
     say(f"renewed {arguments.name} ({last.role.value}), good until {until}: {out}")
@@ -83,7 +83,7 @@ def revoke(arguments: argparse.Namespace) -> None:
     folder = opened(arguments)
     with folder.locked() as authority:
         revoked = authority.revoke(arguments.name, x509.ReasonFlags(arguments.reason))
-        folder.save(authority)
+        save(folder, authority)
     where = "copy to the control plane's tls_dir, or any node's"
     say(f"revoked {len(revoked)} of {arguments.name}; {where}: {folder.path / CRL_FILE}")
 
@@ -93,7 +93,7 @@ def publish(arguments: argparse.Namespace) -> None:
     folder = opened(arguments)
     with folder.locked() as authority:
         authority.publish()
-        folder.save(authority)
+        save(folder, authority)
     say(f"signed revocation list {authority.crl_number}; copy to any node's tls_dir: {folder.path / CRL_FILE}")
 
 
@@ -109,7 +109,7 @@ def rotate(arguments: argparse.Namespace) -> None:
     folder = opened(arguments)
     with folder.locked() as authority:
         authority.rotate(arguments.name, days=arguments.days)
-        folder.save(authority)
+        save(folder, authority)
     files = f"{folder.path / CA_FILE} and {folder.path / CRL_FILE}"
     say(f"made the CA {arguments.name}; before renewing any node, copy to every tls_dir: {files}")
 
@@ -119,7 +119,7 @@ def retire(arguments: argparse.Namespace) -> None:
     folder = opened(arguments)
     with folder.locked() as authority:
         authority.retire()
-        folder.save(authority)
+        save(folder, authority)
     say(f"retired; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}")
 
 
@@ -146,19 +146,33 @@ def opened(arguments: argparse.Namespace, *, warn: bool = True) -> AuthorityFold
     if max(protections) is Protection.CLEAR:
         if arguments.passphrase_file is not None:
             raise ConfigError(str(folder.path), "", f"the CA's key has no passphrase; leave out {_OPTION}")
-        return folder
+        return AuthorityFolder(arguments.dir, on_wait=_tell_of_wait)
     source = PassphraseSource("passphrase of the CA's key", _OPTION, VARIABLE, arguments.passphrase_file)
-    return AuthorityFolder(arguments.dir, source.get())
+    return AuthorityFolder(arguments.dir, source.get(), _tell_of_wait)
+
+
+def _tell_of_wait() -> None:
+    sys.stderr.write("plr: another plr ca command is at work here; waiting for it\n")
+    sys.stderr.flush()
 
 
 def _mend(arguments: argparse.Namespace) -> str:
     return shlex.join(["plr", "ca", "passphrase", "--dir", str(arguments.dir)])
 
 
-def refuse_taken(out: Path, name: str) -> None:
-    """Raise AuthorityError if the folder holds the key or the certificate of a node with another name."""
+def save(folder: AuthorityFolder, authority: Authority) -> None:
+    """Keep the CA as it is now, and warn of nodes' folders that could not be brought up to date; raises OSError."""
+    for problem in folder.save(authority):
+        sys.stderr.write(f"plr: warning: {problem}\n")
+
+
+def refuse_taken(out: Path, name: str, *, own: bool) -> None:
+    """Raise AuthorityError if the folder holds the key or the certificate of a node with another name.
+
+    `own`: it is the CA's folder for this name, where a key without certificate is left of a command cut short.
+    """
     path = out / CERTIFICATE_FILE
-    if not ((out / KEY_FILE).exists() or path.exists()):
+    if not path.exists() and (own or not (out / KEY_FILE).exists()):
         return
     try:
         certificate = x509.load_pem_x509_certificate(path.read_bytes())
@@ -176,5 +190,6 @@ def kept_key(out: Path) -> ec.EllipticCurvePrivateKey:
 
 
 def say(line: str) -> None:
-    """Print a line of what was done."""
-    sys.stdout.write(f"{line}\n")
+    """Print a line of what was done; nowhere, if there is no standard output."""
+    if sys.stdout is not None:
+        sys.stdout.write(f"{line}\n")

@@ -20,6 +20,7 @@ from controlplane.ca.certificates import (
 from controlplane.ca.files import write_tls_files
 from controlplane.ca.index import Entry, Record
 from controlplane.ca.request import fingerprint
+from protos.identity import MAX_CA_CERTIFICATES
 from protos.names import node_name
 
 if TYPE_CHECKING:
@@ -121,7 +122,10 @@ class Authority:
         """
         name = request.name
         self._refuse_key(
-            name, fingerprint(request.key), "the request's key", f"make another on the node: plr request {name}"
+            name,
+            fingerprint(request.key),
+            "the request's key",
+            f"make another on the node: plr request {name} --role ...",
         )
         if not renewing:
             self._refuse_in_force(name, "plr ca sign --renew")
@@ -167,7 +171,27 @@ class Authority:
                 revoked.append(self.entries[place])
         if revoked:
             self.crl_number += 1
+            self.published_at = now
         return revoked
+
+    def adopt(self, lists: Iterable[x509.CertificateRevocationList]) -> None:
+        """Take over what this CA has signed already and does not remember, as a command was cut short in between.
+
+        A node may have that list: what it revokes stays revoked, and the next one has a higher number.
+        """
+        for one in lists:
+            if one.issuer != self.own.certificate.subject or not one.is_signature_valid(self.own.key.public_key()):
+                continue
+            number = one.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
+            if number <= self.crl_number:
+                continue
+            self.crl_number = number
+            self.published_at = one.last_update_utc.timestamp()
+            for place, entry in enumerate(self.entries):
+                revoked = one.get_revoked_certificate_by_serial_number(entry.serial)
+                if revoked is not None and entry.revoked_at is None:
+                    at = revoked.revocation_date_utc.timestamp()
+                    self.entries[place] = dataclasses.replace(entry, revoked_at=at, reason=_reason(revoked))
 
     def publish(self) -> None:
         """Sign the revocation lists again, unchanged, so that nodes can see that they miss none.
@@ -187,6 +211,8 @@ class Authority:
 
         No node can show a certificate of the new CA before the others have its `ca_pem`.
         """
+        if len(self.former) + 1 >= MAX_CA_CERTIFICATES:
+            raise AuthorityError(f"nodes believe {MAX_CA_CERTIFICATES} CAs at most; do first: plr ca retire")
         before = Authority(self.own, self.entries, self.crl_number, clock=self._clock, published_at=self.published_at)
         self.own, self.entries, self.crl_number, self.published_at = _own(name, days, self._clock()), [], 0, None
         self.former.insert(0, before)
@@ -233,7 +259,8 @@ class Authority:
             (entry.serial, entry.revoked_at, entry.reason) for entry in self.entries if entry.revoked_at is not None
         ]
         begin = self.own.certificate.not_valid_before_utc.timestamp()
-        signed_at = max((self.published_at or begin, *(revoked_at for _, revoked_at, _ in revoked)))
+        # Older versions noted no time when they revoked.
+        signed_at = self.published_at or max((begin, *(revoked_at for _, revoked_at, _ in revoked)))
         validity = Validity(signed_at, self.not_after)
         return build_revocation_list(self.own, self.crl_number, revoked, validity).public_bytes(Encoding.PEM)
 
@@ -277,6 +304,13 @@ class Authority:
             )
         )
         return certificate
+
+
+def _reason(revoked: x509.RevokedCertificate) -> str:
+    try:
+        return revoked.extensions.get_extension_for_class(x509.CRLReason).value.reason.value
+    except x509.ExtensionNotFound:
+        return x509.ReasonFlags.unspecified.value
 
 
 def _own(name: str, days: float, now: float) -> Issued:

@@ -15,6 +15,7 @@ import contextlib
 import enum
 import fcntl
 import os
+import re
 import shutil
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,7 @@ from protos.errors import ConfigError
 from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -40,6 +41,13 @@ INDEX_FILE = "index.json"
 AUTHORITIES = "authorities"
 NODES = "nodes"
 _LOCK_FILE = ".lock"
+_PEM_LIST = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", re.DOTALL)
+
+MAX_INDEX_BYTES = 64 << 20
+"""Some 200,000 certificates; what would be more is not written."""
+
+_TEMPORARY = re.compile(r"\.(index\.json|(ca|crl|cert|key)\.pem)\.[^.]{8}")
+"""What a command leaves behind that was cut short while it wrote a file: maybe a key."""
 
 NOT_THE_OWNER = 0o077
 """Permissions that nothing of a CA's has to have."""
@@ -57,16 +65,20 @@ class Protection(enum.IntEnum):
 class AuthorityFolder:
     """Where a CA is kept; `passphrase` is for its private keys."""
 
-    def __init__(self, path: Path, passphrase: bytes | None = None) -> None:
+    def __init__(self, path: Path, passphrase: bytes | None = None, on_wait: Callable[[], None] = lambda: None) -> None:
+        """`on_wait` is called when another command is at work here, before it is waited for."""
         self.path = path
         self._passphrase = passphrase
+        self._on_wait = on_wait
 
     def node_folder(self, name: str) -> Path:
         """Where a node's files go unless told otherwise."""
         return self.path / NODES / name
 
     def create(self, authority: Authority) -> None:
-        """Keep a new CA; raises ConfigError if there is one, and OSError."""
+        """Keep a new CA; raises ConfigError if there is one, or the folder holds anything else, and OSError."""
+        self.refuse_existing()
+        self._refuse_other_things()
         self.path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
         self.path.chmod(PRIVATE_FOLDER)
         with self._lock():
@@ -77,6 +89,14 @@ class AuthorityFolder:
         """Raise ConfigError if there is a CA."""
         if (self.path / INDEX_FILE).exists():
             raise ConfigError(str(self.path), "", "there is a CA already; another one needs another --dir")
+
+    def _refuse_other_things(self) -> None:
+        """The folder will be its owner's alone: it must not be one that others use."""
+        own = {AUTHORITIES, NODES, CA_FILE, CRL_FILE, _LOCK_FILE}
+        if self.path.exists() and any(
+            each.name not in own and not _TEMPORARY.fullmatch(each.name) for each in self.path.iterdir()
+        ):
+            raise ConfigError(str(self.path), "", "holds other things; a CA needs a --dir of its own")
 
     def protections(self) -> list[Protection]:
         """Return how each of the CAs' keys is kept; raises ConfigError."""
@@ -93,6 +113,7 @@ class AuthorityFolder:
         """
         self._check()
         with self._lock():
+            self._sweep()
             keys = [(path, self._open(path, new)) for path in map(self._key_path, self.records())]
             for path, key in keys:
                 write_atomically(path, _key_pem(key, new), PRIVATE_FILE)
@@ -112,15 +133,35 @@ class AuthorityFolder:
         """Load the CA and keep other commands from changing it meanwhile; raises ConfigError."""
         self._check()
         with self._lock():
+            self._sweep()
+            lists = self._lists()
             first, *former = (self._load(record) for record in self.records())
             first.former = former
+            for each in (first, *former):
+                each.adopt(lists)
             yield first
+
+    def _sweep(self) -> None:
+        """Delete what commands left behind that were cut short."""
+        for folder in (self.path, *(self.path / AUTHORITIES).glob("*"), *(self.path / NODES).glob("*")):
+            with contextlib.suppress(OSError):
+                for path in folder.iterdir():
+                    if _TEMPORARY.fullmatch(path.name):
+                        path.unlink()
+
+    def _lists(self) -> tuple[x509.CertificateRevocationList, ...]:
+        """Return the revocation lists that stand here: of a command cut short, nodes may have them already."""
+        try:
+            pem = (self.path / CRL_FILE).read_bytes()
+            return tuple(x509.load_pem_x509_crl(one) for one in _PEM_LIST.findall(pem))
+        except (OSError, ValueError):
+            return ()
 
     def records(self) -> tuple[Record, ...]:
         """Return what the CAs have done, the one that issues first; needs no passphrase. Raises ConfigError."""
         self._check()
         path = self.path / INDEX_FILE
-        return decode_index(read_guarded(path, NOT_THE_OWNER), path)
+        return decode_index(read_guarded(path, NOT_THE_OWNER, most=MAX_INDEX_BYTES), path)
 
     def certificate(self, record: Record) -> x509.Certificate:
         """Return the certificate of a CA that is kept here; raises ConfigError."""
@@ -130,31 +171,46 @@ class AuthorityFolder:
         except ValueError as error:
             raise ConfigError(str(path), "", "expected a certificate in PEM") from error
 
-    def save(self, authority: Authority) -> None:
-        """Keep the CA as it is now; raises OSError.
+    def save(self, authority: Authority) -> list[str]:
+        """Keep the CA as it is now; returns nodes' folders that could not be brought up to date, and why.
 
-        The revocation list is written before the index: cut short in between, revoking again completes it. The other
-        way round the certificate would count as revoked, and no node would hear of it.
+        The revocation list is written before the index: cut short in between, the next command takes it for done. The
+        other way round the certificate would count as revoked, and no node would hear of it.
+
+        Raises:
+            OSError: a file of the CA's own cannot be written.
+            ConfigError: the index has become too long; nothing was written.
         """
         records = [each.record() for each in (authority, *authority.former)]
+        index = encode_index(records)
+        if len(index) > MAX_INDEX_BYTES:
+            raise ConfigError(
+                str(self.path / INDEX_FILE), "", "it is full; do: plr ca rotate, renew every node, plr ca retire"
+            )
         for each, record in zip((authority, *authority.former), records, strict=True):
             self._keep_key(each, self._own_folder(record))
         write_atomically(self.path / CRL_FILE, authority.crl_pem(), PUBLIC_FILE)
-        write_atomically(self.path / INDEX_FILE, encode_index(records), PRIVATE_FILE)
+        write_atomically(self.path / INDEX_FILE, index, PRIVATE_FILE)
         write_atomically(self.path / CA_FILE, authority.ca_pem, PUBLIC_FILE)
-        self._refresh_nodes()
+        problems = self._refresh_nodes()
         kept = {self._own_folder(record) for record in records}
         for path in (self.path / AUTHORITIES).iterdir():
             if path not in kept:
                 shutil.rmtree(path)
+        return problems
 
-    def _refresh_nodes(self) -> None:
+    def _refresh_nodes(self) -> list[str]:
         """Give every node's folder the CAs and revocations of now: whoever copies it again takes nothing back."""
+        problems = []
         for name in (CA_FILE, CRL_FILE):
             data = (self.path / name).read_bytes()
             for path in (self.path / NODES).glob(f"*/{name}"):
-                if path.read_bytes() != data:
-                    write_atomically(path, data, PUBLIC_FILE)
+                try:
+                    if path.read_bytes() != data:
+                        write_atomically(path, data, PUBLIC_FILE)
+                except OSError as error:
+                    problems.append(f"{path}: not brought up to date: {error.strerror or error}")
+        return problems
 
     def _keep_key(self, authority: Authority, folder: Path) -> None:
         if (folder / KEY_FILE).exists():
@@ -193,7 +249,11 @@ class AuthorityFolder:
     def _lock(self) -> Iterator[None]:
         descriptor = os.open(self.path / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, PRIVATE_FILE)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                self._on_wait()
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
             yield
         finally:
             os.close(descriptor)

@@ -65,7 +65,7 @@ class PassphraseSource:
         return passphrase
 
     def _expect_terminal(self, way_out: str) -> None:
-        if not sys.stdin.isatty():
+        if sys.stdin is None or not sys.stdin.isatty():
             problem = f"there is no terminal to ask for it; give {self.option} FILE or set {self.variable}{way_out}"
             raise ConfigError(self.what, "", problem)
 

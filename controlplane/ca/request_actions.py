@@ -9,7 +9,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from controlplane.ca import listing
-from controlplane.ca.actions import kept_key, opened, refuse_taken, say
+from controlplane.ca.actions import kept_key, opened, refuse_taken, save, say
 from controlplane.ca.authority import AuthorityError
 from controlplane.ca.certificates import generate_key
 from controlplane.ca.files import PRIVATE_FILE, PUBLIC_FILE, make_private, write_atomically, write_certificate
@@ -57,9 +57,9 @@ def sign(arguments: argparse.Namespace) -> None:
         out = arguments.out or folder.node_folder(asked.name)
         if (out / KEY_FILE).exists():
             raise AuthorityError(f"{out}: holds a key, and not the request's; delete it or give another --out")
-        refuse_taken(out, asked.name)
+        refuse_taken(out, asked.name, own=arguments.out is None)
         certificate = authority.sign(asked, renewing=arguments.renew, days=arguments.days)
-        folder.save(authority)
+        save(folder, authority)
         write_certificate(out, certificate.public_bytes(Encoding.PEM), authority.ca_pem, authority.crl_pem())
     until = listing.day(certificate.not_valid_after_utc.timestamp())
     say(f"signed {asked.name} ({asked.role.value}), good until {until}; copy to where its key is: {out}")
@@ -77,7 +77,9 @@ def _new_key(out: Path) -> ec.EllipticCurvePrivateKey:
 def _own_key(out: Path, name: str) -> ec.EllipticCurvePrivateKey:
     key = kept_key(out)
     if not isinstance(key.curve, ec.SECP256R1):
-        raise AuthorityError(f"{out / KEY_FILE}: not on P-256; make another without --keep-key: plr request {name}")
+        raise AuthorityError(
+            f"{out / KEY_FILE}: not on P-256; make another without --keep-key: plr request {name} --role ..."
+        )
     return key
 
 
@@ -102,7 +104,7 @@ def _confirm(arguments: argparse.Namespace, asked: Request, records: Iterable[Re
             raise AuthorityError(f"{arguments.request}: asks for the {what} {found}, not {wanted}; nothing was signed")
     if arguments.name is not None and arguments.role is not None:
         return
-    if not sys.stdin.isatty():
+    if sys.stdin is None or not sys.stdin.isatty():
         problem = f"asks for the name {name} and the role {role}, and there is no terminal to confirm that"
         raise ConfigError(str(arguments.request), "", f"{problem}; give --name and --role")
     sys.stderr.write(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 import socket
 import subprocess
 import sys
 import time
 import urllib.request
+from ipaddress import ip_address
 
 import grpc
 import pytest
@@ -105,3 +107,10 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
     assert re.search(r"^robot +robot +open .* rejected ", table, re.MULTILINE)
     assert "not this one" in table
     assert '"SYNC_STATE_REJECTED"' in as_json
+    addresses = [
+        candidate["address"]["ip"]
+        for sidecar in json.loads(as_json)["sidecars"]
+        for candidate in sidecar["peer"].get("candidates", [])
+    ]
+    assert addresses
+    assert all(ip_address(address) for address in addresses), "as people write them, not base64"

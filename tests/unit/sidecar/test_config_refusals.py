@@ -108,6 +108,7 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (ROBOT | {"control_plane": "plr.example.org:65536"}, "control_plane", "up to 65535"),
     (ROBOT | {"control_plane": "::1:50051"}, "control_plane", "in brackets"),
     (ROBOT | {"control_plane": "http://plr:50051"}, "control_plane", "without http://"),
+    (ROBOT | {"control_plane": "https://plr.example.org"}, "control_plane", "expected host:port without https://"),
     (ROBOT | {"control_plane": "-plr:50051"}, "control_plane", "host name"),
     (ROBOT | {"control_plane": []}, "control_plane", "a list of 1 to 8"),
     (ROBOT | {"control_plane": [f"c{n}:1" for n in range(9)]}, "control_plane", "a list of 1 to 8"),
