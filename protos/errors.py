@@ -15,3 +15,7 @@ class ConfigError(ValueError):
         self.source = source
         self.key = key
         self.problem = problem
+
+
+class StartError(ConfigError):
+    """A configuration that may be right cannot be had here and now, such as a port that somebody else has."""

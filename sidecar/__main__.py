@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from protos.certificate_term import term_problem
-from protos.errors import ConfigError
+from protos.errors import ConfigError, StartError
 from protos.tls_files import load_tls_files
 from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
 from sidecar.logging_setup import Logging
@@ -49,7 +49,7 @@ examples:
 
 exit codes:
   0  stopped as asked, or the configuration is right
-  1  failed while running; the log says why
+  1  failed while running, or cannot have a port or its state_dir now; the log says why
   2  wrong usage or configuration; one line on stderr names the file, the key and what was expected
 """
 
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # What is found out later than the file is read does not know its name; without a key it is another file's.
         located = ConfigError(str(options.config), error.key, error.problem) if error.key else error
         sys.stderr.write(f"{PROGRAM}: {located}\n")
-        return EXIT_BAD_CONFIG
+        return EXIT_FAILURE if isinstance(error, StartError) else EXIT_BAD_CONFIG
 
 
 def _parser() -> argparse.ArgumentParser:

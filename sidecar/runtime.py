@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from protos import interpreter
 from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
-from protos.errors import ConfigError
+from protos.errors import ConfigError, StartError
 from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Role, Version
 from protos.notifier import Notifier
 from protos.tls_files import TlsWatch, load_tls_files
@@ -238,7 +238,7 @@ class Sidecar:
             self._metrics = serve_metrics(listen, sources)
         except OSError as error:
             problem = f"expected an address and port to listen on, got '{listen}': {error.strerror or error}"
-            raise ConfigError("the configuration", "metrics_listen", problem) from error
+            raise StartError("the configuration", "metrics_listen", problem) from error
 
     def _restore(self, held: Apply, error: str | None) -> None:
         if error:
@@ -354,7 +354,7 @@ def _open_store(config: SidecarConfig) -> StateStore:
     try:
         return StateStore(config.state_dir, config.node_name)
     except StateDirError as error:
-        raise ConfigError("the configuration", "state_dir", f"{error} ({config.state_dir})") from error
+        raise StartError("the configuration", "state_dir", f"{error} ({config.state_dir})") from error
 
 
 def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:

@@ -293,14 +293,14 @@ def test_a_mapping_on_disk_is_in_force_as_soon_as_it_fits_and_stays_on_the_disk(
 
 
 @pytest.mark.ros
-def test_what_another_program_holds_is_exit_2_and_says_which_key(program: Program) -> None:
+def test_what_cannot_be_had_now_is_exit_1_and_says_which_key(program: Program) -> None:
     host, port = str(program.config["metrics_listen"]).split(":")
     with socket.create_server((host, int(port))):
         program.start()
-        assert program.end() == 2
+        assert program.end() == 1
     assert f"plr-sidecar: {program.path}: metrics_listen: " in program.log
     store = StateStore(Path(program.config["state_dir"]), NodeName("robot-1"))
     program.start()
-    assert program.end() == 2
+    assert program.end() == 1
     store.close()
     assert f"plr-sidecar: {program.path}: state_dir: expected a folder of its own" in program.log
