@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from protos import interpreter
 from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
-from protos.errors import ConfigError, StartError
+from protos.errors import StartError
 from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Role, Version
 from protos.notifier import Notifier
 from protos.tls_files import TlsWatch, load_tls_files
@@ -361,7 +361,7 @@ def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
     """Run a sidecar until `stopping` is set; returns the exit code.
 
     Raises:
-        ConfigError: the configuration does not fit this machine.
+        StartError: an address or the state folder cannot be had now.
     """
     if config.insecure:
         log.warning("insecure: true: the control plane and every peer are believed to be who they say")
