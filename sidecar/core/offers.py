@@ -37,7 +37,7 @@ class Offers:
         self._offered: dict[ServiceName, str] = {}
         self._shares = Shares(MAX_OFFERED)
         self._charged: dict[ServiceName, NodeName] = {}
-        """In whose share each offered service is: of its servers then, the one that had the fewest."""
+        """In whose share each offered service is: one of its servers then."""
         self._refused: set[ServiceName] = set()
         """Wanted, and without room at the last look."""
         self._by_peer: dict[NodeName, tuple[dict[ServiceName, str], bool]] = {}
@@ -89,11 +89,12 @@ class Offers:
             elif reached[name] != kind:
                 events.append(self._withdraw(name, f"its servers offer it as {reached[name]} now"))
         refused: set[ServiceName] = set()
+        full: set[NodeName] = set()
         for name, kind in reached.items():
             self._dark_until.pop(name, None)
             if name in self._offered:
                 continue
-            if self._charge(name):
+            if self._charge(name, full):
                 self._offered[name] = kind
                 events.append(OfferService(name, kind))
             else:
@@ -103,14 +104,22 @@ class Offers:
         self._refused = refused
         return events
 
-    def _charge(self, name: ServiceName) -> bool:
-        """Take the service into the share of one of its servers; returns whether there is room."""
-        server = min(self._wanted[name][1], key=self._shares.held)
-        if not self._shares.fits(server):
-            return False
-        self._shares.take(server)
-        self._charged[name] = server
-        return True
+    def _charge(self, name: ServiceName, full: set[NodeName]) -> bool:
+        """Take the service into the share of one of its servers that has room; `full` are those that had none.
+
+        Servers take turns: looking for the one with the smallest share costs a look at each for each service.
+        """
+        servers = self._wanted[name][1]
+        first = len(self._offered) % len(servers)
+        for server in (*servers[first:], *servers[:first]):
+            if server in full:
+                continue
+            if self._shares.fits(server):
+                self._shares.take(server)
+                self._charged[name] = server
+                return True
+            full.add(server)
+        return False
 
     def _withdraw(self, name: ServiceName, reason: str) -> WithdrawService:
         del self._offered[name]

@@ -52,7 +52,12 @@ def test_a_robot_that_fills_its_share_leaves_the_others_theirs(mesh: Mesh, monke
     mesh.serve("--plan", "/slow", "--busy-s", "0.5")
     mesh.wait_carried("/plan", "/slow")
     greedy = mesh.call("/slow", "--count", "100", "--timeout-s", "20")
-    wait_until(lambda: mesh.cloud.stats.pending >= 9, "the share to be full")
+    slow, stats = ServiceName("/slow"), mesh.cloud.stats
+    wait_until(
+        lambda: stats.requests_sent[slow] + stats.refused[slow, "overloaded"] >= 100,
+        "all of them to be here or refused",
+    )
+    assert stats.refused[slow, "overloaded"]
     mesh.link.asker = NodeName("another")
     assert mesh.result(mesh.call("/plan", "--count", "5"))["answered"] == 5
     assert mesh.result(greedy)["answered"] <= 20
