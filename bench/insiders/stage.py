@@ -8,7 +8,9 @@ control ────────────────────────
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.attacker.orders import ORDERS, TALLY, Orders
@@ -18,8 +20,6 @@ from bench.system import CONTROL_METRICS_PORT, CONTROL_PORT, METRICS_PORT, Syste
 from protos.identity import IdentityRole
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from bench.netlab import HostSpec
     from bench.system import Part
 
@@ -78,6 +78,18 @@ def make_lab(seed: int) -> Lab:
     return Lab(LabConfig(robots=tuple(robot(name) for name in ROBOTS), clouds=clouds), seed=seed)
 
 
+def yield_processors(part: Part) -> None:
+    """Let a program run only on processors that nobody else wants (SCHED_IDLE, sched(7)), as it is now and will be.
+
+    An insider attacks from a machine of its own. Here it shares two processors with those whom it attacks, and its
+    threads would take turns of theirs that no packet of it could take.
+    """
+    pid = part.process.inner_pid
+    assert pid is not None, part.name
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        os.sched_setscheduler(int(thread.name), os.SCHED_IDLE, os.sched_param(0))
+
+
 class Stage:
     """The running system."""
 
@@ -115,6 +127,8 @@ class Stage:
             self.system.wait_for_offer(part)
         self.system.wait("every path to be up", self._all_up)
         self._start_streams()
+        for name in INSIDERS:
+            yield_processors(self.system.parts[name])
 
     def _start_robot(self, name: str) -> Part:
         part = self.system.start_robot([SERVICE], name=name_of(name), host=name)
