@@ -5,6 +5,7 @@ examples:
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
   make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
   make bench-insiders BENCH_ARGS='--minutes 2'              a robot and a cloud of the fleet attack the others
+  make bench-control BENCH_ARGS='--size 500'                a fleet's control streams at one control plane
   make bench-quick                                         15 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
   python -m bench report --out bench/results               verdicts, page and summary anew from the records of runs
@@ -19,6 +20,7 @@ import argparse
 import sys
 
 from bench.churn import command as churn
+from bench.control import command as control
 from bench.dataplane import command as dataplane
 from bench.evaluation import command as evaluate
 from bench.evaluation import report_command as report
@@ -38,6 +40,9 @@ def main() -> int:
     insiders.add_arguments(
         commands.add_parser("insiders", help="two members attack all the others in every way at once")
     )
+    control.add_arguments(
+        commands.add_parser("control", help="the control plane with 500 to 4,000 sidecars: starts, load, a dead server")
+    )
     matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
     scenarios.add_arguments(commands.add_parser("scenarios", help="what is replayed; the generator beside traces"))
     evaluate.add_arguments(commands.add_parser("evaluate", help="the system beside others on replayed networks"))
@@ -45,10 +50,11 @@ def main() -> int:
     given = (
         [sys.argv[1:]]
         if sys.argv[1:]
-        else [[name] for name in ("dataplane", "churn", "insiders", "matcher", "evaluate")]
+        else [[name] for name in ("dataplane", "churn", "insiders", "control", "matcher", "evaluate")]
     )
     runs = {
         "churn": churn.run,
+        "control": control.run,
         "dataplane": dataplane.run,
         "evaluate": evaluate.run,
         "insiders": insiders.run,

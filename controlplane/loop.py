@@ -7,6 +7,7 @@ import concurrent.futures
 import logging
 import time
 from collections import Counter
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from controlplane.core.claims import check_claims, check_unproven_claims
@@ -67,6 +68,23 @@ def wall_clock_epoch() -> int:
 def _few(services: Sequence[ServiceName]) -> str:
     more = len(services) - MAX_SERVICES_LOGGED
     return ", ".join(services[:MAX_SERVICES_LOGGED]) + (f" and {more} more" if more > 0 else "")
+
+
+@dataclass(slots=True)
+class Used:
+    """Processor time of the loop's thread and the time when it was read, in seconds."""
+
+    processor_s: float
+    at: float
+
+    def share(self, processor_s: float, now: float) -> float | None:
+        """The share of one core since the last look; None if that was a moment ago."""
+        passed_s = now - self.at
+        if passed_s < METRICS_INTERVAL_S / 2:
+            return None
+        share = (processor_s - self.processor_s) / passed_s
+        self.processor_s, self.at = processor_s, now
+        return share
 
 
 class _LateMatcher:
@@ -240,6 +258,7 @@ class ControlLoop:
     async def run(self) -> None:
         """Run until `stop`."""
         metrics_at = self._loop.time()
+        used = Used(time.thread_time(), metrics_at)
         self._executor.submit(self._matcher.solve, Problem(()), 0.0, Plan({}))
         async with asyncio.TaskGroup() as solving:
             while not self._stopping:
@@ -250,6 +269,7 @@ class ControlLoop:
                 if picture is not None:
                     solving.create_task(self._solve(picture))
                 if now >= metrics_at:
+                    self._core.follow_load(used.share(time.thread_time(), now))
                     self._update_metrics(now)
                     metrics_at = now + METRICS_INTERVAL_S
                 self._dispatch_quietly()

@@ -75,6 +75,7 @@ class ControlPlaneService:
         self._report_interval_s = report_interval_s
         self._caller = caller
         self._streams = StreamCount()
+        self._turn = asyncio.Lock()
 
     def add_to(self, server: grpc.aio.Server) -> None:
         """Serve on this server."""
@@ -128,7 +129,10 @@ class ControlPlaneService:
         registration = _parse(data)
         if not isinstance(registration, Registration):
             raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
-        result = self._loop.register(registration, caller)
+        async with self._turn:
+            # One in each turn of the loop: the messages of those who are registered already come between two.
+            await asyncio.sleep(0)
+            result = self._loop.register(registration, caller)
         if isinstance(result, Refusal):
             raise _StreamEndError(_REFUSAL_CODES[result], f"{registration.name}: {result.value}")
         return result

@@ -11,6 +11,7 @@ bound its end of the Unix socket to; the gate tells whose certificate stands beh
 from __future__ import annotations
 
 import asyncio
+import asyncio.sslproto
 import contextlib
 import ipaddress
 import logging
@@ -67,6 +68,10 @@ LAST_WORDS_S = 0.5
 ACCEPT_PAUSE_S = 0.1
 """After the system refused to accept: it is out of descriptors, and will be for a moment."""
 
+asyncio.sslproto.SSLProtocol.max_size = 16 * 1024
+"""Each TLS connection holds a buffer of so many bytes, of 256 kB by default: a TLS record, and more than any message of
+a small fleet. There is no other way to say it."""
+
 TOO_MANY_HANDSHAKES = "too_many_handshakes"
 TOO_MANY_CONNECTIONS = "too_many_connections"
 TELL_AGAIN_S = 60.0
@@ -114,7 +119,11 @@ class TlsGate:
         """Of the silent ones."""
         self._silent = HalfOpen(MAX_SILENT, MAX_SILENT_PER_SOURCE)
         self._handshakes = HalfOpen(MAX_HANDSHAKES, MAX_HANDSHAKES_PER_SOURCE)
+        self._turn = asyncio.Lock()
+        """Fair: who waits longest is next."""
         self._connections: OrderedDict[str, _Connection] = OrderedDict()
+        self._of_name: dict[NodeName, OrderedDict[str, None]] = {}
+        """The same by the certificate's name, oldest first."""
         # Never the same name twice, in this process or another of this host: a stale one must not become somebody else.
         self._prefix = f"plr-{secrets.token_hex(8)}"
         self._count = 0
@@ -189,13 +198,24 @@ class TlsGate:
             task.add_done_callback(partial(self._close_unread, accepted))
 
     async def _greet(self, accepted: socket.socket, address: str, source: str) -> None:
-        """Wait for the client's first bytes: who says nothing must not keep others from their handshakes."""
+        """Wait for the client's first bytes: who says nothing must not keep others from their handshakes.
+
+        Then for its turn: one begins in each turn of the loop. So whatever else is due, as the messages of those who
+        are let in already, is done between two, and who began ends before more begin.
+        """
         accepted.setblocking(False)
+        spoke = False
         try:
             async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
                 await _readable(self._loop, accepted)
+                spoke = True
+                async with self._turn:
+                    await asyncio.sleep(0)
         except TimeoutError as error:
-            self._refused(address, *why_failed(error))
+            if spoke:
+                self._on_refused(TOO_MANY_HANDSHAKES)
+            else:
+                self._refused(address, *why_failed(error))
             return
         task = asyncio.current_task()
         assert task is not None
@@ -249,12 +269,15 @@ class TlsGate:
         name = f"{self._prefix}-{self._count}"
         peer = f"unix-abstract:{name}"
 
+        owner = caller.identity.name
+
         def lost() -> None:
-            self._connections.pop(peer, None)
+            self._forget(peer, owner)
 
         inside = PipeEnd(lost)
         # Before gRPC can know of it.
         self._connections[peer] = _Connection(caller, outside, inside)
+        self._of_name.setdefault(owner, OrderedDict())[peer] = None
         if caller.refusal is not None:
             # It may hear from gRPC why, in words that its operator reads.
             self._refused_member(caller.identity.name, address, caller.refusal)
@@ -280,11 +303,20 @@ class TlsGate:
             raise
 
     def _make_room(self, name: NodeName) -> None:
-        own = [connection for connection in self._connections.values() if connection.caller.identity.name == name]
-        for connection in own[: len(own) - MAX_CONNECTIONS_PER_NAME + 1]:
+        own = list(self._of_name.get(name, ()))
+        for peer in own[: len(own) - MAX_CONNECTIONS_PER_NAME + 1]:
+            connection = self._connections[peer]
             self._on_refused(TOO_MANY_CONNECTIONS)
             connection.outside.abort()
             connection.inside.abort()
+
+    def _forget(self, peer: str, name: NodeName) -> None:
+        if self._connections.pop(peer, None) is None:
+            return
+        own = self._of_name[name]
+        del own[peer]
+        if not own:
+            del self._of_name[name]
 
     def _check(self, certificate: bytes) -> Caller:
         """Return the caller with its refusal, if any; raises CertificateError for one that is not even of our CA."""

@@ -123,6 +123,10 @@ class ControlClient:
         """Tell the control plane which revocation lists we use now."""
         self._post(lambda: self._session.set_revocations(held))
 
+    def report_at_once(self) -> None:
+        """Something happened that the control plane should hear of before the next report is due."""
+        self._post(lambda: self._session.report_at_once(time.monotonic()))
+
     def try_again(self) -> None:
         """Interfaces or peers are others now: a mapping that was refused for want of them may fit."""
         self._post(self._try_refused)

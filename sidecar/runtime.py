@@ -99,6 +99,7 @@ class Sidecar:
                 self._on_reach_changed,
                 self._on_paths_changed,
                 self._on_revocations,
+                lambda: self._control.report_at_once(),
             ),
         )
         self._revocations = (

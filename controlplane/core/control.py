@@ -29,6 +29,7 @@ from controlplane.core.estimator import Estimator
 from controlplane.core.explanation import explain, find
 from controlplane.core.exploration import Exploration
 from controlplane.core.mapping_history import MappingHistory
+from controlplane.core.pacing import Pacing
 from controlplane.core.permits import Permits
 from controlplane.core.picture import Picture
 from controlplane.core.plan import Plan
@@ -75,6 +76,12 @@ PUBLISH_DELAY_S = 0.02
 messages, and these should make one version."""
 
 
+PUBLISH_DELAY_EACH_S = 50e-6
+"""The same, more for each sidecar: looking at one for news takes some tenth of it."""
+
+PUBLISHED_AT_ONCE = 200
+"""Sidecars looked at for news in one go: some milliseconds, for which streams wait."""
+
 _CLOSED_FOR = {
     RemovalReason.REVOKED: CloseReason.REVOKED,
     RemovalReason.EXPIRED: CloseReason.CERTIFICATE_ENDED,
@@ -86,7 +93,9 @@ class ControlCore:
 
     def __init__(self, settings: Settings, *, version_epoch: int, now: float) -> None:
         self._settings = settings
+        self.pacing = Pacing(interval_s=settings.report_interval_s, lease_s=settings.lease_s)
         self.registry = Registry(lease_s=settings.lease_s)
+        self._told_intervals: dict[NodeName, float] = {}
         self.estimator = Estimator(half_life_s=settings.half_life_s)
         self.permits = Permits(settings.policy)
         self.counters = Counters()
@@ -111,6 +120,8 @@ class ControlCore:
         self._refused_offers = RefusedOffers()
         self.restlessness = Restlessness()
         self._publish_at: float | None = None
+        self._publications: deque[Iterator[Send | None]] = deque()
+        """Begun, and told to some; the first one goes on first."""
         self._events: deque[Event] = deque()
 
     # ── streams ──
@@ -129,8 +140,9 @@ class ControlCore:
         if result.new_run:
             self._forget_paths(name)
         self._publisher.begin_stream(registration)
-        self._events.append(Send(stream, self._welcome()))
+        self._welcome(name, stream)
         self._came_or_went(name, now)
+        self.follow_load()
         return stream
 
     def receive(self, stream: StreamId, message: SidecarMessage, now: float) -> None:
@@ -139,6 +151,9 @@ class ControlCore:
         if name is None or not self.registry.touch(name, stream, now):
             self.counters.old_stream_messages += 1
             return
+        if self._told_intervals[name] != self.pacing.interval_s:
+            # Along with what is said anyway: to tell all of them at once would hold up everything else.
+            self._welcome(name, stream)
         match message:
             case Registration():
                 raise DecodeError("a second registration on one stream")
@@ -204,9 +219,17 @@ class ControlCore:
         if not self._publisher[name].track(nack.resource).refused_as_before:
             self._events.append(NackNotice(name, nack))
 
-    def _welcome(self) -> Welcome:
-        settings = self._settings
-        return Welcome(settings.lease_s, settings.report_interval_s, settings.stun_servers, self._crl)
+    def _welcome(self, name: NodeName, stream: StreamId) -> None:
+        interval_s = self.pacing.interval_s
+        self.registry.tell_lease(name)
+        self._told_intervals[name] = interval_s
+        welcome = Welcome(self.registry.lease_s, interval_s, self._settings.stun_servers, self._crl)
+        self._events.append(Send(stream, welcome))
+
+    def follow_load(self, busy: float | None = None) -> None:
+        """Let sidecars report as often as their number allows, and `busy`: the share of one core used lately."""
+        self.pacing.follow(len(self.registry), busy)
+        self.registry.lease_s = self.pacing.lease_s
 
     def relay_revocations(self, crl: bytes) -> None:
         """Pass this list (PEM) on to all: a sidecar may know peers that this run of ours has never heard of."""
@@ -215,7 +238,7 @@ class ControlCore:
         self._crl = crl
         for sidecar in self.registry:
             if sidecar.stream is not None:
-                self._events.append(Send(sidecar.stream, self._welcome()))
+                self._welcome(sidecar.name, sidecar.stream)
 
     def refuse(self, refusal: Refusal) -> Refusal:
         """Count a registration that the driver does not let in; returns its reason."""
@@ -232,6 +255,8 @@ class ControlCore:
         self._drawing.members_changed()
         self._debounce.note(Change.MEMBERS, now)
         self._publish(now)
+        while self._publications:
+            self._go_on_publishing(now)
 
     def end_stream(self, name: NodeName, reason: CloseReason, now: float) -> None:
         """End a sidecar's stream; unless it was about to go, it stays registered until its lease ends."""
@@ -284,6 +309,7 @@ class ControlCore:
             self._publisher.warm_until,
             self._publisher.resend_at,
             self.restlessness.next_time(),
+            -math.inf if self._publications else None,
         )
         return min((time for time in times if time is not None), default=None)
 
@@ -303,8 +329,10 @@ class ControlCore:
         if self._publisher.resend_at is not None and self._publisher.resend_at <= now:
             self._publisher.send_refused_again()
             self._publish_soon(now)
-        if self._publish_at is not None and self._publish_at <= now:
+        if self._publish_at is not None and self._publish_at <= now and not self._publications:
             self._publish(now)
+        elif self._publications:
+            self._go_on_publishing(now)
 
     def _forget(self, name: NodeName, reason: RemovalReason) -> None:
         self._events.append(DepartureNotice(name, reason))
@@ -312,6 +340,7 @@ class ControlCore:
         self._refused_offers.forget(name)
         self.restlessness.forget(name)
         self._publisher.forget(name)
+        del self._told_intervals[name]
 
     def _forget_paths(self, name: NodeName) -> None:
         self.estimator.forget_paths(name)
@@ -333,7 +362,8 @@ class ControlCore:
             self._publish_at = now + RESTLESS_DELAY_S
 
     def _publish_soon(self, now: float) -> None:
-        self._publish_at = min(self._publish_at or math.inf, now + PUBLISH_DELAY_S)
+        delay_s = PUBLISH_DELAY_S + PUBLISH_DELAY_EACH_S * len(self.registry)
+        self._publish_at = min(self._publish_at or math.inf, now + delay_s)
 
     # ── solving ──
 
@@ -367,7 +397,7 @@ class ControlCore:
         self.plan = settled
         self._picture = picture
         if self._publish_at is None:
-            self._send(self._publisher.publish_plan(robots, self.permits, settled, picture), now)
+            self._begin_publishing(self._publisher.publish_plan(robots, self.permits, settled, picture), now)
         else:
             self._publish(now)
 
@@ -378,10 +408,27 @@ class ControlCore:
 
     def _publish(self, now: float) -> None:
         self._publish_at = None
-        self._send(self._publisher.publish(self.permits, self.plan, self._picture), now)
+        self._begin_publishing(self._publisher.publish(self.permits, self.plan, self._picture), now)
 
-    def _send(self, news: Iterable[Send], now: float) -> None:
-        for send in news:
+    def _begin_publishing(self, publication: Iterator[Send | None], now: float) -> None:
+        self._publications.append(publication)
+        if len(self._publications) == 1:
+            self._go_on_publishing(now)
+
+    def _go_on_publishing(self, now: float) -> None:
+        """Look for news at some sidecars; `next_timer` is past until all are done."""
+        looked_at = 0
+        for send in self._publications[0]:
+            if send is None:
+                looked_at += 1
+                if looked_at > PUBLISHED_AT_ONCE:
+                    return
+            else:
+                self._sent(send, now)
+        self._publications.popleft()
+
+    def _sent(self, send: Send, now: float) -> None:
+        if send.stream in self._streams:
             if isinstance(send.message, MappingSet):
                 self.history.note(self._streams[send.stream], send.message, now)
             self._events.append(send)

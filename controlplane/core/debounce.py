@@ -12,7 +12,7 @@ ROUTINE_INTERVAL_S = 1.0
 """Between two solvings for the sake of new reports alone: estimates follow reports, which come twice a second,
 and solving a large fleet takes about this long."""
 
-ROUTINE_TIMES = 4.0
+ROUTINE_TIMES = 10.0
 """Routine solvings of a large fleet start this many times their own duration apart, to leave time for the rest."""
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, Registration, Report, ServiceName, ServiceOffer, ServiceUse
     from protos.preferences import InterfaceLabel
 
-SLICE_PAIRS = 200
+SLICE_PAIRS = 40
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""
 
 ROUTINE_PAIRS = 4000

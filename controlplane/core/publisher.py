@@ -21,7 +21,7 @@ from controlplane.core.control_events import Send
 from controlplane.core.registry import MAX_SIDECARS
 from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
 from controlplane.core.told_peers import ToldPeers
-from controlplane.core.views import Views
+from controlplane.core.views import ToldRobots, Views
 from protos.model import POLICY_PENDING, ResourceKind, Role
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ class Publisher:
     def __init__(self, registry: Registry, *, version_epoch: int, warm_until: float | None) -> None:
         self._registry = registry
         self._versions = VersionSource(version_epoch)
+        self._told_robots = ToldRobots()
         self._snapshots: dict[NodeName, Snapshots] = {}
         self._gone: OrderedDict[NodeName, Snapshots] = OrderedDict()
         self.warm_until = warm_until
@@ -74,6 +75,7 @@ class Publisher:
     def forget(self, name: NodeName) -> None:
         """A sidecar is not registered any more."""
         self._held_back.pop(name, None)
+        self._told_robots.forget(name)
         self._gone[name] = self._snapshots.pop(name)
         if len(self._gone) > MAX_GONE_SNAPSHOTS:
             self._gone.popitem(last=False)
@@ -109,14 +111,17 @@ class Publisher:
         for snapshots in self._snapshots.values():
             snapshots.send_refused_again()
 
-    def publish(self, permits: Permits, plan: Plan, picture: Picture) -> Iterator[Send]:
-        """Everything that is news to somebody.
+    def publish(self, permits: Permits, plan: Plan, picture: Picture) -> Iterator[Send | None]:
+        """Everything that is news to somebody, and None before each sidecar: so often other work may come in between.
 
         Clouds first: what a robot learns that it may call shall be refused nowhere.
         """
-        views = Views(self._registry, permits)
-        for sidecar in sorted(self._registry, key=lambda sidecar: sidecar.role is Role.ROBOT):
-            if sidecar.stream is None or self._is_held_back(sidecar, permits):
+        views = Views(self._registry, permits, self._told_robots)
+        names = [one.name for one in sorted(self._registry, key=lambda one: one.role is Role.ROBOT)]
+        for name in names:
+            yield None
+            sidecar = self._registry.get(name)
+            if sidecar is None or sidecar.stream is None or self._is_held_back(sidecar, permits):
                 continue
             yield from self._peers(sidecar, sidecar.stream, views, permits)
             if sidecar.role is Role.ROBOT:
@@ -124,10 +129,11 @@ class Publisher:
 
     def publish_plan(
         self, robots: Iterable[NodeName], permits: Permits, plan: Plan, picture: Picture
-    ) -> Iterator[Send]:
+    ) -> Iterator[Send | None]:
         """The mappings of these robots, where they are news; who is there did not change since `publish`."""
-        views = Views(self._registry, permits)
+        views = Views(self._registry, permits, self._told_robots)
         for name in robots:
+            yield None
             robot = self._registry.get(name)
             if robot is not None and robot.stream is not None and not self._is_held_back(robot, permits):
                 yield from self._mapping(robot, robot.stream, views, plan, picture)

@@ -67,7 +67,6 @@ class Sidecar:
     """One registered sidecar; replaced as a whole when anything about it changes."""
 
     registration: Registration
-    lease_end: float
     stream: StreamId | None
     candidates: tuple[Candidate, ...] | None = None
     """None until told."""
@@ -143,11 +142,21 @@ class RegistryCounters:
     removals_forgotten: int = 0
 
 
+@dataclass(slots=True)
+class _Lease:
+    """Apart from the sidecar, which is replaced when it changes: this changes with each message."""
+
+    length_s: float
+    end: float
+
+
 class Registry:
     """All registered sidecars. Times are monotonic seconds."""
 
     def __init__(self, *, lease_s: float) -> None:
-        self._lease_s = lease_s
+        self.lease_s = lease_s
+        """Of those that register, or are told anew, from now on."""
+        self._leases: dict[NodeName, _Lease] = {}
         self._sidecars: dict[NodeName, Sidecar] = {}
         self._sessions: dict[SessionId, NodeName] = {}
         self._removals: OrderedDict[NodeName, RemovalReason] = OrderedDict()
@@ -180,7 +189,8 @@ class Registry:
             if len(self._sidecars) >= MAX_SIDECARS:
                 return self._refuse(Refusal.FULL)
             self._removals.pop(name, None)
-            self._sidecars[name] = Sidecar(registration, now + self._lease_s, stream)
+            self._sidecars[name] = Sidecar(registration, stream)
+            self._leases[name] = _Lease(self.lease_s, now + self.lease_s)
             self._sessions[registration.session] = name
             self._await_end(name)
             return Admission(replaced=None, new_run=True)
@@ -196,7 +206,7 @@ class Registry:
         self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False)
         del self._sessions[before.session]
         self._sessions[registration.session] = name
-        self._renew(name, now)
+        self._leases[name] = _Lease(self.lease_s, now + self.lease_s)
         return Admission(replaced=known.stream, new_run=not same_run)
 
     def remove(self, name: NodeName, reason: RemovalReason) -> Sidecar | None:
@@ -210,15 +220,24 @@ class Registry:
         self.counters.refused[refusal] += 1
         return refusal
 
-    def _renew(self, name: NodeName, now: float) -> None:
-        end = now + self._lease_s
-        self._sidecars[name] = replace(self._sidecars[name], lease_end=end)
+    def lease_end(self, name: NodeName) -> float:
+        """When a registered sidecar's lease ends unless it speaks."""
+        return self._leases[name].end
+
+    def told_lease_s(self, name: NodeName) -> float:
+        """How long a registered sidecar was told that it may be silent."""
+        return self._leases[name].length_s
+
+    def tell_lease(self, name: NodeName) -> None:
+        """A registered sidecar is told of the lease of now. Its present one goes on, as it may learn of that late."""
+        self._leases[name].length_s = self.lease_s
 
     def touch(self, name: NodeName, stream: StreamId, now: float) -> bool:
         """Renew the lease because `stream` spoke; False if it is not the sidecar's stream any more."""
         if not self._is_current(name, stream):
             return False
-        self._renew(name, now)
+        lease = self._leases[name]
+        lease.end = max(lease.end, now + lease.length_s)
         return True
 
     def _is_current(self, name: NodeName, stream: StreamId) -> bool:
@@ -276,7 +295,7 @@ class Registry:
     def _await_end(self, name: NodeName) -> None:
         if name not in self._awaited:
             self._awaited.add(name)
-            heapq.heappush(self._ends, (self._sidecars[name].lease_end, name))
+            heapq.heappush(self._ends, (self._leases[name].end, name))
 
     def next_expiry(self) -> float | None:
         """When to call `expire` next; it may then find that the lease was renewed."""
@@ -291,7 +310,7 @@ class Registry:
             known = self._sidecars.get(name)
             if known is None:
                 continue
-            if known.lease_end > now:
+            if self._leases[name].end > now:
                 self._await_end(name)
                 continue
             gone.append(known)
@@ -300,6 +319,7 @@ class Registry:
 
     def _remove(self, name: NodeName, reason: RemovalReason) -> None:
         del self._sessions[self._sidecars.pop(name).registration.session]
+        del self._leases[name]
         self.counters.departed[reason] += 1
         self._removals[name] = reason
         self._removals.move_to_end(name)

@@ -24,7 +24,7 @@ def statuses(
         yield SidecarStatus(
             peer=sidecar.as_peer(),
             connected=sidecar.stream is not None,
-            lease_left_s=max(0.0, sidecar.lease_end - now),
+            lease_left_s=max(0.0, registry.lease_end(sidecar.name) - now),
             software_version=sidecar.registration.software_version,
             uses=sidecar.uses,
             peers=snapshots.peers.status,

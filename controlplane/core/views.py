@@ -20,10 +20,41 @@ if TYPE_CHECKING:
     from protos.model import CallPermit, NodeName, Peer
 
 
+MAX_PERMITS_KEPT = 64
+"""Of one robot; clouds that the same rules are about have the same."""
+
+
+class ToldRobots:
+    """Robots as clouds are told of them, from one publication to the next: nearly all are as they were.
+
+    So they are the same objects, and two views are compared by them without a look inside.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[NodeName, tuple[Sidecar, dict[CallPermit, Peer]]] = {}
+
+    def peer(self, robot: Sidecar, permit: CallPermit) -> Peer:
+        """The robot with this permit."""
+        made = self._made.get(robot.name)
+        if made is None or made[0] is not robot:
+            made = self._made[robot.name] = robot, {}
+        peer = made[1].get(permit)
+        if peer is None:
+            if len(made[1]) >= MAX_PERMITS_KEPT:
+                made[1].clear()  # of policies that are not in force any more
+            peer = made[1][permit] = dataclasses.replace(robot.as_peer(), may_call=permit)
+        return peer
+
+    def forget(self, name: NodeName) -> None:
+        """It is not registered any more."""
+        self._made.pop(name, None)
+
+
 class Views:
     """The views of all sidecars at one moment."""
 
-    def __init__(self, registry: Registry, permits: Permits) -> None:
+    def __init__(self, registry: Registry, permits: Permits, told: ToldRobots) -> None:
+        self._told = told
         self._registry = registry
         self._permits = permits
         ready = sorted((sidecar for sidecar in registry if sidecar.ready), key=lambda sidecar: sidecar.name)
@@ -72,7 +103,7 @@ class Views:
         peers = self._permitted.get(permits)
         if peers is None:
             pairs = zip(self._robots, permits, strict=True)
-            peers = tuple(dataclasses.replace(robot.as_peer(), may_call=permit) for robot, permit in pairs if permit)
+            peers = tuple(self._told.peer(robot, permit) for robot, permit in pairs if permit)
             self._permitted[permits] = peers
         return peers
 

@@ -57,6 +57,9 @@ STABLE_AFTER_S = 5.0
 HEARTBEATS_PER_LEASE = 3.0
 """Two may get lost before the lease ends."""
 
+URGENT_PART, URGENT_LEAST_S = 0.1, 0.1
+"""What is urgent is reported so soon after the report before: a part of the interval, and at least so much."""
+
 MIN_INTERVAL_S = 0.05
 """Floor of what the control plane may ask for: it must not be able to make the sidecar spin."""
 
@@ -132,6 +135,7 @@ class ControlSession:
         self._refused = False
         self._heartbeat_interval_s = 0.0
         self._report_interval_s = 0.0
+        self._reported_at = 0.0
         self._heartbeat_at = 0.0
         self._report_at = 0.0
         self._clear_outgoing()
@@ -220,13 +224,16 @@ class ControlSession:
                 return self._receive_resource(ResourceKind.MAPPING, message)
 
     def _receive_welcome(self, welcome: Welcome, now: float) -> Welcome:
-        if self.state is not ControlState.ONLINE:
+        told_before = self.state is ControlState.ONLINE
+        if not told_before:
             self.stats.streams += 1
         self.state = ControlState.ONLINE
         self._heartbeat_interval_s = max(welcome.lease_s / HEARTBEATS_PER_LEASE, MIN_INTERVAL_S)
         self._report_interval_s = max(welcome.report_interval_s, MIN_INTERVAL_S)
         self._heartbeat_at = now + self._heartbeat_interval_s
-        self._report_at = now + self._report_interval_s
+        self._report_at = (
+            min(self._report_at, now + self._report_interval_s) if told_before else (now + self._report_interval_s)
+        )
         return welcome
 
     def _receive_resource(self, resource: ResourceKind, content: PeerSet | MappingSet) -> Apply | None:
@@ -306,8 +313,17 @@ class ControlSession:
         """Whether the driver is to collect a report and pass it to `send_report`."""
         return self.state is ControlState.ONLINE and self._report is None and now >= self._report_at
 
+    def report_at_once(self, now: float) -> None:
+        """Something happened that cannot wait for the interval: a path went, a deadline was missed.
+
+        The fleet's size counts all the same, as it may have happened to all: two reports are a tenth of it apart.
+        """
+        gap_s = max(self._report_interval_s * URGENT_PART, URGENT_LEAST_S)
+        self._report_at = min(self._report_at, max(now, self._reported_at + gap_s))
+
     def send_report(self, report: Report, now: float) -> None:
         """Send what was measured since the last report; one that holds nothing is left out."""
+        self._reported_at = now
         self._report_at = now + self._report_interval_s
         if report != _NOTHING_MEASURED and self.state is ControlState.ONLINE:
             self._report = report

@@ -323,6 +323,10 @@ class Engine:
         """Robot: (service, server, type) of servers left out because the others offer another type."""
         return frozenset(self._offers.conflicts)
 
+    def take_urgency(self) -> bool:
+        """Robot: whether a report is wanted before it is due, as a path changed or a deadline was missed."""
+        return self._config.role is Role.ROBOT and self._measurements.take_urgency()
+
     def take_report(self, now: float) -> Report:
         """Return what was measured since the last report."""
         measured = self._measurements.take(self.routes, self.peers.names())
@@ -445,6 +449,7 @@ class Engine:
             return
         reached = self.routes.reaches(path.peer)
         self.routes.set_state(path, state)
+        self._measurements.note_urgent()
         if state is PathState.UP:
             self._backlog.add_steps(self._outbox.on_path_up(path), now)
             self._inbound.on_path_up(path)

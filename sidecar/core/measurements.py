@@ -63,7 +63,20 @@ class Measurements:
         self._answer_bytes: dict[ServiceName, int] = {}
         self._next_path = 0
         """Which path is told of first, where one report does not hold all."""
+        self._urgent = False
+        self._urgency_told = False
         self._clear()
+
+    def note_urgent(self) -> None:
+        """Something happened that the control plane should hear of before the next report is due."""
+        self._urgent = True
+
+    def take_urgency(self) -> bool:
+        """Whether that is so; True once for each report."""
+        if self._urgent and not self._urgency_told:
+            self._urgency_told = True
+            return True
+        return False
 
     def _clear(self) -> None:
         self._carried: dict[Carried, _Counts] = {}
@@ -123,7 +136,9 @@ class Measurements:
         counts.lost += event.lost
 
     def outcome(self, service: ServiceName, outcome: str) -> None:
-        """A request ended."""
+        """A request ended; a missed deadline may mean that the mapping is wrong."""
+        if outcome == "deadline_missed":
+            self.note_urgent()
         self._outcomes[service, outcome] += 1
 
     def judged_together(
@@ -168,6 +183,7 @@ class Measurements:
         joints = tuple(JointReport(*key, count, self._both_missed[key]) for key, count in self._compared.items())
         interface_joints = tuple(counts.report(pair) for pair, counts in self._interfaces.items())
         self._clear()
+        self._urgent = self._urgency_told = False
         return Report(latencies, paths, outcomes, joints, interface_joints)
 
     def _in_turn(self, paths: list[tuple[InterfaceName, NodeName]]) -> list[tuple[InterfaceName, NodeName]]:

@@ -76,6 +76,8 @@ class DataPlaneHooks:
     """The best state of the paths over each interface that has some; called with the engine's lock held."""
     revocations: Callable[[NodeName, bytes], None]
     """A peer sent revocation lists (PEM), which nobody has judged; called with the engine's lock held."""
+    report_urgent: Callable[[], None] = lambda: None
+    """Something happened that the next report should tell at once; called with the engine's lock held."""
 
 
 class ThreadedDataPlane:
@@ -405,6 +407,8 @@ class ThreadedDataPlane:
             self._hooks.application.handle(event)
         for peer, pem in self._engine.revocations.take_arrived():
             self._hooks.revocations(peer, pem)
+        if self._engine.take_urgency():
+            self._hooks.report_urgent()
         best = self._engine.routes.best
         if best is not self._told_paths:
             self._told_paths = best

@@ -38,7 +38,7 @@ class Fleet:
         self.drawing = Drawing(default_capacity_interfaces=1, objective=Objective.JOINT)
         self.permits = Permits(None)
         self.sidecars = [self._cloud(name) for name in ("a", "b")] + [
-            Sidecar(registration(name), 1e9, stream(2), interfaces("wlan0", "wwan0"), ServiceSet((), (use(),)))
+            Sidecar(registration(name), stream(2), interfaces("wlan0", "wwan0"), ServiceSet((), (use(),)))
             for name in self.names
         ]
         for name in self.names:
@@ -47,7 +47,7 @@ class Fleet:
 
     def _cloud(self, name: str) -> Sidecar:
         services = ServiceSet((offer(),))
-        return Sidecar(registration(name, Role.CLOUD), 1e9, stream(1), interfaces("eth0"), services)
+        return Sidecar(registration(name, Role.CLOUD), stream(1), interfaces("eth0"), services)
 
     def report(self, robot: NodeName, report: Report) -> None:
         changed = self.estimator.merge(robot, report, self.now)
@@ -193,7 +193,7 @@ def test_one_robot_with_many_services_is_drawn_in_slices_too() -> None:
     fleet.sidecars = [
         replace(fleet._cloud(name), services=ServiceSet(offers), offered=frozenset(one.name for one in offers))
         for name in clouds
-    ] + [Sidecar(registration(fleet.names[0]), 1e9, stream(2), interfaces("wlan0", "wwan0"), ServiceSet((), uses))]
+    ] + [Sidecar(registration(fleet.names[0]), stream(2), interfaces("wlan0", "wwan0"), ServiceSet((), uses))]
     fleet.drawing.members_changed()
     assert fleet.draw(routine=True) >= 2
     assert len(fleet.drawing.picture().problem.blocks) == services

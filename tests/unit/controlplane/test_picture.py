@@ -53,13 +53,13 @@ KEY = BlockKey(NodeName("robot"), PLAN)
 
 
 def robot(*uses: ServiceUse, candidates: tuple[Candidate, ...] = interfaces("wlan0", "wwan0")) -> Sidecar:
-    return Sidecar(registration("robot"), 9.0, stream(1), candidates, ServiceSet((), uses or (use(),)))
+    return Sidecar(registration("robot"), stream(1), candidates, ServiceSet((), uses or (use(),)))
 
 
 def cloud(name: str, *offers: ServiceOffer, draining: bool = False) -> Sidecar:
     services = ServiceSet(offers or (offer(),))
     offered = frozenset(offer.name for offer in services.offers)
-    return Sidecar(registration(name, Role.CLOUD), 9.0, stream(2), interfaces("eth0"), services, draining, offered)
+    return Sidecar(registration(name, Role.CLOUD), stream(2), interfaces("eth0"), services, draining, offered)
 
 
 def picture(

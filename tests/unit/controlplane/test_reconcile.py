@@ -31,9 +31,7 @@ WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")
 
 
 def robot(*uses: ServiceUse) -> Sidecar:
-    return Sidecar(
-        registration("robot"), 9.0, stream(1), interfaces("wlan0", "wwan0"), ServiceSet((), uses or (use(),))
-    )
+    return Sidecar(registration("robot"), stream(1), interfaces("wlan0", "wwan0"), ServiceSet((), uses or (use(),)))
 
 
 def servers(*names: str) -> dict[NodeName, CallPermit]:

@@ -95,7 +95,7 @@ def test_a_newer_incarnation_replaces_the_older_stream(registry: Registry) -> No
     assert known.as_peer().session == registration("robot", incarnation=2).session
     assert known.as_peer().candidates == interfaces("wlan0")
     assert not known.draining
-    assert known.lease_end == 1.0 + LEASE_S
+    assert registry.lease_end(ROBOT) == 1.0 + LEASE_S
     assert not registry.touch(ROBOT, stream(1), 2.0)
     assert registry.disconnect(ROBOT, stream(1)) is None
     assert known == registry.get(ROBOT)

@@ -1,0 +1,184 @@
+"""`python -m bench control`: one fleet after another of 500 to 4,000 sidecars, each from its first start to its end."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import json
+import random
+import resource
+import socket
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from bench.control.crowd import Crowd
+from bench.control.member import Member
+from bench.control.plane import Plane
+from bench.control.targets import SIZES, targets
+from bench.pressure import CpuPressure
+from bench.reporting.machine import machine
+from bench.reporting.terminal import show_verdicts
+from controlplane.ca import Authority
+from protos.identity import IdentityRole
+from protos.model import NodeName, Role
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable
+
+SERVERS = 3
+SETTLE_S = 20.0
+"""From the registration of all to what counts as steady: the first mappings are solved and have gone out."""
+STATUS_LOOKS = 3
+LEASES = 'plr_departures_total{reason="lease_expired"}'
+LOOK_EVERY_S = 0.02
+PATIENCE_S = 300.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m bench control`."""
+    parser.add_argument(
+        "--size", type=int, action="append", metavar="N", help=f"sidecars (repeatable; default {SIZES})"
+    )
+    parser.add_argument("--steady-s", type=float, default=30.0, help="steady time measured (default %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("bench/results"), help="folder for control.json (default %(default)s)"
+    )
+    parser.add_argument("--keep-logs", type=Path, metavar="DIR", help="keep configurations and logs here")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Measure and write control.json; returns the exit code: 1 when a target is missed."""
+    console = Console(highlight=False, soft_wrap=True)
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    sizes = tuple(options.size or SIZES)
+    wanted = targets(sizes)
+    figures: dict[str, float] = {}
+    details: dict[str, object] = {}
+    pressure = CpuPressure()
+    for size in sizes:
+        with tempfile.TemporaryDirectory(prefix="plr-bench-") as temporary:
+            folder = (options.keep_logs or Path(temporary)) / f"control-{size}"
+            folder.mkdir(parents=True)
+            fleet = Fleet(size, folder, options.steady_s, console.print)
+            asyncio.run(fleet.measure())
+        figures.update({f"{key}_{size}": value for key, value in fleet.figures.items()})
+        details[str(size)] = fleet.details
+        found = {**figures, "verdicts": {target.key: target.met(figures) for target in wanted}}
+        found |= {"details": details, "machine": {**machine(), "cpu_pressure": pressure.share()}}
+        options.out.mkdir(parents=True, exist_ok=True)
+        (options.out / "control.json").write_text(json.dumps(found, indent=1) + "\n")
+    show_verdicts(console, figures, wanted)
+    console.print(f"figures: {options.out / 'control.json'}")
+    return 1 if any(target.met(figures) is False for target in wanted) else 0
+
+
+class Fleet:
+    """One fleet of `size` sidecars at a control plane of its own."""
+
+    def __init__(self, size: int, folder: Path, steady_s: float, say: Callable[[str], None]) -> None:
+        self.figures: dict[str, float] = {}
+        self.details: dict[str, object] = {}
+        self._size = size
+        self._steady_s = steady_s
+        self._say = say
+        authority = Authority.create()
+        rng = random.Random(size)
+        clouds = tuple(NodeName(f"cloud-{number}") for number in range(SERVERS))
+        self._members = [
+            Member(name, Role.CLOUD, authority.issue(name, IdentityRole.CLOUD), (), rng) for name in clouds
+        ]
+        for number in range(size - SERVERS):
+            name = NodeName(f"robot-{number:05}")
+            self._members.append(Member(name, Role.ROBOT, authority.issue(name, IdentityRole.ROBOT), clouds, rng))
+        self._plane = Plane(folder, authority, (_free_port(), _free_port()))
+        self._crowd = Crowd(self._members, self._plane.target, authority.ca_pem)
+
+    async def measure(self) -> None:
+        """Go through the fleet's life."""
+        try:
+            await self._measure()
+        finally:
+            await self._crowd.close()
+            self._plane.kill()
+
+    async def _measure(self) -> None:
+        self._plane.start()
+        await asyncio.sleep(5.0)
+        empty_kb = self._plane.resident_kb()
+        self._crowd.start()
+        began = time.monotonic()
+        await self._until("everybody to be registered", lambda: self._crowd.online() == self._size)
+        self._tell("first_s", time.monotonic() - began)
+        await self._until("everybody to be mapped", lambda: self._crowd.unmapped() == 0)
+        self._tell("first_mapped_s", time.monotonic() - began)
+
+        self._plane.kill()
+        await asyncio.sleep(2.0)
+        self._crowd.ended.clear()
+        began = self._plane.start()
+        await self._until("everybody to be back", lambda: self._crowd.online() == self._size)
+        self._figure("registered_s", time.monotonic() - began)
+        self.details["streams ended"] = dict(self._crowd.ended)
+        await asyncio.sleep(SETTLE_S)
+
+        self._turns("restart")
+        lost, spent, at = self._plane.metric(LEASES), self._plane.processor_s(), time.monotonic()
+        pressure = CpuPressure()
+        await asyncio.sleep(self._steady_s)
+        self._figure("steady_core_share", (self._plane.processor_s() - spent) / (time.monotonic() - at))
+        self.details["somebody waited for a processor"] = pressure.share()
+        self._figure("leases_lost", self._plane.metric(LEASES) - lost)
+        self._figure("kb_a_sidecar", (self._plane.resident_kb() - empty_kb) / self._size)
+        steady = self._turns("steady")
+        looks = [await asyncio.to_thread(self._plane.status_s) for _ in range(STATUS_LOOKS)]
+        self._figure("status_s", sorted(looks)[STATUS_LOOKS // 2])
+
+        await self._lose_a_server()
+        self._figure("loop_hold_ms", 1000 * max(steady, self._turns("a server is lost")))
+
+    async def _lose_a_server(self) -> None:
+        dead = self._members[0].name
+        users = [member for member in self._members if dead in member.mapped]
+        await self._crowd.leave(dead)
+        at = self._crowd.lose_server(dead)
+        await self._until("new mappings", lambda: not any(dead in member.mapped for member in users))
+        taken = sorted(member.mapped_at - at for member in users)
+        self.details["mapped to the dead server"] = len(users)
+        self._figure("remapped_p99_s", taken[int(0.99 * (len(taken) - 1))] if taken else 0.0)
+
+    def _turns(self, phase: str) -> float:
+        hold = self._plane.hold()
+        self.details[f"longest turn, {phase}"] = dataclasses.asdict(hold)
+        self._say(f"{self._size}: longest turn, {phase}: {hold}")
+        return hold.cpu_s
+
+    def _figure(self, key: str, value: float) -> None:
+        self.figures[key] = value
+        self._tell(key, value)
+
+    def _tell(self, key: str, value: float) -> None:
+        self.details[key] = value
+        self._say(f"{self._size}: {key} {value:.3g}")
+
+    async def _until(self, what: str, holds: Callable[[], bool]) -> None:
+        give_up_at = time.monotonic() + PATIENCE_S
+        say_at = time.monotonic() + 5.0
+        while not holds():
+            if time.monotonic() > give_up_at:
+                raise TimeoutError(f"{self._size}: no {what} after {PATIENCE_S:g} s: {self._crowd.online()} are online")
+            if time.monotonic() > say_at:
+                say_at += 5.0
+                self._say(f"{self._size}: waiting for {what}: {self._crowd.online()} online, {dict(self._crowd.ended)}")
+            await asyncio.sleep(LOOK_EVERY_S)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port: int = taken.getsockname()[1]
+        return port

@@ -1,0 +1,167 @@
+"""A fleet's control streams in one event loop: each with its own certificate, TLS connection, and reports.
+
+The dialogue is the sidecar's own (`ControlSession`: backoff, reports, heartbeats, acks); what stands around it in a
+robot, ROS and the data plane, is not here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import grpc
+
+from protos.convert import control_message_from_proto, sidecar_message_to_proto
+from protos.identity import CONTROL_PLANE_DNS
+from protos.model import MappingSet, PeerSet, Role
+from protos.plr.v1 import control_pb2_grpc
+from sidecar.control_channel import REFUSALS
+from sidecar.core.control_session import Apply, ControlState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from bench.control.member import Member
+    from protos.model import NodeName
+    from protos.plr.v1 import control_pb2
+
+    Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
+
+OPTIONS: tuple[tuple[str, int | str], ...] = (
+    ("grpc.enable_retries", 0),
+    ("grpc.use_local_subchannel_pool", 1),
+    ("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),
+)
+
+
+class Crowd:
+    """Members that keep themselves connected to the control plane at `target`."""
+
+    def __init__(self, members: Iterable[Member], target: str, ca_pem: bytes) -> None:
+        self.members = {member.name: member for member in members}
+        self.ended: Counter[str] = Counter()
+        """Why streams ended, by gRPC's code."""
+        self.sets: Counter[str] = Counter()
+        """Messages and bytes received."""
+        self._target = target
+        self._ca_pem = ca_pem
+        self._wake = {name: asyncio.Event() for name in self.members}
+        self._tasks: dict[NodeName, asyncio.Task[None]] = {}
+
+    def start(self) -> None:
+        """Connect everybody, each at its turn of the sidecar's backoff."""
+        for member in self.members.values():
+            self._tasks[member.name] = asyncio.create_task(self._keep_connected(member))
+
+    async def leave(self, name: NodeName) -> None:
+        """This member's process is killed: its stream breaks."""
+        await self._cancel([self._tasks.pop(name)])
+
+    async def close(self) -> None:
+        """End all."""
+        await self._cancel(list(self._tasks.values()))
+        self._tasks.clear()
+
+    @staticmethod
+    async def _cancel(tasks: list[asyncio.Task[None]]) -> None:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def online(self) -> int:
+        """How many are registered."""
+        return sum(member.session.state is ControlState.ONLINE for member in self.members.values())
+
+    def unmapped(self) -> int:
+        """How many robots have no mapping."""
+        return sum(member.role is Role.ROBOT and not member.mapped for member in self.members.values())
+
+    def lose_server(self, dead: NodeName) -> float:
+        """Every robot finds at once that no path to this server is up; returns when."""
+        now = time.monotonic()
+        for member in self.members.values():
+            if member.role is Role.ROBOT:
+                member.dead = dead
+                member.session.report_at_once(now)
+                self._wake[member.name].set()
+        return now
+
+    async def _keep_connected(self, member: Member) -> None:
+        while True:
+            delay_s = member.session.retry_at - time.monotonic()
+            if delay_s > 0:
+                await asyncio.sleep(delay_s)
+            await self._one_stream(member)
+
+    async def _one_stream(self, member: Member) -> None:
+        credentials = grpc.ssl_channel_credentials(self._ca_pem, member.issued.key_pem, member.issued.certificate_pem)
+        session = member.session
+        session.opened(time.monotonic())
+        refused = False
+        channel = grpc.aio.secure_channel(self._target, credentials, options=OPTIONS)
+        try:
+            call = control_pb2_grpc.ControlPlaneStub(channel).Connect()
+            writing = asyncio.create_task(self._write(member, call))
+            try:
+                async for message in call:
+                    self._take(member, message)
+            finally:
+                call.cancel()
+                writing.cancel()
+                await asyncio.gather(writing, return_exceptions=True)
+            self.ended["closed"] += 1
+        except asyncio.CancelledError:
+            # The call was cancelled, not we.
+            task = asyncio.current_task()
+            if task is None or task.cancelling():
+                raise
+        except grpc.aio.AioRpcError as error:
+            self.ended[f"{error.code().name}: {error.details()}"[:80]] += 1
+            refused = error.code() in REFUSALS
+        finally:
+            # Its own close looks at every task of the loop for calls of the channel: a minute for a thousand channels.
+            channel._channel.close()  # type: ignore[attr-defined]
+            session.closed(time.monotonic(), refused=refused)
+
+    async def _write(self, member: Member, call: Call) -> None:
+        session, wake = member.session, self._wake[member.name]
+        reported_at = time.monotonic()
+        while True:
+            wake.clear()
+            now = time.monotonic()
+            if session.welcome_overdue(now):
+                self.ended["no welcome"] += 1
+                call.cancel()
+                return
+            session.handle_timer(now)
+            if session.report_due(now):
+                session.send_report(member.report(now - reported_at), now)
+                reported_at = now
+            try:
+                for message in session.messages_to_send(now):
+                    await call.write(sidecar_message_to_proto(message))
+            except (grpc.aio.AioRpcError, asyncio.InvalidStateError):
+                return
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(max(session.next_timer() - time.monotonic(), 0.0)):
+                    await wake.wait()
+
+    def _take(self, member: Member, message: control_pb2.ControlMessage) -> None:
+        self.sets[str(message.WhichOneof("kind"))] += 1
+        self.sets["bytes"] += message.ByteSize()
+        now = time.monotonic()
+        event = member.session.receive(control_message_from_proto(message), now)
+        if isinstance(event, Apply):
+            self._apply(member, event.content, now)
+            member.session.applied(event, None)
+        self._wake[member.name].set()
+
+    @staticmethod
+    def _apply(member: Member, content: PeerSet | MappingSet, now: float) -> None:
+        if isinstance(content, MappingSet):
+            for service in content.services:
+                member.mapped = frozenset(one.server for one in service.assignments)
+                member.mapped_at = now

@@ -1,0 +1,120 @@
+"""One sidecar as its control stream shows it: what it says, what it is told, and when."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from typing import TYPE_CHECKING
+
+from protos.candidate_signature import sign_candidates
+from protos.credential import Aead, SessionCredential, session_number
+from protos.histogram import Histogram
+from protos.model import (
+    PROTOCOL_VERSION,
+    Candidate,
+    CandidateKind,
+    CandidateSet,
+    InterfaceId,
+    InterfaceName,
+    LatencyReport,
+    NodeName,
+    OutcomeReport,
+    PathReport,
+    Registration,
+    Report,
+    Role,
+    ServiceName,
+    ServiceOffer,
+    ServiceSet,
+    ServiceUse,
+)
+from sidecar.core.control_session import ControlSession
+
+if TYPE_CHECKING:
+    import random
+
+    from controlplane.ca.certificates import Issued
+    from protos.model import Assignment, SessionId
+
+SERVICE = ServiceName("/plan_path")
+TYPE = "bench/srv/Plan"
+DEADLINE_S = 0.25
+INTERFACES = (InterfaceName("wlan0"), InterfaceName("wwan0"))
+PROCESSING_S = 0.02
+
+
+class Member:
+    """A sidecar of the crowd; `servers` are the clouds that robots reach."""
+
+    def __init__(
+        self, name: NodeName, role: Role, issued: Issued, servers: tuple[NodeName, ...], rng: random.Random
+    ) -> None:
+        self.name = name
+        self.role = role
+        self.issued = issued
+        self.mapped: frozenset[NodeName] = frozenset()
+        """Servers of the mapping in force."""
+        self.mapped_at = 0.0
+        self.dead: NodeName | None = None
+        """The server to which no path is up any more."""
+        self._servers = servers
+        self._rng = rng
+        incarnation = int(time.time() * 1000.0)
+        public_key = hashlib.sha256(f"{name} {incarnation}".encode()).digest()
+        number = session_number(name, role, public_key)
+        credential = SessionCredential(
+            name, role, number, incarnation, public_key, Aead.AES_256_GCM, issued.certificate_der
+        ).sign(issued.key)
+        registration = Registration(
+            protocol_version=PROTOCOL_VERSION,
+            name=name,
+            role=role,
+            session=number,
+            token=hashlib.sha256(name.encode()).digest()[:16],
+            incarnation=incarnation,
+            software_version="bench",
+            credential=credential.encode(),
+        )
+        self.session = ControlSession(registration, rng)
+        self._announce(number)
+
+    def _announce(self, number: SessionId) -> None:
+        interfaces = INTERFACES if self.role is Role.ROBOT else (InterfaceName("eth0"),)
+        candidates = tuple(
+            Candidate(InterfaceId(place), name, CandidateKind.HOST, (f"10.{place}.0.1", 4000 + place))
+            for place, name in enumerate(interfaces)
+        )
+        signature = sign_candidates(self.issued.key, number, 1, candidates)
+        self.session.set_candidates(CandidateSet(candidates, (), 1, signature))
+        if self.role is Role.ROBOT:
+            services = ServiceSet(uses=(ServiceUse(SERVICE, TYPE, DEADLINE_S, True),))
+        else:
+            services = ServiceSet(offers=(ServiceOffer(SERVICE, TYPE),))
+        self.session.set_services(services)
+
+    def report(self, interval_s: float) -> Report:
+        """What a robot measured in this time: ten requests a second over each of its paths in use."""
+        if self.role is Role.CLOUD:
+            return Report()
+        requests = max(round(10 * interval_s), 1)
+        paths, latencies = [], []
+        for interface in INTERFACES:
+            for server in self._servers:
+                up = server != self.dead
+                rtt = Histogram()
+                if up:
+                    rtt.record_many([self._rng.lognormvariate(-3.0, 0.4) for _ in range(max(round(interval_s), 1))])
+                paths.append(PathReport(interface, server, up, rtt, 10 * requests, 0))
+                if up and server in self.mapped:
+                    network, processing = Histogram(), Histogram()
+                    network.record_many([self._rng.lognormvariate(-3.0, 0.4) for _ in range(requests)])
+                    processing.record_many([PROCESSING_S] * requests)
+                    latencies.append(
+                        LatencyReport(interface, server, SERVICE, 1, network, Histogram(), processing, requests, 0)
+                    )
+        return Report(tuple(latencies), tuple(paths), (OutcomeReport(SERVICE, ok=requests),))
+
+    def takes(self, assignments: tuple[Assignment, ...], now: float) -> None:
+        """A mapping is in force."""
+        self.mapped = frozenset(one.server for one in assignments)
+        self.mapped_at = now

@@ -1,0 +1,147 @@
+"""The real control plane as a process of its own, under the limits of its unit, with its turns watched."""
+
+from __future__ import annotations
+
+import configparser
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.request import urlopen
+
+import yaml
+
+from bench.churn.machine import processor_s
+from protos.identity import IdentityRole
+
+if TYPE_CHECKING:
+    from controlplane.ca import Authority
+
+UNIT = Path("deploy/systemd/plr-controlplane.service")
+USUAL_OPEN_FILES = 1024
+"""What systemd gives to a unit that does not say."""
+PATIENCE_S = 30.0
+
+
+class PlaneError(RuntimeError):
+    """The control plane did not do what it should; the text names its log."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """The longest turn of the event loop: seconds of processor time, of the clock, and what it ran."""
+
+    cpu_s: float
+    wall_s: float
+    what: str
+
+
+class Plane:
+    """Starts, kills and looks at one control plane; `folder` takes its files."""
+
+    def __init__(self, folder: Path, authority: Authority, ports: tuple[int, int]) -> None:
+        self._folder = folder
+        self._port, self._metrics_port = ports
+        self._turns = folder / "turns.json"
+        self._process: subprocess.Popen[bytes] | None = None
+        tls = self._certify(authority, IdentityRole.CONTROL_PLANE)
+        self._operator = self._certify(authority, IdentityRole.OPERATOR)
+        config = {
+            "listen": f"127.0.0.1:{self._port}",
+            "tls_dir": str(tls),
+            "stun_listen": [],
+            "metrics_listen": f"127.0.0.1:{self._metrics_port}",
+        }
+        self._config = folder / "controlplane.yaml"
+        self._config.write_text(yaml.safe_dump(config))
+
+    def _certify(self, authority: Authority, role: IdentityRole) -> Path:
+        folder = self._folder / role.value
+        folder.mkdir()
+        issued = authority.issue(role.value, role)
+        files = {"ca.pem": authority.ca_pem, "cert.pem": issued.certificate_pem, "key.pem": issued.key_pem}
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+            (folder / name).chmod(0o600)
+        return folder
+
+    @property
+    def target(self) -> str:
+        """Where it listens."""
+        return f"127.0.0.1:{self._port}"
+
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        assert self._process is not None
+        return self._process.pid
+
+    def start(self) -> float:
+        """Start it with as many open files as the unit allows; returns when."""
+        limit = min(open_files_of(UNIT), resource.getrlimit(resource.RLIMIT_NOFILE)[1])
+        command = [sys.executable, "-m", "bench.control.watched", str(self._turns), "--config", str(self._config)]
+        began = time.monotonic()
+        with (self._folder / "controlplane.log").open("ab") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdout=log,
+                stderr=log,
+                preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit)),
+            )
+        return began
+
+    def kill(self) -> None:
+        """SIGKILL, as when the power goes."""
+        assert self._process is not None
+        self._process.kill()
+        self._process.wait()
+
+    def processor_s(self) -> float:
+        """Processor time it has used."""
+        return processor_s(self.pid)
+
+    def resident_kb(self) -> int:
+        """Memory it holds."""
+        text = Path(f"/proc/{self.pid}/status").read_text()
+        return int(text.partition("VmRSS:")[2].split()[0])
+
+    def hold(self) -> Hold:
+        """The longest turn of its event loop since the last look."""
+        self._turns.unlink(missing_ok=True)
+        os.kill(self.pid, signal.SIGUSR1)
+        give_up_at = time.monotonic() + PATIENCE_S
+        while not self._turns.exists():
+            if time.monotonic() > give_up_at:
+                raise PlaneError(f"it does not answer; see {self._folder}")
+            time.sleep(0.02)
+        found = json.loads(self._turns.read_text())
+        what = found["turns"][0][2] if found["turns"] else "nothing"
+        return Hold(found["cpu_s"], found["wall_s"], what)
+
+    def metric(self, name: str) -> float:
+        """The value of a series, with its labels as they are written."""
+        with urlopen(f"http://127.0.0.1:{self._metrics_port}/metrics", timeout=PATIENCE_S) as answer:
+            lines = answer.read().decode().splitlines()
+        return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(f"{name} "))
+
+    def status_s(self) -> float:
+        """How long `plr status` takes, from its start to its end."""
+        command = [sys.executable, "-m", "controlplane.cli", "status", "--address", self.target]
+        began = time.monotonic()
+        subprocess.run(
+            [*command, "--tls-dir", str(self._operator)], check=True, stdout=subprocess.DEVNULL, timeout=PATIENCE_S
+        )
+        return time.monotonic() - began
+
+
+def open_files_of(unit: Path) -> int:
+    """Return how many files a systemd unit lets its program have open."""
+    parser = configparser.RawConfigParser(strict=False)
+    parser.read_string(unit.read_text())
+    return int(parser.get("Service", "LimitNOFILE", fallback=USUAL_OPEN_FILES))

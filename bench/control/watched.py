@@ -1,0 +1,87 @@
+"""Runs the real control plane, and notes how long each turn of its event loop held it.
+
+`python -m bench.control.watched FILE --config ...` starts `plr-controlplane` with these arguments. On SIGUSR1 it writes
+what it noted since the last time to FILE, as one JSON object: the longest turns, in seconds of the loop's processor
+time and of the clock. A shared machine stretches the latter.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from controlplane.__main__ import main as controlplane_main
+
+KEPT = 20
+NOTED_FROM_S = 0.002
+"""Shorter turns are of no interest, and naming them would cost more than they do."""
+
+
+class Turns:
+    """The longest turns since the last look."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._worst: list[tuple[float, float, str]] = []
+
+    def note(self, cpu_s: float, wall_s: float, handle: Any) -> None:
+        """One turn has ended."""
+        item = (cpu_s, wall_s, describe(handle))
+        if len(self._worst) < KEPT:
+            heapq.heappush(self._worst, item)
+        else:
+            heapq.heappushpop(self._worst, item)
+
+    def write(self) -> None:
+        """Write them to the file, whole or not at all, and begin anew."""
+        worst, self._worst = sorted(self._worst, reverse=True), []
+        found = {
+            "cpu_s": max((cpu for cpu, _, _ in worst), default=0.0),
+            "wall_s": max((wall for _, wall, _ in worst), default=0.0),
+            "turns": worst,
+        }
+        partial = self._file.with_suffix(".part")
+        partial.write_text(json.dumps(found))
+        os.replace(partial, self._file)
+
+
+def describe(handle: Any) -> str:
+    """Name what a turn ran: a task by its coroutine."""
+    callback = handle._callback
+    owner = getattr(callback, "__self__", None)
+    if isinstance(owner, asyncio.Task):
+        return getattr(owner.get_coro(), "__qualname__", repr(owner))
+    return getattr(callback, "__qualname__", repr(callback))
+
+
+def watch(turns: Turns) -> None:
+    """Measure every turn of this process's event loops from now on."""
+    run = asyncio.events.Handle._run  # type: ignore[attr-defined]  # there is no public hook
+
+    def timed(handle: Any) -> None:
+        wall, cpu = time.perf_counter(), time.thread_time()
+        run(handle)
+        wall_s = time.perf_counter() - wall
+        if wall_s >= NOTED_FROM_S:
+            turns.note(time.thread_time() - cpu, wall_s, handle)
+
+    asyncio.events.Handle._run = timed  # type: ignore[attr-defined]
+
+
+def main() -> int:
+    """Command line."""
+    turns = Turns(Path(sys.argv[1]))
+    watch(turns)
+    signal.signal(signal.SIGUSR1, lambda *_: turns.write())
+    return controlplane_main(sys.argv[2:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,65 @@
+"""How often sidecars report and how long their leases last: by how many they are, and how busy the control plane is.
+
+A report costs the same in a fleet of ten as in one of ten thousand. So its interval grows with the square root of the
+number: ten sidecars report at the configured interval, a thousand at ten times it, and together they send a hundred
+times as much instead of a thousand. What cannot wait is reported at once whatever the interval (`ControlSession`). A
+control plane that is busy all the same stretches the interval further.
+"""
+
+from __future__ import annotations
+
+import math
+
+FULL_PACE = 10
+"""So many sidecars report at the configured interval."""
+
+MAX_INTERVAL_S = 10.0
+"""The most that pacing makes of a shorter interval: histograms fade with a minute's half-life."""
+
+REPORTS_PER_LEASE = 3.0
+"""A lease outlasts two lost reports; heartbeats, a third of a lease apart, then cost nothing beside reports."""
+
+BUSY, IDLE = 0.6, 0.3
+"""Shares of one core above which intervals are stretched, and below which that is taken back."""
+
+BUSY_WEIGHT = 0.2
+"""Of the newest look, each second, in the average: what is over in a second or two stretches nothing."""
+
+STRETCH_STEP = 1.25
+MAX_STRETCH = 8.0
+
+WORTH_TELLING = 1.25
+"""Sidecars are told of another interval when it differs by this factor: not at each one that comes."""
+
+
+class Pacing:
+    """The interval and the lease in force, from the configured ones in seconds."""
+
+    def __init__(self, *, interval_s: float, lease_s: float) -> None:
+        self._least_interval_s = interval_s
+        self._least_lease_s = lease_s
+        self._stretch = 1.0
+        self._busy = 0.0
+        self.interval_s = interval_s
+
+    @property
+    def lease_s(self) -> float:
+        """How long a sidecar may be silent."""
+        return max(self._least_lease_s, REPORTS_PER_LEASE * self.interval_s)
+
+    def follow(self, sidecars: int, busy: float | None = None) -> None:
+        """So many are registered; `busy` is the share of one core that the control plane took lately, if it is new."""
+        if busy is not None:
+            self._busy += BUSY_WEIGHT * (busy - self._busy)
+            if self._busy > BUSY:
+                self._stretch = min(self._stretch * STRETCH_STEP, MAX_STRETCH)
+            elif self._busy < IDLE:
+                self._stretch = max(self._stretch / STRETCH_STEP, 1.0)
+        most = max(MAX_INTERVAL_S, self._least_interval_s)
+        paced = self._least_interval_s * math.sqrt(max(sidecars, FULL_PACE) / FULL_PACE)
+        wanted = min(paced * self._stretch, most)
+        if not 1.0 / WORTH_TELLING < wanted / self.interval_s < WORTH_TELLING or wanted in (
+            self._least_interval_s,
+            most,
+        ):
+            self.interval_s = wanted
