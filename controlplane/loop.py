@@ -268,12 +268,15 @@ class ControlLoop:
                 picture = self._core.start_solving(now)
                 if picture is not None:
                     solving.create_task(self._solve(picture))
+                drawn_s = self._loop.time() - now
                 if now >= metrics_at:
                     self._core.follow_load(used.share(time.thread_time(), now))
                     self._update_metrics(now)
                     metrics_at = now + METRICS_INTERVAL_S
                 self._dispatch_quietly()
-                await self._sleep_until(min(metrics_at, self._core.next_timer() or metrics_at))
+                # What takes several turns takes half of the loop's time at most: streams have the other half.
+                next_at = max(self._core.next_timer() or metrics_at, self._loop.time() + drawn_s)
+                await self._sleep_until(min(metrics_at, next_at))
         self._executor.shutdown()
 
     def _dispatch_quietly(self) -> None:

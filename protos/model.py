@@ -330,6 +330,8 @@ class Welcome:
     report_interval_s: float
     stun_servers: tuple[str, ...] = ()
     crl: bytes = field(default=b"", repr=False)
+    reconnect_max_s: float = 0.0
+    """The most between two attempts to connect again; 0: not told."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,7 +61,7 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
 
     from controlplane.core.policy import Policy
     from protos.explanation import Explanation
@@ -200,7 +200,7 @@ class ControlCore:
         if self.estimator.merge(name, report, now):
             change = Change.PATH
         if change is not Change.REPORT:
-            self._drawing.robot_changed(name)
+            self._drawing.robot_changed(name, anew=change is not Change.PATH)
         self._debounce.note(change, now)
         if reaches_again:
             self._publish_soon(now)
@@ -223,7 +223,9 @@ class ControlCore:
         interval_s = self.pacing.interval_s
         self.registry.tell_lease(name)
         self._told_intervals[name] = interval_s
-        welcome = Welcome(self.registry.lease_s, interval_s, self._settings.stun_servers, self._crl)
+        welcome = Welcome(
+            self.registry.lease_s, interval_s, self._settings.stun_servers, self._crl, self.pacing.reconnect_max_s
+        )
         self._events.append(Send(stream, welcome))
 
     def follow_load(self, busy: float | None = None) -> None:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 SLICE_PAIRS = 40
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""
 
+KEPT_PAIRS = 8
+"""Pairs whose estimates are kept take as long as one that is estimated."""
+
 ROUTINE_PAIRS = 4000
 """Pairs estimated between two routine solvings because of reports alone: a tenth of a processor."""
 
@@ -97,13 +100,14 @@ class Drawing:
         self._drawn: dict[BlockKey, _Drawn] = {}
         self._at: dict[NodeName, float] = {}
         """When each robot was drawn last."""
-        self._urgent: dict[NodeName, None] = {}
+        self._urgent: dict[NodeName, bool] = {}
+        """Robots to draw whatever it costs, and whether their pairs are to be estimated anew."""
         self._surprise: dict[NodeName, float] = {}
         """Robots that reported since they were drawn, and their misses beyond those believed in."""
         self._routine = False
-        self._queue: list[NodeName] | None = None
+        self._queue: list[tuple[NodeName, bool]] | None = None
         """Robots still to be drawn for the next picture, the last one first; None until looked for."""
-        self._rest: tuple[NodeName, list[tuple[BlockKey, _Inputs]]] | None = None
+        self._rest: tuple[NodeName, bool, list[tuple[BlockKey, _Inputs]]] | None = None
         """The robot that is being drawn, and its uses that are still to be, the last one first."""
 
     # ── what changed ──
@@ -112,9 +116,13 @@ class Drawing:
         """A sidecar, its addresses or services, or the policy changed."""
         self._frame = None
 
-    def robot_changed(self, robot: NodeName) -> None:
-        """Draw this robot in the next picture whatever it costs."""
-        self._urgent[robot] = None
+    def robot_changed(self, robot: NodeName, *, anew: bool = True) -> None:
+        """Draw this robot in the next picture whatever it costs.
+
+        Unless `anew`, pairs that it has already keep their estimates: its paths changed, not what is known of them.
+        When a server dies that is so for all of its robots, and they are to have other mappings within a second.
+        """
+        self._urgent[robot] = anew or self._urgent.get(robot, False)
 
     def reported(self, robot: NodeName, report: Report) -> bool:
         """A robot's report was merged into the estimates; True if it misses far more deadlines than was believed."""
@@ -145,19 +153,21 @@ class Drawing:
             self._put_back()
             self._frame = self._look_around(sidecars, permits)
         if self._queue is None:
-            self._queue = self._next_routine(self._frame, now) if self._routine else []
-        self._queue += reversed(self._urgent)
+            routine = self._next_routine(self._frame, now) if self._routine else []
+            self._queue = [(name, True) for name in routine]
+        self._queue += reversed(self._urgent.items())
         self._urgent.clear()
         pairs = 0
         while (self._rest or self._queue) and pairs < SLICE_PAIRS:
             if self._rest is None:
-                robot = self._queue.pop()
-                self._rest = robot, list(reversed(self._frame.uses.get(robot, ())))
-                self._at[robot] = now
-                self._surprise.pop(robot, None)
-            robot, uses = self._rest
+                robot, anew = self._queue.pop()
+                self._rest = robot, anew, list(reversed(self._frame.uses.get(robot, ())))
+                if anew or robot not in self._at:
+                    self._at[robot] = now
+                    self._surprise.pop(robot, None)
+            robot, anew, uses = self._rest
             if uses:
-                pairs += self._draw_use(*uses.pop(), estimator, now)
+                pairs += self._draw_use(*uses.pop(), estimator, now, anew=anew)
             if not uses:
                 self._rest = None
         return not self._queue and not self._rest
@@ -165,7 +175,8 @@ class Drawing:
     def _put_back(self) -> None:
         """A robot of which some uses were drawn is drawn anew."""
         if self._rest is not None:
-            self._urgent[self._rest[0]] = None
+            robot, anew, _ = self._rest
+            self.robot_changed(robot, anew=anew)
             self._rest = None
 
     def picture(self) -> Picture:
@@ -207,7 +218,7 @@ class Drawing:
         self._forget_others(uses)
         for name, wanted in uses.items():
             if any(key not in self._drawn or self._drawn[key].inputs != inputs for key, inputs in wanted):
-                self._urgent[name] = None
+                self.robot_changed(name, anew=False)
         return _Frame(uses, fleet_capacity)
 
     def _forget_others(self, uses: Mapping[NodeName, tuple[tuple[BlockKey, _Inputs], ...]]) -> None:
@@ -231,20 +242,28 @@ class Drawing:
     def _is_due(self, robot: NodeName, now: float) -> bool:
         return robot in self._surprise or now - self._at.get(robot, now) >= STALE_S
 
-    def _draw_use(self, key: BlockKey, inputs: _Inputs, estimator: Estimator, now: float) -> int:
-        """Returns the pairs that were estimated."""
+    def _draw_use(self, key: BlockKey, inputs: _Inputs, estimator: Estimator, now: float, *, anew: bool) -> int:
+        """Returns the pairs that were estimated, or as many as that took time for."""
         before = self._drawn.get(key)
         if inputs.unserved:
             servers = tuple(cloud.name for cloud in inputs.clouds)
             self._drawn[key] = _Drawn(inputs, None, BlockNotes(servers, unserved=inputs.unserved))
             return 0
+        known = before.block if before is not None and not anew and before.inputs.use == inputs.use else None
         block, notes = draw_block(
-            inputs.robot, inputs.use, inputs.clouds, estimator, now, capacity=self._capacity, barred=inputs.barred
+            inputs.robot,
+            inputs.use,
+            inputs.clouds,
+            estimator,
+            now,
+            capacity=self._capacity,
+            barred=inputs.barred,
+            known=known,
         )
         if before is not None and before.block is not None and is_alike(block, before.block):
             block = before.block
         self._drawn[key] = _Drawn(inputs, block, notes)
-        return inputs.pairs
+        return inputs.pairs if known is None else -(-inputs.pairs // KEPT_PAIRS)
 
 
 def _inputs(

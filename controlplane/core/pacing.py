@@ -28,6 +28,12 @@ BUSY_WEIGHT = 0.2
 STRETCH_STEP = 1.25
 MAX_STRETCH = 8.0
 
+ADMITTED_PER_S = 400.0
+"""Registrations that one core handles in a second, at best."""
+
+LEAST_RECONNECT_S = 1.0
+"""As far apart may the attempts of a small fleet be."""
+
 WORTH_TELLING = 1.25
 """Sidecars are told of another interval when it differs by this factor: not at each one that comes."""
 
@@ -39,6 +45,7 @@ class Pacing:
         self._least_interval_s = interval_s
         self._least_lease_s = lease_s
         self._stretch = 1.0
+        self._sidecars = 0
         self._busy = 0.0
         self.interval_s = interval_s
 
@@ -47,8 +54,14 @@ class Pacing:
         """How long a sidecar may be silent."""
         return max(self._least_lease_s, REPORTS_PER_LEASE * self.interval_s)
 
+    @property
+    def reconnect_max_s(self) -> float:
+        """How far apart a sidecar's attempts to connect may be: so many come back in this time as are let in in it."""
+        return min(max(self._sidecars / ADMITTED_PER_S, LEAST_RECONNECT_S), MAX_INTERVAL_S)
+
     def follow(self, sidecars: int, busy: float | None = None) -> None:
         """So many are registered; `busy` is the share of one core that the control plane took lately, if it is new."""
+        self._sidecars = sidecars
         if busy is not None:
             self._busy += BUSY_WEIGHT * (busy - self._busy)
             if self._busy > BUSY:

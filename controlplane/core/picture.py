@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from controlplane.core.block_rules import with_rules
+from controlplane.core.posterior import Estimate
 from controlplane.core.problem import Block, BlockKey, Problem
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from controlplane.core.estimator import Estimator
-    from controlplane.core.posterior import Estimate
     from controlplane.core.problem import Path
     from controlplane.core.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceUse
@@ -61,11 +61,13 @@ def draw_block(
     *,
     capacity: int,
     barred: frozenset[tuple[InterfaceName, NodeName]] = frozenset(),
+    known: Block | None = None,
 ) -> tuple[Block, BlockNotes]:
     """One robot's use of a service on these clouds, of which there is one at least, as of its interfaces.
 
     Only paths that are up are candidates, unless none is, and none of the pairs that are `barred`, of which not all
-    may be. Paths to servers that the robot penalises are candidates only if all are such.
+    may be. Paths to servers that the robot penalises are candidates only if all are such. What is in `known` is not
+    estimated anew.
     """
     interfaces = interfaces_of(robot)
     servers = tuple(cloud.name for cloud in clouds)
@@ -83,9 +85,13 @@ def draw_block(
     lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
     reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
 
+    kept = _estimates(known) if known is not None else {}
+
     def estimate(interface: InterfaceName, server: NodeName) -> Estimate | None:
         if (interface, server) not in up:
             return None
+        if (interface, server) in kept:
+            return kept[interface, server]
         return estimator.estimate(robot.name, interface, server, use.name, use.deadline_s, now)
 
     estimates = [[estimate(interface, server) for server in reached] for interface in lit]
@@ -101,6 +107,15 @@ def draw_block(
         weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
     return with_rules(block, robot, use, clouds), BlockNotes(servers, dark, all_dark, barred, penalised)
+
+
+def _estimates(block: Block) -> dict[tuple[InterfaceName, NodeName], Estimate]:
+    return {
+        (interface, server): Estimate.of(mean, weight)
+        for interface, means, weights in zip(block.interfaces, block.epsilon, block.weights, strict=True)
+        for server, mean, weight in zip(block.servers, means, weights, strict=True)
+        if mean is not None
+    }
 
 
 def _lifts(

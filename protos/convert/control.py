@@ -212,6 +212,7 @@ def control_message_to_proto(value: ControlMessage) -> control_pb2.ControlMessag
                 report_interval_us=microseconds(value.report_interval_s),
                 stun_servers=value.stun_servers,
                 crl=value.crl,
+                reconnect_max_us=microseconds(value.reconnect_max_s),
             )
             return control_pb2.ControlMessage(welcome=welcome)
         case PeerSet():
@@ -285,6 +286,7 @@ def _welcome_from_proto(message: control_pb2.Welcome) -> Welcome:
         report_interval_s=duration(message.report_interval_us, "report_interval_us"),
         stun_servers=tuple(text(server, "stun_servers") for server in message.stun_servers),
         crl=message.crl,
+        reconnect_max_s=duration(message.reconnect_max_us, "reconnect_max_us", zero=True),
     )
 
 

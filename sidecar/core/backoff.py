@@ -26,6 +26,11 @@ class Backoff:
         self._bound_s = min(2.0 * self._bound_s, self._max_s)
         return delay_s
 
+    def set_max(self, max_s: float) -> None:
+        """From now on the bound doubles up to `max_s` only."""
+        self._max_s = max_s
+        self._bound_s = min(self._bound_s, max_s)
+
     def reset(self) -> None:
         """The last attempt went well."""
         self._bound_s = self._first_s

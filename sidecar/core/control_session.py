@@ -228,6 +228,8 @@ class ControlSession:
         if not told_before:
             self.stats.streams += 1
         self.state = ControlState.ONLINE
+        if welcome.reconnect_max_s:
+            self._backoff.set_max(min(max(welcome.reconnect_max_s, RETRY_FIRST_S), RETRY_MAX_S))
         self._heartbeat_interval_s = max(welcome.lease_s / HEARTBEATS_PER_LEASE, MIN_INTERVAL_S)
         self._report_interval_s = max(welcome.report_interval_s, MIN_INTERVAL_S)
         self._heartbeat_at = now + self._heartbeat_interval_s

@@ -714,6 +714,7 @@ class Welcome(_message.Message):
     REPORT_INTERVAL_US_FIELD_NUMBER: _builtins.int
     STUN_SERVERS_FIELD_NUMBER: _builtins.int
     CRL_FIELD_NUMBER: _builtins.int
+    RECONNECT_MAX_US_FIELD_NUMBER: _builtins.int
     lease_us: _builtins.int
     """A sidecar that is silent for longer leaves its peers' view."""
     report_interval_us: _builtins.int
@@ -721,6 +722,8 @@ class Welcome(_message.Message):
     """What the fleet's CAs have revoked, PEM: signed by them, so that the sidecar need not believe the control plane.
     With a newer list the Welcome is sent again.
     """
+    reconnect_max_us: _builtins.int
+    """The most between two attempts to connect again, by the fleet's size. 0: 10 s."""
     @_builtins.property
     def stun_servers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """host:port, to be tried over each interface."""
@@ -732,10 +735,11 @@ class Welcome(_message.Message):
         report_interval_us: _builtins.int = ...,
         stun_servers: _abc.Iterable[_builtins.str] | None = ...,
         crl: _builtins.bytes = ...,
+        reconnect_max_us: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["crl", b"crl", "lease_us", b"lease_us", "report_interval_us", b"report_interval_us", "stun_servers", b"stun_servers"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["crl", b"crl", "lease_us", b"lease_us", "reconnect_max_us", b"reconnect_max_us", "report_interval_us", b"report_interval_us", "stun_servers", b"stun_servers"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
