@@ -33,6 +33,9 @@ SERVICE_NAME = control_pb2.DESCRIPTOR.services_by_name["ControlPlane"].full_name
 REGISTER_TIMEOUT_S = 10.0
 """A stream that says nothing for this long after it was opened is closed: slower than any sidecar's start."""
 
+REGISTERED_AT_ONCE = 4
+"""In one turn of the loop."""
+
 _REFUSAL_CODES = {
     Refusal.OLDER_INCARNATION: grpc.StatusCode.ABORTED,
     Refusal.NAME_TAKEN: grpc.StatusCode.ALREADY_EXISTS,
@@ -75,7 +78,7 @@ class ControlPlaneService:
         self._report_interval_s = report_interval_s
         self._caller = caller
         self._streams = StreamCount()
-        self._turn = asyncio.Lock()
+        self._turn = asyncio.Semaphore(REGISTERED_AT_ONCE)
 
     def add_to(self, server: grpc.aio.Server) -> None:
         """Serve on this server."""
@@ -130,7 +133,7 @@ class ControlPlaneService:
         if not isinstance(registration, Registration):
             raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
         async with self._turn:
-            # One in each turn of the loop: the messages of those who are registered already come between two.
+            # Few in each turn of the loop: the messages of those who are registered already come in between.
             await asyncio.sleep(0)
             result = self._loop.register(registration, caller)
         if isinstance(result, Refusal):

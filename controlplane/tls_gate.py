@@ -50,10 +50,17 @@ MAX_HANDSHAKES_PER_SOURCE = 256
 """Of these, from one address (IPv6: one /64), which may be a NAT with a fleet behind it. A further one ends the oldest
 of the same address."""
 
-MAX_SILENT = 1024
-"""Connections at once that have said nothing yet: no TLS stands behind them, and each costs a descriptor only."""
+TURN_TIMEOUT_S = 15.0
+"""Longest wait for the turn to begin a handshake: as long as a sidecar of a large fleet waits."""
 
-MAX_SILENT_PER_SOURCE = 512
+BEGUN_AT_ONCE = 4
+"""Handshakes begun in one turn of the loop, some milliseconds each."""
+
+MAX_SILENT = 4096
+"""Connections at once that have said nothing yet, or wait for their turn: no TLS stands behind them, and each costs a
+descriptor only."""
+
+MAX_SILENT_PER_SOURCE = 2048
 """Of these, from one address."""
 
 MAX_CONNECTIONS = 2 * 4096 + 64
@@ -119,7 +126,7 @@ class TlsGate:
         """Of the silent ones."""
         self._silent = HalfOpen(MAX_SILENT, MAX_SILENT_PER_SOURCE)
         self._handshakes = HalfOpen(MAX_HANDSHAKES, MAX_HANDSHAKES_PER_SOURCE)
-        self._turn = asyncio.Lock()
+        self._turn = asyncio.Semaphore(BEGUN_AT_ONCE)
         """Fair: who waits longest is next."""
         self._connections: OrderedDict[str, _Connection] = OrderedDict()
         self._of_name: dict[NodeName, OrderedDict[str, None]] = {}
@@ -200,7 +207,7 @@ class TlsGate:
     async def _greet(self, accepted: socket.socket, address: str, source: str) -> None:
         """Wait for the client's first bytes: who says nothing must not keep others from their handshakes.
 
-        Then for its turn: one begins in each turn of the loop. So whatever else is due, as the messages of those who
+        Then for its turn: few begin in each turn of the loop. So whatever else is due, as the messages of those who
         are let in already, is done between two, and who began ends before more begin.
         """
         accepted.setblocking(False)
@@ -208,9 +215,9 @@ class TlsGate:
         try:
             async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
                 await _readable(self._loop, accepted)
-                spoke = True
-                async with self._turn:
-                    await asyncio.sleep(0)
+            spoke = True
+            async with asyncio.timeout(TURN_TIMEOUT_S), self._turn:
+                await asyncio.sleep(0)
         except TimeoutError as error:
             if spoke:
                 self._on_refused(TOO_MANY_HANDSHAKES)

@@ -88,12 +88,9 @@ class Plane:
         command = [sys.executable, "-m", "bench.control.watched", str(self._turns), "--config", str(self._config)]
         began = time.monotonic()
         with (self._folder / "controlplane.log").open("ab") as log:
-            self._process = subprocess.Popen(
-                command,
-                stdout=log,
-                stderr=log,
-                preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit)),
-            )
+            self._process = subprocess.Popen(command, stdout=log, stderr=log)
+        # Not between fork and exec: gRPC's threads of this process would be missing there.
+        resource.prlimit(self._process.pid, resource.RLIMIT_NOFILE, (limit, limit))
         return began
 
     def kill(self) -> None:

@@ -28,8 +28,8 @@ BUSY_WEIGHT = 0.2
 STRETCH_STEP = 1.25
 MAX_STRETCH = 8.0
 
-ADMITTED_PER_S = 400.0
-"""Registrations that one core handles in a second, at best."""
+ADMITTED_PER_S = 150.0
+"""Registrations that one core handles in a second."""
 
 LEAST_RECONNECT_S = 1.0
 """As far apart may the attempts of a small fleet be."""

@@ -131,6 +131,9 @@ class ControlSession:
         self.state = ControlState.OFFLINE
         self.stats = ControlStats()
         self._retry_at = 0.0
+        self._patience_s = WELCOME_TIMEOUT_S
+        """The same and more, as a fleet that comes back all at once waits for its turns: who gives up and begins anew
+        has had its turn for nothing."""
         self._opened_at = 0.0
         self._refused = False
         self._heartbeat_interval_s = 0.0
@@ -229,7 +232,9 @@ class ControlSession:
             self.stats.streams += 1
         self.state = ControlState.ONLINE
         if welcome.reconnect_max_s:
-            self._backoff.set_max(min(max(welcome.reconnect_max_s, RETRY_FIRST_S), RETRY_MAX_S))
+            reconnect_max_s = min(max(welcome.reconnect_max_s, RETRY_FIRST_S), RETRY_MAX_S)
+            self._backoff.set_max(reconnect_max_s)
+            self._patience_s = WELCOME_TIMEOUT_S + reconnect_max_s
         self._heartbeat_interval_s = max(welcome.lease_s / HEARTBEATS_PER_LEASE, MIN_INTERVAL_S)
         self._report_interval_s = max(welcome.report_interval_s, MIN_INTERVAL_S)
         self._heartbeat_at = now + self._heartbeat_interval_s
@@ -338,7 +343,7 @@ class ControlSession:
             case ControlState.OFFLINE:
                 return self._retry_at
             case ControlState.REGISTERING:
-                return self._opened_at + WELCOME_TIMEOUT_S
+                return self._opened_at + self._patience_s
             case ControlState.ONLINE:
                 return min(self._heartbeat_at, self._report_at)
 
@@ -349,7 +354,7 @@ class ControlSession:
 
     def welcome_overdue(self, now: float) -> bool:
         """Whether the stream is to be given up."""
-        return self.state is ControlState.REGISTERING and now >= self._opened_at + WELCOME_TIMEOUT_S
+        return self.state is ControlState.REGISTERING and now >= self._opened_at + self._patience_s
 
     # ── to the control plane ──
 
