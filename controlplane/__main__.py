@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import logging
+import resource
 import signal
 import sys
 import time
@@ -70,6 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> int:
+    _take_descriptors()
     # gRPC takes half a second to import, which checking a configuration need not wait for.
     from controlplane.server import StartError
 
@@ -102,6 +104,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=version.describe("plr-controlplane"))
     return parser
+
+
+def _take_descriptors() -> None:
+    """Have as many files open as the system lets us: a sidecar takes three, and a shell gives 1,024 at first."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def _start_logging(level: str) -> None:

@@ -56,11 +56,11 @@ TURN_TIMEOUT_S = 15.0
 BEGUN_AT_ONCE = 4
 """Handshakes begun in one turn of the loop, some milliseconds each."""
 
-MAX_SILENT = 4096
+MAX_SILENT = 2048
 """Connections at once that have said nothing yet, or wait for their turn: no TLS stands behind them, and each costs a
 descriptor only."""
 
-MAX_SILENT_PER_SOURCE = 2048
+MAX_SILENT_PER_SOURCE = 1024
 """Of these, from one address."""
 
 MAX_CONNECTIONS = 2 * 4096 + 64

@@ -122,6 +122,7 @@ class ControlCore:
         self._publish_at: float | None = None
         self._publications: deque[Iterator[Send | None]] = deque()
         """Begun, and told to some; the first one goes on first."""
+        self._publishing_since = now
         self._events: deque[Event] = deque()
 
     # ── streams ──
@@ -311,7 +312,7 @@ class ControlCore:
             self._publisher.warm_until,
             self._publisher.resend_at,
             self.restlessness.next_time(),
-            -math.inf if self._publications else None,
+            self._publishing_since if self._publications else None,
         )
         return min((time for time in times if time is not None), default=None)
 
@@ -415,6 +416,7 @@ class ControlCore:
     def _begin_publishing(self, publication: Iterator[Send | None], now: float) -> None:
         self._publications.append(publication)
         if len(self._publications) == 1:
+            self._publishing_since = now
             self._go_on_publishing(now)
 
     def _go_on_publishing(self, now: float) -> None:

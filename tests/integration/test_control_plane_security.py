@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import resource
 import socket
 import ssl
 import subprocess
@@ -114,6 +115,8 @@ def test_a_half_open_handshake_ends(plane: SecuredControlPlane) -> None:
 @pytest.mark.audit("sec-7")
 def test_many_half_open_handshakes_do_not_keep_out_who_comes_from_the_same_place(plane: SecuredControlPlane) -> None:
     host, port = plane.address.split(":")
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     with contextlib.ExitStack() as stack:
         with plane.counted("too_many_handshakes"):
             for _ in range(MAX_SILENT_PER_SOURCE + 20):

@@ -424,3 +424,45 @@ def test_versions_in_force_only_grow_and_every_push_gets_its_answer(
         assert reply.version == session.version(kind) >= before
         assert isinstance(reply, Ack) == (reply.version == version)
     assert session.state is ControlState.ONLINE
+
+
+@pytest.mark.audit("ops-18")
+def test_what_is_urgent_is_reported_before_it_is_due_but_not_all_the_time() -> None:
+    session = make_session()
+    session.opened(0.0)
+    session.messages_to_send(0.0)
+    session.receive(Welcome(lease_s=30.0, report_interval_s=10.0), 0.0)
+    session.messages_to_send(0.0)
+    assert not session.report_due(5.0)
+    session.report_at_once(5.0)
+    assert session.report_due(5.0)
+    session.send_report(REPORT, 5.0)
+    assert answer(session, 5.0) == REPORT
+    session.report_at_once(5.1)
+    assert not session.report_due(5.9)
+    assert session.report_due(6.0)
+    session.send_report(REPORT, 6.0)
+    answer(session, 6.0)
+    assert session.next_timer() == 16.0
+
+
+@pytest.mark.audit("ops-18")
+def test_another_interval_does_not_put_off_the_report_that_is_due_soon() -> None:
+    session = online(make_session())
+    session.receive(Welcome(lease_s=30.0, report_interval_s=10.0), 0.4)
+    assert session.report_due(0.5)
+
+
+@pytest.mark.audit("ops-16")
+def test_a_fleet_that_is_told_so_comes_back_within_the_time_told_and_waits_for_its_turn() -> None:
+    session = make_session()
+    session.opened(0.0)
+    assert session.next_timer() == WELCOME_TIMEOUT_S
+    session.receive(Welcome(lease_s=3.0, report_interval_s=0.5, reconnect_max_s=2.0), 0.0)
+    delays = []
+    for attempt in range(40):
+        session.closed(float(attempt), refused=attempt % 2 == 0)
+        delays.append(session.retry_at - attempt)
+        session.opened(100.0)
+    assert max(delays) <= 2.0 < sum(sorted(delays)[-2:])
+    assert session.next_timer() == 100.0 + WELCOME_TIMEOUT_S + 2.0

@@ -1,0 +1,110 @@
+"""A large fleet at the core: what is told when, and how much is done in one go."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from controlplane.core import control, drawing
+from controlplane.core.estimator import Estimator
+from protos.model import Heartbeat, MappingSet, PeerSet
+from tests.sim.control_world import SETTLED_S
+from tests.unit.controlplane.samples import path
+
+if TYPE_CHECKING:
+    from tests.sim.control_world import SimSidecar, World
+
+ROBOTS = 60
+
+
+def fleet(world: World) -> list[SimSidecar]:
+    world.cloud("a"), world.cloud("b")
+    robots = [world.robot(f"robot-{number:03}") for number in range(ROBOTS)]
+    world.run(SETTLED_S)
+    for robot in robots:
+        world.all_up(robot, ("a", "b"))
+    world.run(SETTLED_S)
+    return robots
+
+
+@pytest.mark.audit("ops-18")
+def test_those_registered_learn_of_a_longer_interval_when_they_speak(world: World) -> None:
+    robots = fleet(world)
+    assert robots[0].welcomes[0].report_interval_s == 0.5
+    assert robots[0].welcomes[-1].report_interval_s > 0.5
+    assert robots[0].welcomes[-1].lease_s == max(world.settings.lease_s, 3 * robots[0].welcomes[-1].report_interval_s)
+    before = len(robots[0].welcomes)
+    world.say(robots[0], Heartbeat())
+    assert len(robots[0].welcomes) == before
+
+
+@pytest.mark.audit("ops-18")
+def test_a_lease_is_as_long_as_the_sidecar_was_told(world: World) -> None:
+    robots = fleet(world)
+    name = robots[0].name
+    told = robots[0].welcomes[-1].lease_s
+    assert world.core.registry.told_lease_s(name) == told
+    world.say(robots[0], Heartbeat())
+    assert world.core.registry.lease_end(name) == pytest.approx(world.now + told)
+
+
+@pytest.mark.audit("ops-19")
+def test_a_publication_takes_turns_and_reaches_all(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    robots = fleet(world)
+    monkeypatch.setattr(control, "PUBLISHED_AT_ONCE", 7)
+    for robot in robots:
+        robot.received.clear()
+    world.cloud("c")
+    turns = 0
+    most = 0
+    for _ in range(200):
+        timer = world.core.next_timer()
+        assert timer is not None
+        world.now = max(world.now, min(timer, world.now + 0.05))
+        before = sum(len(robot.received) for robot in robots)
+        world.core.handle_timer(world.now)
+        world.dispatch()
+        told = sum(len(robot.peer_sets) + len(robot.mapping_sets) for robot in robots)
+        most = max(most, sum(len(robot.received) for robot in robots) - before)
+        turns += most > 0
+        if told >= ROBOTS and all(robot.peer_sets for robot in robots):
+            break
+    assert all("c" in robot.peer_names for robot in robots)
+    assert turns > ROBOTS / 8
+    assert most <= 2 * 8
+
+
+@pytest.mark.audit("ops-20")
+def test_a_dead_server_costs_no_estimates_anew(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    robots = fleet(world)
+    assert {*robots[0].pairs().values()} == {"a", "b"}
+    estimated = []
+    estimate = Estimator.estimate
+
+    def counting(self: Estimator, *asked: object) -> object:
+        estimated.append(asked)
+        return estimate(self, *asked)  # type: ignore[arg-type]  # passed through
+
+    monkeypatch.setattr(Estimator, "estimate", counting)
+    monkeypatch.setattr(drawing, "ROUTINE_PAIRS", 0)
+    for robot in robots:
+        world.report(
+            robot, *(path(nic, server, up=server != "a") for nic in ("wlan0", "wwan0") for server in ("a", "b"))
+        )
+    world.run(0.2)
+    assert all({*robot.pairs().values()} == {"b"} for robot in robots)
+    # One robot may be drawn as a matter of routine.
+    assert len(estimated) <= 8
+
+
+@pytest.mark.audit("ops-19")
+def test_nobody_is_told_again_what_did_not_change(world: World) -> None:
+    robots = fleet(world)
+    clouds = [sidecar for sidecar in world.sidecars.values() if sidecar not in robots]
+    for sidecar in world.sidecars.values():
+        sidecar.received.clear()
+    world.robot("another")
+    world.run(SETTLED_S)
+    assert all(len(cloud.peer_sets) == 1 for cloud in clouds)
+    assert not [one for robot in robots for one in robot.received if isinstance(one, PeerSet | MappingSet)]
