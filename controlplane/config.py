@@ -88,7 +88,11 @@ class ControlPlaneConfig(BaseModel):
         "handover or a lost TCP segment takes seconds, and dead paths are noticed by the data plane much sooner.",
     )
     report_interval_ms: int = Field(
-        default=500, ge=50, le=60_000, description="How often sidecars report what they measured."
+        default=500,
+        ge=50,
+        le=60_000,
+        description="How often ten sidecars report what they measured; more of them less often, up to 10 s "
+        "apart. What cannot wait they report at once.",
     )
     warm_up_ms: int = Field(
         default=RECONNECT_MAX_MS + 2000,

@@ -197,12 +197,15 @@ class ControlCore:
         report, left_out = believable(report, name, self.registry, self.permits)
         self.counters.reports += 1
         self.counters.report_entries_forbidden += left_out
-        change = Change.MISSES if self._drawing.reported(name, report) else Change.REPORT
+        surprised = self._drawing.reported(name, report)
+        change = Change.MISSES if surprised else Change.REPORT
         if self.estimator.merge(name, report, now):
             change = Change.PATH
         if change is not Change.REPORT:
-            self._drawing.robot_changed(name, anew=change is not Change.PATH)
+            self._drawing.robot_changed(name, anew=surprised)
         self._debounce.note(change, now)
+        # What else it says is estimated with the next routine drawing.
+        self._debounce.note(Change.REPORT, now)
         if reaches_again:
             self._publish_soon(now)
 

@@ -262,6 +262,9 @@ class ControlSession:
             self._nack(apply.resource, apply.content.nonce, error)
             return
         self._in_force[apply.resource] = apply.content.version
+        if apply.resource is ResourceKind.PEERS:
+            # A control plane that has just started believes what is said of a server only once that is back, too.
+            self._report_at = min(self._report_at, self._soonest_report())
         self._ack(apply.resource, apply.content.nonce)
 
     def _keep_if_refused(self, apply: Apply, *, refused: bool) -> None:
@@ -325,8 +328,10 @@ class ControlSession:
 
         The fleet's size counts all the same, as it may have happened to all: two reports are a tenth of it apart.
         """
-        gap_s = max(self._report_interval_s * URGENT_PART, URGENT_LEAST_S)
-        self._report_at = min(self._report_at, max(now, self._reported_at + gap_s))
+        self._report_at = min(self._report_at, max(now, self._soonest_report()))
+
+    def _soonest_report(self) -> float:
+        return self._reported_at + max(self._report_interval_s * URGENT_PART, URGENT_LEAST_S)
 
     def send_report(self, report: Report, now: float) -> None:
         """Send what was measured since the last report; one that holds nothing is left out."""

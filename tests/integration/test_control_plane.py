@@ -143,6 +143,8 @@ def test_after_a_restart_versions_grow_and_robots_keep_their_peers_meanwhile(tmp
                 with cloud(plane.address, "cloud-a"):
                     again = r.peers("cloud-a", "cloud-b")
                     assert again.version > peers.version
+                    # As every robot does with new peers: who was not back when it reported first is believed in now.
+                    r.send(Report(paths=known))
                     assert r.mapping("cloud-a", "cloud-b").version > mapping.version
 
 

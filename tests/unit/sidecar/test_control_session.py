@@ -466,3 +466,17 @@ def test_a_fleet_that_is_told_so_comes_back_within_the_time_told_and_waits_for_i
         session.opened(100.0)
     assert max(delays) <= 2.0 < sum(sorted(delays)[-2:])
     assert session.next_timer() == 100.0 + WELCOME_TIMEOUT_S + 2.0
+
+
+@pytest.mark.audit("ops-18")
+def test_new_peers_are_reported_on_soon() -> None:
+    session = make_session()
+    session.opened(0.0)
+    session.messages_to_send(0.0)
+    session.receive(Welcome(lease_s=30.0, report_interval_s=10.0), 0.0)
+    session.messages_to_send(0.0)
+    event = session.receive(peers(5), 2.0)
+    assert isinstance(event, Apply)
+    assert not session.report_due(2.0)
+    session.applied(event, None)
+    assert session.report_due(2.0)
