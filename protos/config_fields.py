@@ -99,7 +99,10 @@ def _check_absolute(path: Path) -> Path:
     return path
 
 
-TlsDir = Annotated[Path, AfterValidator(_check_absolute)]
+AbsolutePath = Annotated[Path, AfterValidator(_check_absolute)]
+"""A folder: relative to what, a service would not know."""
+
+TlsDir = AbsolutePath
 """Folder of a node's certificate files."""
 
 RemoteAddress = Annotated[str, AfterValidator(check_remote)]

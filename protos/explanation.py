@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from protos.fleet_events import Why
     from protos.histogram import Histogram
     from protos.model import Assignment, InterfaceName, NodeName, ServiceMapping, ServiceName, Version
     from protos.status import ResourceStatus
@@ -166,3 +167,6 @@ class Explanation:
     alternatives: tuple[Alternative, ...] = ()
     changes: tuple[MappingChange, ...] = ()
     """The last ones, the newest first."""
+    gone_s: float | None = None
+    """Since when the robot is gone: all else is what was known last, as of then. None: it is there."""
+    gone_why: Why | None = None

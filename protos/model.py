@@ -68,6 +68,9 @@ MAX_PATHS = 4096
 MAX_JOINTS = 1024
 """Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers. As many of interfaces."""
 
+MAX_UNMET = 64
+"""Services told of that a configuration names and nobody serves."""
+
 MAX_PENALTIES = 1024
 """Servers in one report whose answers could not be delivered."""
 
@@ -307,6 +310,8 @@ class ServiceSet:
 
     offers: tuple[ServiceOffer, ...] = ()
     uses: tuple[ServiceUse, ...] = ()
+    unmet: tuple[ServiceName, ...] = ()
+    """That its configuration names and nobody serves, at most MAX_UNMET; for the operator."""
 
 
 @dataclass(frozen=True, slots=True)

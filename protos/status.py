@@ -50,3 +50,5 @@ class SidecarStatus:
     refused_offers: tuple[ServiceName, ...] = ()
     """What it offers and the policy does not let it."""
     revocations: RevocationSet = NO_REVOCATIONS
+    unmet: tuple[ServiceName, ...] = ()
+    """Services that its configuration names and nobody serves."""

@@ -17,6 +17,17 @@ from protos.convert.control import (
     sidecar_message_from_proto,
     sidecar_message_to_proto,
 )
+from protos.convert.events import (
+    departed_from_proto,
+    departed_to_proto,
+    event_list_from_proto,
+    event_query_from_proto,
+    event_query_to_proto,
+    event_to_proto,
+    events_from_proto,
+    log_state_from_proto,
+    log_state_to_proto,
+)
 from protos.convert.explanation import explain_request_from_proto, explanation_from_proto, explanation_to_proto
 from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
 from protos.convert.reports import report_from_proto, report_to_proto
@@ -42,11 +53,20 @@ __all__ = [
     "candidate_to_proto",
     "control_message_from_proto",
     "control_message_to_proto",
+    "departed_from_proto",
+    "departed_to_proto",
+    "event_list_from_proto",
+    "event_query_from_proto",
+    "event_query_to_proto",
+    "event_to_proto",
+    "events_from_proto",
     "explain_request_from_proto",
     "explanation_from_proto",
     "explanation_to_proto",
     "histogram_from_proto",
     "histogram_to_proto",
+    "log_state_from_proto",
+    "log_state_to_proto",
     "mapping_set_from_proto",
     "mapping_set_to_proto",
     "offer_from_proto",

@@ -20,7 +20,7 @@ from protos.convert.fields import (
 from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
 from protos.convert.reports import path_from_proto, path_to_proto
 from protos.convert.types import peer_from_proto, peer_to_proto, service_names, use_from_proto, use_to_proto
-from protos.model import MAX_PATHS, NO_REVOCATIONS, RevocationSet
+from protos.model import MAX_PATHS, MAX_UNMET, NO_REVOCATIONS, RevocationSet
 from protos.names import clean_text, text
 from protos.plr.v1 import admin_pb2
 from protos.status import ResourceStatus, SidecarStatus, SyncState
@@ -67,6 +67,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
         refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
         revocations=revocations_from_proto(message.revocations),
+        unmet=service_names(message.unmet, MAX_UNMET, "unmet"),
     )
 
 
@@ -83,6 +84,7 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         paths=map(path_to_proto, status.paths),
         refused_offers=status.refused_offers,
         revocations=revocations_to_proto(status.revocations),
+        unmet=status.unmet,
     )
 
 

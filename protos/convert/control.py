@@ -33,6 +33,7 @@ from protos.convert.types import (
     peer_to_proto,
     role_from_proto,
     role_to_proto,
+    service_names,
     session_from_proto,
     signature_from_proto,
     use_from_proto,
@@ -41,6 +42,7 @@ from protos.convert.types import (
 from protos.errors import DecodeError
 from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import (
+    MAX_UNMET,
     TOKEN_BYTES,
     Ack,
     CandidateSet,
@@ -110,7 +112,8 @@ def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMe
         case "services":
             uses = each(message.services.uses, MAX_USES, "uses", use_from_proto)
             unique((use.name for use in uses), "uses")
-            return ServiceSet(offers_from_proto(message.services.offers), uses)
+            unmet = service_names(message.services.unmet, MAX_UNMET, "unmet")
+            return ServiceSet(offers_from_proto(message.services.offers), uses, unmet)
         case "report":
             return report_from_proto(message.report)
         case "ack":
@@ -164,8 +167,10 @@ def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessag
             return control_pb2.SidecarMessage(register=_registration_to_proto(value))
         case CandidateSet():
             return control_pb2.SidecarMessage(candidates=_candidate_set_to_proto(value))
-        case ServiceSet(offers=offers, uses=uses):
-            services = control_pb2.Services(offers=map(offer_to_proto, offers), uses=map(use_to_proto, uses))
+        case ServiceSet(offers=offers, uses=uses, unmet=unmet):
+            services = control_pb2.Services(
+                offers=map(offer_to_proto, offers), uses=map(use_to_proto, uses), unmet=unmet
+            )
             return control_pb2.SidecarMessage(services=services)
         case Report():
             return control_pb2.SidecarMessage(report=report_to_proto(value))

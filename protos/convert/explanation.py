@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Literal
 
 from protos.convert.admin import resource_from_proto, resource_to_proto
+from protos.convert.events import why_from_proto, why_to_proto
 from protos.convert.fields import (
     MAX_ASSIGNMENTS,
     MAX_DURATION_S,
@@ -101,6 +102,8 @@ def explanation_from_proto(message: admin_pb2.ExplainResponse) -> Explanation:
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
         alternatives=each(message.alternatives, MAX_ALTERNATIVES, "alternatives", _alternative_from_proto),
         changes=each(message.changes, MAX_CHANGES, "changes", _change_from_proto),
+        gone_s=_age(message.gone_us, "gone_us") if message.HasField("gone_us") else None,
+        gone_why=why_from_proto(message.gone_reason) if message.HasField("gone_us") else None,
     )
 
 
@@ -125,6 +128,8 @@ def explanation_to_proto(explanation: Explanation) -> admin_pb2.ExplainResponse:
         joints=map(_joint_to_proto, found.joints),
         alternatives=map(_alternative_to_proto, found.alternatives),
         changes=map(_change_to_proto, found.changes),
+        gone_us=microseconds(found.gone_s) if found.gone_s is not None else None,
+        gone_reason=why_to_proto(found.gone_why),
     )
 
 

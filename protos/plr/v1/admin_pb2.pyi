@@ -45,6 +45,77 @@ SYNC_STATE_SYNCED: SyncState.ValueType  # 3
 SYNC_STATE_REJECTED: SyncState.ValueType  # 4
 Global___SyncState: _TypeAlias = SyncState  # noqa: Y015
 
+class _DepartureReason:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _DepartureReasonEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_DepartureReason.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    DEPARTURE_REASON_UNSPECIFIED: _DepartureReason.ValueType  # 0
+    DEPARTURE_REASON_LEASE_EXPIRED: _DepartureReason.ValueType  # 1
+    """Silent for longer than its lease."""
+    DEPARTURE_REASON_CERTIFICATE_EXPIRED: _DepartureReason.ValueType  # 2
+    DEPARTURE_REASON_REVOKED: _DepartureReason.ValueType  # 3
+    DEPARTURE_REASON_DRAINED: _DepartureReason.ValueType  # 4
+    """It said goodbye, finished what was in flight, and ended its stream."""
+    DEPARTURE_REASON_LEFT: _DepartureReason.ValueType  # 5
+    """It said goodbye, and fell silent before it had finished."""
+    DEPARTURE_REASON_POLICY: _DepartureReason.ValueType  # 6
+    """It is connected, but the access policy leaves it nobody to talk to."""
+
+class DepartureReason(_DepartureReason, metaclass=_DepartureReasonEnumTypeWrapper):
+    """Why a sidecar is gone."""
+
+DEPARTURE_REASON_UNSPECIFIED: DepartureReason.ValueType  # 0
+DEPARTURE_REASON_LEASE_EXPIRED: DepartureReason.ValueType  # 1
+"""Silent for longer than its lease."""
+DEPARTURE_REASON_CERTIFICATE_EXPIRED: DepartureReason.ValueType  # 2
+DEPARTURE_REASON_REVOKED: DepartureReason.ValueType  # 3
+DEPARTURE_REASON_DRAINED: DepartureReason.ValueType  # 4
+"""It said goodbye, finished what was in flight, and ended its stream."""
+DEPARTURE_REASON_LEFT: DepartureReason.ValueType  # 5
+"""It said goodbye, and fell silent before it had finished."""
+DEPARTURE_REASON_POLICY: DepartureReason.ValueType  # 6
+"""It is connected, but the access policy leaves it nobody to talk to."""
+Global___DepartureReason: _TypeAlias = DepartureReason  # noqa: Y015
+
+class _EventKind:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _EventKindEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_EventKind.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    EVENT_KIND_UNSPECIFIED: _EventKind.ValueType  # 0
+    EVENT_KIND_STARTED: _EventKind.ValueType  # 1
+    EVENT_KIND_STOPPED: _EventKind.ValueType  # 2
+    EVENT_KIND_CONNECTED: _EventKind.ValueType  # 3
+    EVENT_KIND_STREAM_LOST: _EventKind.ValueType  # 4
+    EVENT_KIND_DEPARTED: _EventKind.ValueType  # 5
+    EVENT_KIND_REFUSED: _EventKind.ValueType  # 6
+    EVENT_KIND_NACK: _EventKind.ValueType  # 7
+    EVENT_KIND_OFFERS_REFUSED: _EventKind.ValueType  # 8
+    EVENT_KIND_UNMET: _EventKind.ValueType  # 9
+    EVENT_KIND_POLICY: _EventKind.ValueType  # 10
+    EVENT_KIND_CUT_OFF: _EventKind.ValueType  # 11
+    EVENT_KIND_REJOINED: _EventKind.ValueType  # 12
+
+class EventKind(_EventKind, metaclass=_EventKindEnumTypeWrapper): ...
+
+EVENT_KIND_UNSPECIFIED: EventKind.ValueType  # 0
+EVENT_KIND_STARTED: EventKind.ValueType  # 1
+EVENT_KIND_STOPPED: EventKind.ValueType  # 2
+EVENT_KIND_CONNECTED: EventKind.ValueType  # 3
+EVENT_KIND_STREAM_LOST: EventKind.ValueType  # 4
+EVENT_KIND_DEPARTED: EventKind.ValueType  # 5
+EVENT_KIND_REFUSED: EventKind.ValueType  # 6
+EVENT_KIND_NACK: EventKind.ValueType  # 7
+EVENT_KIND_OFFERS_REFUSED: EventKind.ValueType  # 8
+EVENT_KIND_UNMET: EventKind.ValueType  # 9
+EVENT_KIND_POLICY: EventKind.ValueType  # 10
+EVENT_KIND_CUT_OFF: EventKind.ValueType  # 11
+EVENT_KIND_REJOINED: EventKind.ValueType  # 12
+Global___EventKind: _TypeAlias = EventKind  # noqa: Y015
+
 class _PathState:
     ValueType = _typing.NewType("ValueType", _builtins.int)
     V: _TypeAlias = ValueType  # noqa: Y015
@@ -171,6 +242,7 @@ class SidecarStatus(_message.Message):
     PATHS_FIELD_NUMBER: _builtins.int
     REFUSED_OFFERS_FIELD_NUMBER: _builtins.int
     REVOCATIONS_FIELD_NUMBER: _builtins.int
+    UNMET_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
@@ -194,6 +266,10 @@ class SidecarStatus(_message.Message):
 
     @_builtins.property
     def revocations(self) -> _control_pb2.Revocations: ...
+    @_builtins.property
+    def unmet(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Services that its configuration names and nobody serves."""
+
     def __init__(
         self,
         *,
@@ -208,14 +284,203 @@ class SidecarStatus(_message.Message):
         paths: _abc.Iterable[_control_pb2.PathReport] | None = ...,
         refused_offers: _abc.Iterable[_builtins.str] | None = ...,
         revocations: _control_pb2.Revocations | None = ...,
+        unmet: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "uses", b"uses"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unmet", b"unmet", "uses", b"uses"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___SidecarStatus: _TypeAlias = SidecarStatus  # noqa: Y015
+
+@_typing.final
+class DepartedSidecar(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    ROLE_FIELD_NUMBER: _builtins.int
+    REASON_FIELD_NUMBER: _builtins.int
+    GONE_US_FIELD_NUMBER: _builtins.int
+    SEEN_US_FIELD_NUMBER: _builtins.int
+    TEXT_FIELD_NUMBER: _builtins.int
+    SOFTWARE_VERSION_FIELD_NUMBER: _builtins.int
+    SERVICES_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    role: _types_pb2.Role.ValueType
+    reason: Global___DepartureReason.ValueType
+    gone_us: _builtins.int
+    """How long ago it went, and how long ago it said anything."""
+    seen_us: _builtins.int
+    text: _builtins.str
+    software_version: _builtins.str
+    @_builtins.property
+    def services(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Those that it offered or carried, the first of them."""
+
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        role: _types_pb2.Role.ValueType = ...,
+        reason: Global___DepartureReason.ValueType = ...,
+        gone_us: _builtins.int = ...,
+        seen_us: _builtins.int = ...,
+        text: _builtins.str = ...,
+        software_version: _builtins.str = ...,
+        services: _abc.Iterable[_builtins.str] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["gone_us", b"gone_us", "name", b"name", "reason", b"reason", "role", b"role", "seen_us", b"seen_us", "services", b"services", "software_version", b"software_version", "text", b"text"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___DepartedSidecar: _TypeAlias = DepartedSidecar  # noqa: Y015
+
+@_typing.final
+class FleetEvent(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NUMBER_FIELD_NUMBER: _builtins.int
+    AT_US_FIELD_NUMBER: _builtins.int
+    KIND_FIELD_NUMBER: _builtins.int
+    NODE_FIELD_NUMBER: _builtins.int
+    ROLE_FIELD_NUMBER: _builtins.int
+    REASON_FIELD_NUMBER: _builtins.int
+    TEXT_FIELD_NUMBER: _builtins.int
+    number: _builtins.int
+    """Only grows, also over restarts of the control plane."""
+    at_us: _builtins.int
+    """Since 1970."""
+    kind: Global___EventKind.ValueType
+    node: _builtins.str
+    """Empty: the control plane itself."""
+    role: _types_pb2.Role.ValueType
+    reason: Global___DepartureReason.ValueType
+    """Of a departure."""
+    text: _builtins.str
+    def __init__(
+        self,
+        *,
+        number: _builtins.int = ...,
+        at_us: _builtins.int = ...,
+        kind: Global___EventKind.ValueType = ...,
+        node: _builtins.str = ...,
+        role: _types_pb2.Role.ValueType = ...,
+        reason: Global___DepartureReason.ValueType = ...,
+        text: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_us", b"at_us", "kind", b"kind", "node", b"node", "number", b"number", "reason", b"reason", "role", b"role", "text", b"text"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___FleetEvent: _TypeAlias = FleetEvent  # noqa: Y015
+
+@_typing.final
+class EventLogState(_message.Message):
+    """How the log of events is doing."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    KEPT_FIELD_NUMBER: _builtins.int
+    EVICTED_FIELD_NUMBER: _builtins.int
+    TOO_OFTEN_FIELD_NUMBER: _builtins.int
+    DAMAGED_FIELD_NUMBER: _builtins.int
+    WRITE_FAILURES_FIELD_NUMBER: _builtins.int
+    ON_DISK_FIELD_NUMBER: _builtins.int
+    PROBLEM_FIELD_NUMBER: _builtins.int
+    kept: _builtins.int
+    evicted: _builtins.int
+    """Not in it: old ones that made room, those of members that had too many, lines of the file that were damaged."""
+    too_often: _builtins.int
+    damaged: _builtins.int
+    write_failures: _builtins.int
+    on_disk: _builtins.bool
+    """Whether all events are on the disk; if they should be and are not, why."""
+    problem: _builtins.str
+    def __init__(
+        self,
+        *,
+        kept: _builtins.int = ...,
+        evicted: _builtins.int = ...,
+        too_often: _builtins.int = ...,
+        damaged: _builtins.int = ...,
+        write_failures: _builtins.int = ...,
+        on_disk: _builtins.bool = ...,
+        problem: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["damaged", b"damaged", "evicted", b"evicted", "kept", b"kept", "on_disk", b"on_disk", "problem", b"problem", "too_often", b"too_often", "write_failures", b"write_failures"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___EventLogState: _TypeAlias = EventLogState  # noqa: Y015
+
+@_typing.final
+class ListEventsRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NODE_FIELD_NUMBER: _builtins.int
+    AFTER_FIELD_NUMBER: _builtins.int
+    SINCE_US_FIELD_NUMBER: _builtins.int
+    LAST_FIELD_NUMBER: _builtins.int
+    node: _builtins.str
+    """Of this sidecar alone."""
+    after: _builtins.int
+    """Those with a larger number."""
+    since_us: _builtins.int
+    """Not before this time; since 1970."""
+    last: _builtins.int
+    """The last ones of these; 0: all."""
+    def __init__(
+        self,
+        *,
+        node: _builtins.str = ...,
+        after: _builtins.int = ...,
+        since_us: _builtins.int = ...,
+        last: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["after", b"after", "last", b"last", "node", b"node", "since_us", b"since_us"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ListEventsRequest: _TypeAlias = ListEventsRequest  # noqa: Y015
+
+@_typing.final
+class ListEventsResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    EVENTS_FIELD_NUMBER: _builtins.int
+    LEFT_OUT_FIELD_NUMBER: _builtins.int
+    LOG_FIELD_NUMBER: _builtins.int
+    left_out: _builtins.int
+    """Older ones that were asked for, but for `last`."""
+    @_builtins.property
+    def events(self) -> _containers.RepeatedCompositeFieldContainer[Global___FleetEvent]:
+        """The oldest first."""
+
+    @_builtins.property
+    def log(self) -> Global___EventLogState: ...
+    def __init__(
+        self,
+        *,
+        events: _abc.Iterable[Global___FleetEvent] | None = ...,
+        left_out: _builtins.int = ...,
+        log: Global___EventLogState | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["log", b"log"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["events", b"events", "left_out", b"left_out", "log", b"log"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ListEventsResponse: _TypeAlias = ListEventsResponse  # noqa: Y015
 
 @_typing.final
 class GetStatusResponse(_message.Message):
@@ -223,21 +488,40 @@ class GetStatusResponse(_message.Message):
 
     SIDECARS_FIELD_NUMBER: _builtins.int
     REVOCATIONS_FIELD_NUMBER: _builtins.int
+    DEPARTED_FIELD_NUMBER: _builtins.int
+    DEPARTED_LEFT_OUT_FIELD_NUMBER: _builtins.int
+    EVENTS_FIELD_NUMBER: _builtins.int
+    LOG_FIELD_NUMBER: _builtins.int
+    departed_left_out: _builtins.int
     @_builtins.property
     def sidecars(self) -> _containers.RepeatedCompositeFieldContainer[Global___SidecarStatus]: ...
     @_builtins.property
     def revocations(self) -> _control_pb2.Revocations:
         """The control plane's own."""
 
+    @_builtins.property
+    def departed(self) -> _containers.RepeatedCompositeFieldContainer[Global___DepartedSidecar]:
+        """Who is gone, who went last first, and how many more are remembered."""
+
+    @_builtins.property
+    def events(self) -> _containers.RepeatedCompositeFieldContainer[Global___FleetEvent]:
+        """The last ones, the oldest first."""
+
+    @_builtins.property
+    def log(self) -> Global___EventLogState: ...
     def __init__(
         self,
         *,
         sidecars: _abc.Iterable[Global___SidecarStatus] | None = ...,
         revocations: _control_pb2.Revocations | None = ...,
+        departed: _abc.Iterable[Global___DepartedSidecar] | None = ...,
+        departed_left_out: _builtins.int = ...,
+        events: _abc.Iterable[Global___FleetEvent] | None = ...,
+        log: Global___EventLogState | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["revocations", b"revocations"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["log", b"log", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["revocations", b"revocations", "sidecars", b"sidecars"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["departed", b"departed", "departed_left_out", b"departed_left_out", "events", b"events", "log", b"log", "revocations", b"revocations", "sidecars", b"sidecars"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -516,6 +800,8 @@ class ExplainResponse(_message.Message):
     TARGET_MISS_FIELD_NUMBER: _builtins.int
     CHARGE_FIELD_NUMBER: _builtins.int
     PREDICTED_MISS_FIELD_NUMBER: _builtins.int
+    GONE_US_FIELD_NUMBER: _builtins.int
+    GONE_REASON_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     service: _builtins.str
     deadline_us: _builtins.int
@@ -534,6 +820,9 @@ class ExplainResponse(_message.Message):
     """What a request costs with all its copies; absent unless the service is to be cheap."""
     predicted_miss: _builtins.float
     """What is predicted now; `mapping` has what was predicted when it was sent. Absent if nothing is planned."""
+    gone_us: _builtins.int
+    """Present if the robot is gone: how long ago it went, and why. All else is as of then."""
+    gone_reason: Global___DepartureReason.ValueType
     @_builtins.property
     def mapping(self) -> _control_pb2.ServiceMapping:
         """As last sent; absent if nothing was."""
@@ -570,13 +859,17 @@ class ExplainResponse(_message.Message):
         target_miss: _builtins.float = ...,
         charge: _builtins.float | None = ...,
         predicted_miss: _builtins.float | None = ...,
+        gone_us: _builtins.int | None = ...,
+        gone_reason: Global___DepartureReason.ValueType = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "charge", b"charge", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "sync", b"sync"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "charge", b"charge", "gone_us", b"gone_us", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "sync", b"sync"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "alternatives", b"alternatives", "changes", b"changes", "charge", b"charge", "deadline_us", b"deadline_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "alternatives", b"alternatives", "changes", b"changes", "charge", b"charge", "deadline_us", b"deadline_us", "gone_reason", b"gone_reason", "gone_us", b"gone_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__charge: _TypeAlias = _typing.Literal["charge"]  # noqa: Y015
     _WhichOneofArgType__charge: _TypeAlias = _typing.Literal["_charge", b"_charge"]  # noqa: Y015
+    _WhichOneofReturnType__gone_us: _TypeAlias = _typing.Literal["gone_us"]  # noqa: Y015
+    _WhichOneofArgType__gone_us: _TypeAlias = _typing.Literal["_gone_us", b"_gone_us"]  # noqa: Y015
     _WhichOneofReturnType__in_force_us: _TypeAlias = _typing.Literal["in_force_us"]  # noqa: Y015
     _WhichOneofArgType__in_force_us: _TypeAlias = _typing.Literal["_in_force_us", b"_in_force_us"]  # noqa: Y015
     _WhichOneofReturnType__observed_miss: _TypeAlias = _typing.Literal["observed_miss"]  # noqa: Y015
@@ -585,6 +878,8 @@ class ExplainResponse(_message.Message):
     _WhichOneofArgType__predicted_miss: _TypeAlias = _typing.Literal["_predicted_miss", b"_predicted_miss"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__charge) -> _WhichOneofReturnType__charge | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__gone_us) -> _WhichOneofReturnType__gone_us | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__in_force_us) -> _WhichOneofReturnType__in_force_us | None: ...
     @_typing.overload

@@ -45,6 +45,11 @@ class AdminStub:
                 request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.SerializeToString,
                 response_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.FromString,
                 _registered_method=True)
+        self.ListEvents = channel.unary_unary(
+                '/plr.v1.Admin/ListEvents',
+                request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.SerializeToString,
+                response_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.FromString,
+                _registered_method=True)
 
 
 class AdminServicer:
@@ -65,6 +70,13 @@ class AdminServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ListEvents(self, request, context):
+        """What happened in the fleet.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_AdminServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -77,6 +89,11 @@ def add_AdminServicer_to_server(servicer, server):
                     servicer.Explain,
                     request_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.FromString,
                     response_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.SerializeToString,
+            ),
+            'ListEvents': grpc.unary_unary_rpc_method_handler(
+                    servicer.ListEvents,
+                    request_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.FromString,
+                    response_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -134,6 +151,33 @@ class Admin:
             '/plr.v1.Admin/Explain',
             protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.SerializeToString,
             protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ListEvents(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/plr.v1.Admin/ListEvents',
+            protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.SerializeToString,
+            protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.FromString,
             options,
             channel_credentials,
             insecure,

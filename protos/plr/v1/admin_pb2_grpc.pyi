@@ -38,6 +38,8 @@ class AdminStub:
     """Why a robot's requests for a service go where they go. NOT_FOUND, with the nearest name, if there is no such robot
     or it carries no such service.
     """
+    ListEvents: _grpc.UnaryUnaryMultiCallable[_admin_pb2.ListEventsRequest, _admin_pb2.ListEventsResponse]
+    """What happened in the fleet."""
 
 @_typing.type_check_only
 class AdminAsyncStub(AdminStub):
@@ -49,6 +51,8 @@ class AdminAsyncStub(AdminStub):
     """Why a robot's requests for a service go where they go. NOT_FOUND, with the nearest name, if there is no such robot
     or it carries no such service.
     """
+    ListEvents: _aio.UnaryUnaryMultiCallable[_admin_pb2.ListEventsRequest, _admin_pb2.ListEventsResponse]  # type: ignore[assignment]
+    """What happened in the fleet."""
 
 class AdminServicer(metaclass=_abc_1.ABCMeta):
     """Serves the operator's command line."""
@@ -69,5 +73,13 @@ class AdminServicer(metaclass=_abc_1.ABCMeta):
         """Why a robot's requests for a service go where they go. NOT_FOUND, with the nearest name, if there is no such robot
         or it carries no such service.
         """
+
+    @_abc_1.abstractmethod
+    def ListEvents(
+        self,
+        request: _admin_pb2.ListEventsRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_admin_pb2.ListEventsResponse, _abc.Awaitable[_admin_pb2.ListEventsResponse]]:
+        """What happened in the fleet."""
 
 def add_AdminServicer_to_server(servicer: AdminServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

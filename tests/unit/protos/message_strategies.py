@@ -20,6 +20,7 @@ from protos.explanation import (
     MappingChange,
     PairExplanation,
 )
+from protos.fleet_events import DepartedSidecar, EventKind, EventLogState, FleetEvent, Why
 from protos.histogram import BUCKETS, MAX_COUNT, Histogram
 from protos.model import (
     ALL_CALLS,
@@ -270,7 +271,7 @@ revocation_sets = st.builds(
 sidecar_messages: st.SearchStrategy[SidecarMessage] = st.one_of(
     registrations,
     candidate_sets(),
-    st.builds(ServiceSet, _tuples(offers, by="name"), _tuples(uses, by="name")),
+    st.builds(ServiceSet, _tuples(offers, by="name"), _tuples(uses, by="name"), _tuples(service_names)),
     reports,
     st.builds(Ack, st.sampled_from(ResourceKind), versions, uint64),
     st.builds(Nack, st.sampled_from(ResourceKind), versions, uint64, texts),
@@ -293,10 +294,34 @@ statuses = st.builds(
     _tuples(paths),
     _tuples(service_names),
     revocation_sets,
+    _tuples(service_names),
 )
 
 beliefs = st.tuples(probabilities, probabilities, probabilities).map(lambda three: Belief(three[0], *sorted(three[1:])))
 weights = st.floats(0.0, MAX_EVENTS)
+wall_times = st.integers(0, MAX_WALL_S * 1000).map(lambda ms: ms / 1000)
+fleet_events = st.builds(
+    FleetEvent,
+    uint64,
+    wall_times,
+    st.sampled_from(EventKind),
+    st.none() | node_names,
+    texts,
+    st.none() | st.sampled_from(Role),
+    st.none() | st.sampled_from(Why),
+)
+departed_sidecars = st.builds(
+    DepartedSidecar,
+    node_names,
+    st.sampled_from(Role),
+    st.sampled_from(Why),
+    durations | st.just(0.0),
+    durations | st.just(0.0),
+    texts,
+    texts,
+    _tuples(service_names),
+)
+log_states = st.builds(EventLogState, events, events, events, events, events, st.booleans(), texts)
 explained_pairs = st.builds(
     PairExplanation,
     assignments,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -12,8 +13,13 @@ from hypothesis import strategies as st
 from protos.convert import (
     control_message_from_proto,
     control_message_to_proto,
+    departed_from_proto,
+    departed_to_proto,
+    event_list_from_proto,
+    event_to_proto,
     explanation_from_proto,
     explanation_to_proto,
+    log_state_to_proto,
     own_revocations_from_proto,
     parse_control_message,
     parse_sidecar_message,
@@ -25,6 +31,7 @@ from protos.convert import (
 )
 from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_VERSION
 from protos.errors import DecodeError
+from protos.fleet_events import EventList
 from protos.model import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
@@ -54,6 +61,7 @@ from tests.unit.protos import message_strategies as some
 
 if TYPE_CHECKING:
     from protos.explanation import Explanation
+    from protos.fleet_events import DepartedSidecar, EventLogState, FleetEvent
 
 PEERS = control_pb2.RESOURCE_KIND_PEERS
 LEFT = control_pb2.REMOVAL_REASON_LEFT
@@ -77,6 +85,21 @@ def test_statuses_round_trip(statuses: list[SidecarStatus], own: RevocationSet) 
     message = status_to_proto(statuses, own)
     assert status_from_proto(message) == tuple(statuses)
     assert own_revocations_from_proto(message) == own
+
+
+@given(st.lists(some.fleet_events, max_size=3), some.departed_sidecars, some.log_states)
+@settings(max_examples=30)
+def test_events_round_trip(events: list[FleetEvent], gone: DepartedSidecar, state: EventLogState) -> None:
+    message = admin_pb2.ListEventsResponse(events=map(event_to_proto, events), log=log_state_to_proto(state))
+    assert event_list_from_proto(message) == EventList(tuple(events), 0, state)
+    assert departed_from_proto([departed_to_proto(gone)]) == (gone,)
+
+
+@given(some.explanations, some.departed_sidecars)
+@settings(max_examples=10)
+def test_an_explanation_says_who_is_gone(explanation: Explanation, gone: DepartedSidecar) -> None:
+    explanation = replace(explanation, gone_s=gone.gone_s, gone_why=gone.why)
+    assert explanation_from_proto(explanation_to_proto(explanation)) == explanation
 
 
 @given(some.explanations)
