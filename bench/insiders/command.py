@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     with _folder(options.keep_logs) as folder:
         only = tuple(options.only or ("*",))
         attack_s, quiet_s = options.minutes * 60.0, options.quiet_minutes * 60.0
-        outcome = insiders(console, folder, attack_s, quiet_s, only=only, seed=options.seed)
+        outcome = insiders(console, folder, attack_s, quiet_s, only=only, seed=options.seed, apart=True)
     report.show(console, outcome)
     options.out.mkdir(parents=True, exist_ok=True)
     report.write_json(options.out / "insiders.json", outcome)
@@ -82,13 +82,16 @@ def insiders(
     cycle_s: float = CYCLE_S,
     only: tuple[str, ...] = ("*",),
     seed: int = 1,
+    apart: bool = False,
 ) -> Outcome:
-    """One run in a lab of its own."""
+    """One run in a lab of its own. `apart`: the insiders take no processor that an honest program wants."""
     with make_lab(seed) as lab:
         stage = Stage(lab, folder)
         try:
             with console.status("starting the control plane, three clouds and three robots"):
                 stage.start()
+                if apart:
+                    stage.give_processors_to_the_honest()
             return _Run(console, stage, attack_s, quiet_s, cycle_s, only).outcome()
         finally:
             stage.close()

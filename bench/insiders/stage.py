@@ -127,6 +127,9 @@ class Stage:
             self.system.wait_for_offer(part)
         self.system.wait("every path to be up", self._all_up)
         self._start_streams()
+
+    def give_processors_to_the_honest(self) -> None:
+        """Let the insiders have what the honest leave: apart from the network, nothing is shared then."""
         for name in INSIDERS:
             yield_processors(self.system.parts[name])
 
