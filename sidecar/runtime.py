@@ -13,7 +13,16 @@ from protos import interpreter
 from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
 from protos.errors import StartError
-from protos.model import PROTOCOL_VERSION, CandidateKind, Registration, ResourceKind, Role, Version
+from protos.model import (
+    MAX_UNMET,
+    PROTOCOL_VERSION,
+    CandidateKind,
+    Registration,
+    ResourceKind,
+    Role,
+    ServiceName,
+    Version,
+)
 from protos.notifier import Notifier
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar.announcement import Announcer
@@ -43,7 +52,6 @@ if TYPE_CHECKING:
         NodeName,
         PeerSet,
         Report,
-        ServiceName,
         Welcome,
     )
     from protos.tls_files import TlsFiles
@@ -180,7 +188,11 @@ class Sidecar:
         """Tell, once, of those that the configuration names and nobody serves."""
         stats = self._bridge.stats
         met = {*stats.carried, *stats.left_alone, *stats.missing_types}
-        for name in self._unmet.look(met, time.monotonic()):
+        before = self._unmet.unmet
+        news = self._unmet.look(met, time.monotonic())
+        if self._unmet.unmet != before:
+            self._on_services_changed()
+        for name in news:
             if self._config.role is Role.ROBOT:
                 line = told(name, self._data_plane.services_of_peers(), "no server that this robot knows of")
             else:
@@ -270,7 +282,8 @@ class Sidecar:
         )
 
     def _on_services_changed(self) -> None:
-        self._control.set_services(*self._data_plane.services())
+        unmet = sorted(self._unmet.unmet)[:MAX_UNMET]
+        self._control.set_services(*self._data_plane.services(), tuple(map(ServiceName, unmet)))
 
     def _on_reach_changed(self) -> None:
         self._control.try_again()

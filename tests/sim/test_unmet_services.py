@@ -1,0 +1,71 @@
+"""A configured service that nobody serves is told to the operator, with the name that was meant."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from controlplane.core.control_events import UnmetNotice
+from controlplane.core.explanation import UnknownNameError
+from controlplane.status_table import render
+from protos.model import NodeName, ServiceName, ServiceSet
+from tests.sim.control_world import SETTLED_S, World
+from tests.unit.controlplane.samples import offer, use
+
+if TYPE_CHECKING:
+    from controlplane.core.control_events import Event
+
+pytestmark = pytest.mark.audit("ops-5")
+
+WRONG = ServiceName("/plam")
+
+
+def events(world: World) -> list[Event]:
+    found = []
+    while (event := world.core.next_event()) is not None:
+        found.append(event)
+    return found
+
+
+def test_it_stands_in_the_status_with_the_name_that_was_meant() -> None:
+    world = World()
+    world.cloud("a")
+    robot = world.robot()
+    world.say(robot, ServiceSet((), (use(),), (WRONG,)))
+    world.run(SETTLED_S)
+    statuses = world.core.status(world.now)
+    assert [status.unmet for status in statuses] == [(), (WRONG,)]
+    assert "UNMET /plam: configured, and no server that it knows of offers it; did you mean /plan?" in render(statuses)
+
+
+def test_a_cloud_did_not_mean_what_it_offers() -> None:
+    world = World()
+    cloud = world.cloud("a")
+    world.say(cloud, ServiceSet((offer(),), (), (WRONG,)))
+    shown = render(world.core.status(world.now))
+    assert "UNMET /plam: configured, and no node there offers it" in shown
+    assert "did you mean" not in shown
+
+
+def test_explain_suggests_the_name_that_was_meant() -> None:
+    world = World()
+    world.cloud("a")
+    robot = world.robot()
+    world.say(robot, ServiceSet((), (), (WRONG,)))
+    with pytest.raises(UnknownNameError, match=r"configured to carry /plam.*did you mean /plan\?"):
+        world.core.explain(NodeName("robot"), WRONG, world.now)
+
+
+def test_it_is_told_once_and_is_no_news_to_others() -> None:
+    world = World()
+    cloud = world.cloud("a")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    sets, solvings = len(cloud.peer_sets), world.solvings
+    assert robot.stream is not None
+    for _ in range(2):
+        world.core.receive(robot.stream, ServiceSet((), (use(),), (WRONG,)), world.now)
+    assert events(world) == [UnmetNotice(robot.name, (WRONG,))]
+    world.run(SETTLED_S)
+    assert (len(cloud.peer_sets), world.solvings) == (sets, solvings)
