@@ -4,6 +4,7 @@ examples:
   plr status --tls-dir ~/.plr/alice --address control.example.org:50051
   plr status --insecure --json
   plr explain --tls-dir ~/.plr/alice robot-7 /plan
+  plr events --tls-dir ~/.plr/alice --node robot-7 --since 2h
   plr plan --traces drive.csv.gz --request-bytes 120000 --deadline-ms 250 --target 0.01
   plr ca init
   plr ca issue robot-1 --role robot
@@ -29,11 +30,25 @@ from typing import TYPE_CHECKING
 
 from google.protobuf import json_format
 
-from controlplane import explain_command, plan_command, policy_command, status_table, version
+from controlplane import (
+    event_text,
+    events_command,
+    explain_command,
+    plan_command,
+    policy_command,
+    status_table,
+    version,
+)
 from controlplane.admin_client import AskError, add_options, ask
 from controlplane.ca import commands as ca_commands
 from controlplane.config import ControlPlaneConfig
-from protos.convert import own_revocations_from_proto, status_from_proto
+from protos.convert import (
+    departed_from_proto,
+    events_from_proto,
+    log_state_from_proto,
+    own_revocations_from_proto,
+    status_from_proto,
+)
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
@@ -60,11 +75,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=version.describe("plr"))
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    status = commands.add_parser("status", help="who is connected, and how far each follows")
+    status = commands.add_parser("status", help="who is connected, how far each follows, and who is gone")
     add_options(status)
     status.set_defaults(run=_status)
 
     explain_command.add_to(commands)
+    events_command.add_to(commands)
     plan_command.add_to(commands)
     ca_commands.add_to(commands)
 
@@ -80,10 +96,16 @@ def _parser() -> argparse.ArgumentParser:
 
 def _status(arguments: argparse.Namespace) -> int:
     try:
-        answer, (sidecars, own) = ask(
+        answer, (sidecars, own, gone, events, state) = ask(
             arguments,
             lambda stub, timeout_s: stub.GetStatus(admin_pb2.GetStatusRequest(), timeout=timeout_s),
-            lambda message: (status_from_proto(message), own_revocations_from_proto(message)),
+            lambda message: (
+                status_from_proto(message),
+                own_revocations_from_proto(message),
+                departed_from_proto(message.departed),
+                events_from_proto(message.events),
+                log_state_from_proto(message.log),
+            ),
         )
     except AskError as error:
         sys.stderr.write(f"plr: {error}\n")
@@ -92,6 +114,10 @@ def _status(arguments: argparse.Namespace) -> int:
         print(_status_json(answer))
     else:
         print(status_table.render(sidecars, own, time.time()))
+        for section in (event_text.departed(gone, answer.departed_left_out), event_text.events(events, state)):
+            lines = list(section)
+            if lines:
+                print("", *lines, sep="\n")
     return EXIT_OK
 
 

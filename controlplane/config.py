@@ -12,6 +12,7 @@ from controlplane.core.problem import Objective
 from controlplane.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
 from controlplane.policy_config import PolicyConfig
 from protos.config_fields import (
+    AbsolutePath,
     ListenAddress,
     RemoteAddress,
     TlsDir,
@@ -79,6 +80,11 @@ class ControlPlaneConfig(BaseModel):
     )
     metrics_listen: ListenAddress | None = Field(
         default="127.0.0.1:9465", description="address:port for Prometheus; null turns it off."
+    )
+    state_dir: AbsolutePath | None = Field(
+        default=None,
+        description="Absolute path of a folder of its own, made if missing, for the log of events; null keeps these in "
+        "memory only, where a restart forgets who is gone.",
     )
     lease_ms: int = Field(
         default=5000,

@@ -32,7 +32,14 @@ def render(explanation: Explanation) -> str:
     found = explanation
     kind = "idempotent" if found.idempotent else "not idempotent: one server at a time"
     aim = f"cheapest that misses at most {found.target_miss:g}" if found.target_miss else f"objective {found.objective}"
-    lines = [f"{found.robot} {found.service}: deadline {_ms(found.deadline_s)}, {kind}, {aim}"]
+    lines = []
+    if found.gone_s is not None:
+        why = found.gone_why.value if found.gone_why is not None else "unknown"
+        lines += [
+            f"{found.robot} IS GONE for {_age(found.gone_s)} ({why}): this is the last that was known, as of then",
+            "",
+        ]
+    lines += [f"{found.robot} {found.service}: deadline {_ms(found.deadline_s)}, {kind}, {aim}"]
     for title, section in (
         ("mapping in force", list(_mapping(found))),
         ("pairs (times in ms, * in force)", list(_pairs(found))),

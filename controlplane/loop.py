@@ -15,16 +15,22 @@ from controlplane.core.control import ControlCore
 from controlplane.core.control_events import (
     Close,
     CloseReason,
+    CutOffNotice,
     DepartureNotice,
     NackNotice,
     OffersRefusedNotice,
     Send,
+    StreamLostNotice,
+    UnmetNotice,
 )
 from controlplane.core.plan import Plan
 from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
+from controlplane.fleet_metrics import MAX_GONE, Fleet
 from controlplane.mailbox import Mailbox
+from controlplane.remembered import departures
+from protos.fleet_events import EventKind
 from protos.identity import EXPIRED, REVOKED, CertificateError
 from protos.model import NO_REVOCATIONS, RemovalReason, Role
 from protos.token_bucket import TokenBucket
@@ -33,9 +39,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from controlplane.config import ControlPlaneConfig
+    from controlplane.core.departed import Departed
+    from controlplane.core.fleet_view import MemberView
     from controlplane.core.picture import Picture
     from controlplane.core.policy import Policy
     from controlplane.core.registry import StreamId
+    from controlplane.event_log import EventLog
     from controlplane.matcher import Matcher
     from controlplane.metrics import Metrics
     from controlplane.stun_server import StunServer
@@ -55,6 +64,13 @@ ENDED_LINES_PER_S, ENDED_LINES_BURST = 1.0, 20.0
 
 METRICS_INTERVAL_S = 1.0
 """How old what is scraped may be: Prometheus scrapes every few seconds at most."""
+
+
+MEMBERS_A_TURN = 32
+"""Members looked at for the metrics in one go, some 2 ms."""
+
+FLEET_TIMEOUT_S = 4.0
+"""For all of them: a scrape waits no longer, and Prometheus not much."""
 
 
 def wall_clock_epoch() -> int:
@@ -107,11 +123,14 @@ class _LateMatcher:
 class ControlLoop:
     """The core with its clock, its solver and the mailboxes of its streams."""
 
-    def __init__(self, config: ControlPlaneConfig, metrics: Metrics) -> None:
+    def __init__(self, config: ControlPlaneConfig, metrics: Metrics, events: EventLog) -> None:
         self._loop = asyncio.get_running_loop()
         self._config = config
         self._metrics = metrics
-        self._core = ControlCore(config.settings(), version_epoch=wall_clock_epoch(), now=self._loop.time())
+        self.events = events
+        now = self._loop.time()
+        self._core = ControlCore(config.settings(), version_epoch=wall_clock_epoch(), now=now)
+        self._core.remember(*departures(events.events(), now_wall=time.time(), now=now), now)
         self._mailboxes: dict[StreamId, Mailbox] = {}
         self._callers: dict[NodeName, Caller] = {}
         self._superseded = 0
@@ -120,6 +139,8 @@ class ControlLoop:
         self._wake = asyncio.Event()
         self._ended_lines = TokenBucket(rate=ENDED_LINES_PER_S, burst=ENDED_LINES_BURST, now=self._loop.time())
         self._stopping = False
+        self._closing = False
+        """Whether streams end since the control plane does."""
         self._matcher = _LateMatcher()
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
         self.stun_servers: list[StunServer] = []
@@ -132,10 +153,10 @@ class ControlLoop:
             refusal = check_unproven_claims(registration)
         else:
             refusal = check_claims(registration, caller.identity, caller.certificate)
-        if refusal is not None:
-            return self._core.refuse(refusal)
-        result = self._core.register(registration, self._loop.time())
+        result = self._core.register(registration, self._loop.time()) if refusal is None else self._core.refuse(refusal)
         if isinstance(result, Refusal):
+            who = registration.name if caller is None else caller.identity.name
+            self.events.record(EventKind.REFUSED, who, f"registration: {result.value}")
             return result
         if caller is not None:
             self._callers[registration.name] = caller
@@ -145,6 +166,12 @@ class ControlLoop:
             registration.role.value,
             registration.incarnation,
             registration.software_version or "unknown",
+        )
+        self.events.record(
+            EventKind.CONNECTED,
+            registration.name,
+            f"software {registration.software_version or 'unknown'}, incarnation {registration.incarnation}",
+            role=registration.role,
         )
         mailbox = self._mailboxes[result] = Mailbox()
         self._dispatch()
@@ -167,6 +194,43 @@ class ControlLoop:
         """Every registered sidecar."""
         return self._core.status(self._loop.time())
 
+    @property
+    def departed(self) -> Departed:
+        """Who is gone."""
+        return self._core.departed
+
+    def now(self) -> float:
+        """The time of the core: monotonic seconds."""
+        return self._loop.time()
+
+    def ask_fleet(self) -> Fleet:
+        """What is known of each member; for other threads. Raises TimeoutError if the loop is busy, or has ended."""
+        gathering = self.gather_fleet()
+        try:
+            future = asyncio.run_coroutine_threadsafe(gathering, self._loop)
+        except RuntimeError as error:
+            gathering.close()
+            raise TimeoutError("the loop has ended") from error
+        try:
+            return future.result(FLEET_TIMEOUT_S)
+        except concurrent.futures.CancelledError as error:
+            raise TimeoutError("the loop ends") from error
+        finally:
+            future.cancel()
+
+    async def gather_fleet(self) -> Fleet:
+        """The same, on the loop, in turns."""
+        members: list[MemberView] = []
+        for number, name in enumerate([sidecar.name for sidecar in self._core.registry]):
+            if number % MEMBERS_A_TURN == 0:
+                await asyncio.sleep(0)
+            view = self._core.view(name, self._loop.time())
+            if view is not None:
+                members.append(view)
+        ends = {name: caller.identity.not_after for name, caller in self._callers.items()}
+        now = self._loop.time()
+        return Fleet(members, self._core.departed.told(now, MAX_GONE), ends, now, time.time())
+
     def status_line(self) -> str:
         """Return in a few words how it is, for `systemctl status`."""
         counts = Counter(sidecar.role for sidecar in self._core.registry)
@@ -178,6 +242,8 @@ class ControlLoop:
 
     def set_policy(self, policy: Policy | None) -> None:
         """Another policy is in force from now on."""
+        rules = f"rules for calls {len(policy.calls)}, for offers {len(policy.offers)}" if policy else "none"
+        self.events.record(EventKind.POLICY, text=rules)
         self._core.set_policy(policy, self._loop.time())
         self._dispatch()
 
@@ -198,6 +264,7 @@ class ControlLoop:
                         nack.version,
                         nack.error,
                     )
+                    self._record(EventKind.NACK, name, f"{nack.resource.value}: {nack.error}")
                 case OffersRefusedNotice(sidecar=name, services=services):
                     log.warning(
                         "%s offers %s, which the policy does not let it: told to no robot; missing under offers: %s",
@@ -205,10 +272,28 @@ class ControlLoop:
                         _few(services),
                         OfferRule((name,), services[:MAX_SERVICES_LOGGED]),
                     )
-                case DepartureNotice(sidecar=name, reason=reason):
-                    log.info("%s is gone: %s", name, reason.value)
+                    self._record(EventKind.OFFERS_REFUSED, name, _few(services))
+                case UnmetNotice(sidecar=name, services=services):
+                    self._record(EventKind.UNMET, name, _few(services))
+                case DepartureNotice(sidecar=name, departure=gone):
+                    log.info("%s is gone: %s", name, gone.why.value)
+                    self.events.record(EventKind.DEPARTED, name, gone.text, role=gone.role, why=gone.why)
                     self._callers.pop(name, None)
+                case StreamLostNotice(sidecar=name, role=role) if not self._closing:
+                    self.events.record(EventKind.STREAM_LOST, name, role=role)
+                case CutOffNotice(sidecar=name, role=role, lifted=lifted):
+                    log.log(
+                        logging.INFO if lifted else logging.WARNING,
+                        "%s: the policy leaves it %s to talk to",
+                        name,
+                        "somebody" if lifted else "nobody",
+                    )
+                    self.events.record(EventKind.REJOINED if lifted else EventKind.CUT_OFF, name, role=role)
         self._wake.set()
+
+    def _record(self, kind: EventKind, name: NodeName, text: str) -> None:
+        sidecar = self._core.registry.get(name)
+        self.events.record(kind, name, text, role=sidecar.role if sidecar is not None else None)
 
     # ── for who watches the certificates ──
 
@@ -271,7 +356,7 @@ class ControlLoop:
                 drawn_s = self._loop.time() - now
                 if now >= metrics_at:
                     self._core.follow_load(used.share(time.thread_time(), now))
-                    self._update_metrics(now)
+                    self._update_metrics()
                     metrics_at = now + METRICS_INTERVAL_S
                 self._dispatch_quietly()
                 # What takes several turns takes half of the loop's time at most: streams have the other half.
@@ -310,12 +395,13 @@ class ControlLoop:
             log.warning("capacities are exceeded by %d interfaces in all", self._core.plan.relaxed)
         self._dispatch()
 
-    def _update_metrics(self, now: float) -> None:
+    def _update_metrics(self) -> None:
         superseded = self._superseded + sum(mailbox.superseded for mailbox in self._mailboxes.values())
-        self._metrics.update(self._core, self.stun_servers, superseded, now)
+        self._metrics.update(self._core, self.stun_servers, superseded, self.events.state)
 
     def close_streams(self) -> None:
         """Tell every stream that the control plane stops."""
+        self._closing = True
         for mailbox in self._mailboxes.values():
             mailbox.close(CloseReason.STOPPING)
 

@@ -15,18 +15,21 @@ import prometheus_client
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from controlplane import handshakes, limits, tls_gate
+from controlplane.fleet_metrics import FleetCollector
 from protos import identity
+from protos.fleet_events import EventLogState
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind, Role
 from protos.revocation_views import revocation_gauges
 from protos.status import SyncState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from prometheus_client import Metric
 
     from controlplane.core.control import ControlCore
+    from controlplane.fleet_metrics import Fleet
     from controlplane.stun_server import StunServer
     from protos.identity import Identity, RevocationList
 
@@ -35,6 +38,8 @@ SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 
 
 SECONDS_PER_DAY = 86_400.0
+
+NO_EVENTS = EventLogState()
 
 REFUSAL_REASONS = (
     identity.MALFORMED,
@@ -112,17 +117,28 @@ class Metrics:
         """These are the certificate and the revocation lists (`Trust.lists`) in use from now on."""
         self._own = identity, lists
 
+    def watch_fleet(self, ask: Callable[[], Fleet]) -> None:
+        """Tell of each member too: `ask` gets them, on a thread other than the loop's."""
+        self.registry.register(FleetCollector(ask))
+
     def start(self, host: str, port: int) -> tuple[str, int]:
         """Serve them over HTTP; returns where. Raises OSError if the address cannot be had."""
         return host, MetricsServer(host, port, self.registry).port
 
-    def update(self, core: ControlCore, stun_servers: Sequence[StunServer], superseded: int, now: float) -> None:
+    def update(
+        self,
+        core: ControlCore,
+        stun_servers: Sequence[StunServer],
+        superseded: int,
+        events: EventLogState = NO_EVENTS,
+    ) -> None:
         """Take the values of this moment."""
         self._values.families = (
             *_members(core),
             *_sync(core),
-            *_plan(core, now),
-            *_drops(core, superseded),
+            *_plan(core),
+            *_drops(core, superseded, events),
+            *_events(events),
             *_stun(stun_servers),
             *_certificate(self._own),
         )
@@ -186,20 +202,7 @@ def _sync(core: ControlCore) -> Iterable[Metric]:
     )
 
 
-def _plan(core: ControlCore, now: float) -> Iterable[Metric]:
-    ratios = core.miss_ratios(now)
-    yield _gauge(
-        "plr_predicted_miss_probability",
-        "Predicted probability that all copies of a request miss its deadline.",
-        ["robot", "service"],
-        {key: predicted for key, (predicted, _) in ratios.items()},
-    )
-    yield _gauge(
-        "plr_observed_miss_ratio",
-        "Share of recent requests that missed their deadline or failed.",
-        ["robot", "service"],
-        {key: observed for key, (_, observed) in ratios.items() if observed is not None},
-    )
+def _plan(core: ControlCore) -> Iterable[Metric]:
     yield _gauge(
         "plr_plan_excess_interfaces",
         "Interfaces by which the running plan exceeds capacities.",
@@ -246,7 +249,7 @@ def _plan(core: ControlCore, now: float) -> Iterable[Metric]:
     yield _counter("plr_reports_total", "Reports merged.", [], {(): core.counters.reports})
 
 
-def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
+def _drops(core: ControlCore, superseded: int, events: EventLogState) -> Iterable[Metric]:
     yield _counter(
         "plr_control_dropped_total",
         "What was dropped, by reason.",
@@ -254,6 +257,10 @@ def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
         {
             ("histogram_evicted",): core.estimator.dropped,
             ("mapping_history_evicted",): core.history.dropped,
+            ("departure_forgotten",): core.departed.forgotten,
+            ("event_evicted",): events.evicted,
+            ("event_too_often",): events.too_often,
+            ("event_damaged",): events.damaged,
             ("removal_forgotten",): core.registry.counters.removals_forgotten,
             ("stale_answer",): core.counters.stale_answers,
             ("old_stream",): core.counters.old_stream_messages,
@@ -262,6 +269,16 @@ def _drops(core: ControlCore, superseded: int) -> Iterable[Metric]:
             ("announced_too_often",): core.restlessness.held,
             ("superseded_before_sent",): superseded,
         },
+    )
+
+
+def _events(events: EventLogState) -> Iterable[Metric]:
+    yield _gauge("plr_events_kept", "Events of the fleet that are remembered.", [], {(): events.kept})
+    yield _counter(
+        "plr_event_write_failures_total",
+        "Times that the log of events could not be written.",
+        [],
+        {(): events.write_failures},
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
+import socket
 import tempfile
 import time
 from dataclasses import dataclass
@@ -14,10 +16,11 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from controlplane import admin, service
+from controlplane import admin, service, version
 from controlplane.access import AccessGuard
 from controlplane.certificates import CertificateKeeper
 from controlplane.core.registry import MAX_SIDECARS
+from controlplane.event_log import EventLog
 from controlplane.limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
@@ -25,6 +28,7 @@ from controlplane.stun_server import start_stun_server
 from controlplane.tls_gate import TlsGate
 from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
+from protos.fleet_events import EventKind
 from protos.plr.v1 import admin_pb2_grpc
 
 if TYPE_CHECKING:
@@ -94,15 +98,20 @@ async def serve(
     `files` is None in insecure mode. Raises StartError if an address cannot be had.
     """
     metrics = Metrics()
-    loop = ControlLoop(config, metrics)
+    events = EventLog(config.state_dir)
     async with contextlib.AsyncExitStack() as cleanup:
+        cleanup.callback(events.close)
+        loop = ControlLoop(config, metrics, events)
         # Nobody but this user gets at the socket behind the gate.
         folder = cleanup.enter_context(tempfile.TemporaryDirectory(prefix="plr-controlplane-"))
         upstream = f"{folder}/grpc"
         clock = ClockFloor(time.time, alert=log.error)
         gate = TlsGate(files, upstream, metrics.refused_connection, clock) if files is not None else None
+        if gate is not None:
+            gate.on_member_refused = lambda name, text: events.record(EventKind.REFUSED, name, text)
         server, health_service = _make_server(config, loop, metrics, gate)
         stun = await _start_stun(config, loop, cleanup)
+        metrics.watch_fleet(loop.ask_fleet)
         metrics_address = _start_metrics(config, metrics)
         if gate is None:
             grpc_address = _add_port(config, server)
@@ -122,8 +131,11 @@ async def serve(
             for name in _SERVICES:
                 await health_service.set(name, health_pb2.HealthCheckResponse.SERVING)
             ready(Addresses(grpc_address, stun, metrics_address))
+            events.announce()
+            events.record(EventKind.STARTED, text=version.describe("plr-controlplane"))
             await stop.wait()
             stopping()
+            events.record(EventKind.STOPPED)
             await health_service.enter_graceful_shutdown()
             loop.close_streams()
             await server.stop(STOP_GRACE_S)
@@ -160,7 +172,7 @@ def _open_gate(config: ControlPlaneConfig, gate: TlsGate) -> str:
     try:
         return _join(host, gate.listen(host, port))
     except OSError as error:
-        raise StartError(f"listen: cannot listen on {config.listen}: {error.strerror or error}") from error
+        raise StartError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
 
 
 async def _start_stun(
@@ -193,12 +205,20 @@ def _start_metrics(config: ControlPlaneConfig, metrics: Metrics) -> str | None:
 
 
 def _add_port(config: ControlPlaneConfig, server: grpc.aio.Server) -> str:
-    host, _ = split_host_port(config.listen)
+    host, wanted = split_host_port(config.listen)
     try:
+        # gRPC itself writes a raw line of its own about an address that it cannot have, and does not tell us why.
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, wanted), family=family).close()
         port = server.add_insecure_port(config.listen)
-    except RuntimeError as error:
-        raise StartError(f"listen: cannot listen on {config.listen}") from error
+    except (OSError, RuntimeError) as error:
+        raise StartError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
     return _join(host, port)
+
+
+def _reason(error: OSError | RuntimeError) -> str:
+    # The text of asyncio and of sockets made ready to listen repeats the address.
+    return os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
 
 
 def _join(host: str, port: int) -> str:

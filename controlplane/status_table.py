@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from typing import TYPE_CHECKING
 
@@ -33,8 +34,9 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
     if not sidecars:
         return "\n".join([*lines, "no sidecars"])
     lines += columns([_HEADER, *(_row(status) for status in sidecars)])
+    offered = sorted({offer.name for status in sidecars for offer in status.peer.offers})
     for status in sidecars:
-        details = [*_details(status), *_revocations(status.revocations, newest, now_wall)]
+        details = [*_details(status), *_unmet(status, offered), *_revocations(status.revocations, newest, now_wall)]
         if details:
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in details)]
     return "\n".join(lines)
@@ -70,6 +72,16 @@ def _details(status: SidecarStatus) -> Iterator[str]:
             state = "ready on the robot" if use.fallback_up else "MISSING: its node does not run, or has another type"
             yield f"{use.name}: fallback {state}"
     yield from columns([_path(path) for path in status.paths])
+
+
+def _unmet(status: SidecarStatus, offered: Sequence[str]) -> Iterator[str]:
+    own = {offer.name for offer in status.peer.offers}
+    for name in status.unmet:
+        # A cloud did not mean what it offers anyway.
+        close = difflib.get_close_matches(name, [other for other in offered if other not in own], n=1)
+        hint = f"; did you mean {close[0]}?" if close and close[0] != name else ""
+        whose = "no server that it knows of" if status.peer.role is Role.ROBOT else "no node there"
+        yield f"UNMET {name}: configured, and {whose} offers it{hint}"
 
 
 def _revocations(held: RevocationSet, newest: Mapping[int, int], now_wall: float) -> Iterator[str]:

@@ -136,6 +136,8 @@ class TlsGate:
         self._count = 0
         self._told: OrderedDict[tuple[NodeName, str], float] = OrderedDict()
         """When each refused member was logged last, by its name and the reason."""
+        self.on_member_refused: Callable[[NodeName, str], None] = lambda name, text: None
+        """Told, as seldom as the log, whose certificate is not believed, and why."""
         self._log_lines = TokenBucket(rate=_LOG_LINES_PER_S, burst=_LOG_BURST, now=self._loop.time())
 
     # ── for the server ──
@@ -365,6 +367,7 @@ class TlsGate:
         if len(self._told) > MAX_TOLD:
             self._told.popitem(last=False)
         log.warning("refused a connection of %s: %s: %s", who, refusal.reason, refusal)
+        self.on_member_refused(name, f"connection: {refusal}")
 
     def _refused(self, who: str, reason: str, text: str) -> None:
         self._on_refused(reason)

@@ -16,18 +16,25 @@ from controlplane.core.control_events import (
     Close,
     CloseReason,
     Counters,
+    CutOffNotice,
     DepartureNotice,
     Event,
     NackNotice,
     OffersRefusedNotice,
     Send,
     Settings,
+    StreamLostNotice,
+    UnmetNotice,
 )
+from controlplane.core.cut_off import cut_off
 from controlplane.core.debounce import Change, Debounce
+from controlplane.core.departed import Departed, Departure, departure, last_known, why_removed
+from controlplane.core.departed_explanation import explain_departed
 from controlplane.core.drawing import Drawing
 from controlplane.core.estimator import Estimator
 from controlplane.core.explanation import explain, find
 from controlplane.core.exploration import Exploration
+from controlplane.core.fleet_view import MemberView, view_of
 from controlplane.core.mapping_history import MappingHistory
 from controlplane.core.pacing import Pacing
 from controlplane.core.permits import Permits
@@ -40,9 +47,11 @@ from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.report_filter import believable
 from controlplane.core.restlessness import Restlessness
+from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
 from controlplane.core.status import statuses
 from protos.errors import DecodeError
+from protos.fleet_events import Why
 from protos.model import (
     Ack,
     CandidateSet,
@@ -61,9 +70,10 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from controlplane.core.policy import Policy
+    from controlplane.core.registry import Sidecar
     from protos.explanation import Explanation
     from protos.model import NodeName, ServiceName, SidecarMessage
     from protos.status import SidecarStatus, SyncState
@@ -111,6 +121,8 @@ class ControlCore:
         self._debounce = Debounce()
         self._stability = Stability()
         self.history = MappingHistory()
+        self.departed = Departed()
+        self._returning = Returning()
         self._exploration = Exploration()
         warm_until = now + settings.warm_up_s if settings.warm_up_s else None
         self._publisher = Publisher(self.registry, version_epoch=version_epoch, warm_until=warm_until)
@@ -136,6 +148,10 @@ class ControlCore:
         self._last_stream = stream
         name = registration.name
         self.restlessness.forget(name)
+        self._returning.is_back(name)
+        gone = self.departed.get(name)
+        if gone is not None and gone.why is not Why.POLICY:
+            self.departed.forget(name)
         self._close(result.replaced, CloseReason.REPLACED, now)
         self._streams[stream] = name
         if result.new_run:
@@ -181,6 +197,9 @@ class ControlCore:
         if isinstance(told, CandidateSet):
             changed = self.registry.set_candidates(name, told)
         else:
+            known = self.registry.get(name)
+            if told.unmet and known is not None and told.unmet != known.unmet:
+                self._events.append(UnmetNotice(name, told.unmet))
             changed = self.registry.set_services(name, told)
         if changed:
             self._members_changed(now)
@@ -257,7 +276,7 @@ class ControlCore:
         if sidecar is None:
             return
         self._close(sidecar.stream, _CLOSED_FOR[reason], now)
-        self._forget(name, reason)
+        self._forget(sidecar, reason, now)
         self._drawing.members_changed()
         self._debounce.note(Change.MEMBERS, now)
         self._publish(now)
@@ -279,19 +298,39 @@ class ControlCore:
     def disconnected(self, stream: StreamId, now: float) -> None:
         """A stream ended, whoever ended it: the only way in which one does. No news if it had ended before."""
         name = self._streams.pop(stream, None)
-        if name is not None and self.registry.disconnect(name, stream) is not None:
-            self._forget(name, RemovalReason.LEFT)
+        sidecar = self.registry.get(name) if name is not None else None
+        if name is None or sidecar is None:
+            return
+        if self.registry.disconnect(name, stream) is not None:
+            self._forget(sidecar, RemovalReason.LEFT, now)
             self._came_or_went(name, now)
+        elif sidecar.stream == stream:
+            self._events.append(StreamLostNotice(name, sidecar.role))
 
     # ── policy ──
 
     def set_policy(self, policy: Policy | None, now: float) -> None:
         """Another policy is in force: everybody is told what changes for them."""
+        alone = cut_off(self.registry, self.permits)
         self.permits = Permits(policy)
+        self._note_cut_off(alone, cut_off(self.registry, self.permits), now)
         self._refused_offers.clear()
         for sidecar in self.registry:
             self._note_refused_offers(sidecar.name)
         self._members_changed(now)
+
+    def _note_cut_off(self, before: frozenset[NodeName], after: frozenset[NodeName], now: float) -> None:
+        for name in sorted(before ^ after):
+            sidecar = self.registry.get(name)
+            if sidecar is None:
+                continue
+            lifted = name in before
+            if lifted:
+                self.departed.forget(name)
+            else:
+                text = "connected, but the policy leaves it nobody to talk to; try: plr policy check"
+                self.departed.note(self._departure(sidecar, Why.POLICY, text, now))
+            self._events.append(CutOffNotice(name, sidecar.role, lifted))
 
     def _note_refused_offers(self, name: NodeName) -> None:
         sidecar = self.registry.get(name)
@@ -316,6 +355,7 @@ class ControlCore:
             self._publisher.resend_at,
             self.restlessness.next_time(),
             self._publishing_since if self._publications else None,
+            self._returning.until,
         )
         return min((time for time in times if time is not None), default=None)
 
@@ -323,8 +363,11 @@ class ControlCore:
         """Let leases end, and publish what changed."""
         for sidecar in self.registry.expire(now):
             self._close(sidecar.stream, CloseReason.LEASE_EXPIRED, now)
-            self._forget(sidecar.name, RemovalReason.LEASE_EXPIRED)
+            self._forget(sidecar, RemovalReason.LEASE_EXPIRED, now)
             self._members_changed(now)
+        for gone in self._returning.missing(now):
+            self.departed.note(gone)
+            self._events.append(DepartureNotice(gone.name, gone))
         for name, stream, waited in self.restlessness.due(now):
             if self._streams.get(stream) == name and self.registry.get(name) is not None:
                 for told in waited:
@@ -340,8 +383,24 @@ class ControlCore:
         elif self._publications:
             self._go_on_publishing(now)
 
-    def _forget(self, name: NodeName, reason: RemovalReason) -> None:
-        self._events.append(DepartureNotice(name, reason))
+    def remember(self, departures: Iterable[Departure], present: Iterable[Departure], now: float) -> None:
+        """What an earlier run knew: who was gone, and who was there; of these who does not come back is gone."""
+        for gone in departures:
+            self.departed.note(gone)
+        self._returning.expect(present, now + self._settings.warm_up_s + self._settings.lease_s)
+
+    def _departure(self, sidecar: Sidecar, why: Why, text: str, now: float) -> Departure:
+        return departure(sidecar, why, text, at=now, seen_at=self.registry.heard_at(sidecar.name, now))
+
+    def _forget(self, sidecar: Sidecar, reason: RemovalReason, now: float) -> None:
+        name = sidecar.name
+        gone = self._departure(sidecar, why_removed(sidecar, reason), "", now)
+        last = None
+        if sidecar.role is Role.ROBOT:
+            paths = self.estimator.path_states(name)
+            last = last_known(sidecar, self._publisher[name], paths, self._picture, self.plan)
+        self.departed.note(gone, last)
+        self._events.append(DepartureNotice(name, gone))
         self._forget_paths(name)
         self._refused_offers.forget(name)
         self.restlessness.forget(name)
@@ -451,15 +510,21 @@ class ControlCore:
         return list(statuses(self.registry, self._publisher, self.estimator, self.permits, now))
 
     def explain(self, robot: NodeName, service: ServiceName, now: float) -> Explanation:
-        """Why requests go where they go. Raises UnknownNameError if the robot, or its service, is not known."""
+        """Why requests go where they go, or went. Raises UnknownNameError if robot or service is not known."""
+        gone = self.departed.get(robot)
+        if gone is not None and gone.role is Role.ROBOT and self.registry.get(robot) is None:
+            last = self.departed.last_known(robot)
+            return explain_departed(gone, last, service, estimator=self.estimator, history=self.history, now=now)
         sidecar, use = find(self.registry, robot, service)
+        mapping = self._publisher[robot].mapping
         return explain(
             sidecar,
             use,
             picture=self._picture,
             plan=self.plan,
             estimator=self.estimator,
-            snapshots=self._publisher[robot],
+            sent=mapping.sent or (),
+            sync=mapping.status,
             history=self.history.of(BlockKey(robot, service)),
             now=now,
         )
@@ -468,12 +533,12 @@ class ControlCore:
         """How far every registered sidecar follows; clouds get no mapping."""
         return self._publisher.sync_states()
 
-    def miss_ratios(self, now: float) -> dict[tuple[NodeName, ServiceName], tuple[float, float | None]]:
-        """For every planned (robot, service) the predicted miss probability and the observed ratio."""
-        return {
-            (key.robot, key.service): (
-                block.predicted_miss,
-                self.estimator.observed_miss_ratio(key.robot, key.service, now),
-            )
-            for key, block in self.plan.blocks.items()
-        }
+    def view(self, name: NodeName, now: float) -> MemberView | None:
+        """What the metrics tell of a member; None if it is not there any more."""
+        sidecar = self.registry.get(name)
+        if sidecar is None:
+            return None
+        sent = self._publisher[name].mapping.sent or ()
+        return view_of(
+            sidecar, sent, self.plan, self.estimator, seen_at=self.registry.heard_at(sidecar.name, now), now=now
+        )

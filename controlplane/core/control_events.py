@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 from controlplane.core.problem import Objective
 
 if TYPE_CHECKING:
+    from controlplane.core.departed import Departure
     from controlplane.core.path_rules import PathRule
     from controlplane.core.policy import Policy
     from controlplane.core.registry import StreamId
-    from protos.model import ControlMessage, Nack, NodeName, RemovalReason, ResourceKind, ServiceName
+    from protos.model import ControlMessage, Nack, NodeName, ResourceKind, Role, ServiceName
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,32 @@ class DepartureNotice:
     """A sidecar is not there any more, for the log."""
 
     sidecar: NodeName
-    reason: RemovalReason
+    departure: Departure
+
+
+@dataclass(frozen=True, slots=True)
+class StreamLostNotice:
+    """A sidecar's stream ended, and its lease has not, for the log of events."""
+
+    sidecar: NodeName
+    role: Role
+
+
+@dataclass(frozen=True, slots=True)
+class CutOffNotice:
+    """Another policy leaves a sidecar nobody to talk to; or somebody again (`lifted`)."""
+
+    sidecar: NodeName
+    role: Role
+    lifted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class UnmetNotice:
+    """A sidecar's configuration names services that nobody serves; told when these are others than before."""
+
+    sidecar: NodeName
+    services: tuple[ServiceName, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,5 +131,7 @@ class OffersRefusedNotice:
     services: tuple[ServiceName, ...]
 
 
-Event = Send | Close | NackNotice | DepartureNotice | OffersRefusedNotice
+Event = (
+    Send | Close | NackNotice | DepartureNotice | StreamLostNotice | CutOffNotice | UnmetNotice | OffersRefusedNotice
+)
 """What the driver has to do, in this order."""

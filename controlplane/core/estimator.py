@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from controlplane.core.compute import ComputeTimes, ServerTimes
 from controlplane.core.fading import FadedCount, FadedShares
+from controlplane.core.fleet_view import PathView
 from controlplane.core.interface_trouble import InterfaceTrouble
 from controlplane.core.network import RobotNetwork
 from controlplane.core.parts import Asked, from_parts
@@ -28,6 +29,7 @@ from protos.size_class import SIZE_CLASSES
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from controlplane.core.network import PathState
     from controlplane.core.shared_fate import CommonMisses
     from protos.model import (
         Assignment,
@@ -240,6 +242,18 @@ class Estimator:
         if tables is not None:
             yield from (state.last for state in tables.network.paths.values())
 
+    def path_states(self, robot: NodeName) -> Mapping[tuple[InterfaceName, NodeName], PathState]:
+        """What is known of each path of a robot: the table itself, which `forget_paths` leaves to who holds it."""
+        tables = self._robots.get(robot)
+        return tables.network.paths if tables is not None else {}
+
+    def path_views(self, robot: NodeName) -> Iterator[PathView]:
+        """Each path of a robot as reported last, with its round trips as remembered."""
+        tables = self._robots.get(robot)
+        if tables is not None:
+            for (interface, server), state in tables.network.paths.items():
+                yield PathView(interface, server, state.up, state.rtt.snapshot())
+
     def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
         """Whether the path was up when last reported; None if it never was reported."""
         tables = self._robots.get(robot)
@@ -312,8 +326,14 @@ class Estimator:
                 trouble.note(interface, server, requests, expected, pair.trials.posterior(expected, now))
         return trouble
 
-    def evidence(self, robot: NodeName, path: Assignment, service: ServiceName, now: float) -> Evidence:
-        """What was measured on this pair, for the operator."""
+    def evidence(
+        self, robot: NodeName, path: Assignment, service: ServiceName, now: float, *, servers_now: float | None = None
+    ) -> Evidence:
+        """What was measured on this pair, for the operator.
+
+        Of a robot that is gone `now` is when it went; of its servers others tell since, until `servers_now`.
+        """
+        servers_now = now if servers_now is None else servers_now
         tables = self._robots.get(robot) or _Robot(self._half_life_s)
         state = tables.network.paths.get((path.interface, path.server))
         pair = tables.trials.get((path.interface, path.server, service))
@@ -325,9 +345,9 @@ class Estimator:
             probes=state.rtt.weight(now) if state is not None else 0.0,
             rtt=state.rtt.scaled(now, SAMPLE) if state is not None else Histogram(),
             network=network,
-            compute=self._compute.requests(path.server, service, now, sample=SAMPLE),
+            compute=self._compute.requests(path.server, service, servers_now, sample=SAMPLE),
             witnesses=self._compute.witnesses(path.server, service),
-            busiest=self._compute.busiest_witness(path.server, service, now),
+            busiest=self._compute.busiest_witness(path.server, service, servers_now),
         )
 
     def common_misses(

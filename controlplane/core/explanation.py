@@ -6,7 +6,7 @@ Nothing here decides anything, and no epsilon is estimated anew: the explanation
 from __future__ import annotations
 
 import difflib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from controlplane.core import alternatives
 from controlplane.core.beta import intervals
@@ -16,17 +16,18 @@ from protos.explanation import Belief, Explanation, JointExplanation, MappingCha
 from protos.model import Assignment, Role
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
-    from controlplane.core.estimator import Estimator
+    from controlplane.core.estimator import Evidence
     from controlplane.core.mapping_history import History
     from controlplane.core.picture import Picture
     from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.posterior import Estimate
     from controlplane.core.problem import Block
     from controlplane.core.registry import Registry, Sidecar
-    from controlplane.core.snapshots import Snapshots
-    from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
+    from controlplane.core.shared_fate import CommonMisses
+    from protos.model import InterfaceName, NodeName, PenaltyReport, ServiceMapping, ServiceName, ServiceUse
+    from protos.status import ResourceStatus
 
 LEVEL = 0.9
 """Of the intervals told with a probability."""
@@ -42,6 +43,27 @@ class UnknownNameError(Exception):
     """There is no such robot, or it has no such service; the text says so in one line and names the nearest."""
 
 
+class Measured(Protocol):
+    """What the estimator knows, or knew of a robot when it went."""
+
+    def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
+        """Whether a path was up when last reported."""
+
+    def penalties(self, robot: NodeName, now: float) -> Mapping[NodeName, PenaltyReport]:
+        """Servers that the robot asks only where it has no other."""
+
+    def observed_miss_ratio(self, robot: NodeName, service: ServiceName, now: float) -> float | None:
+        """Share of the recent requests that missed."""
+
+    def evidence(self, robot: NodeName, path: Assignment, service: ServiceName, now: float) -> Evidence:
+        """What was measured on a pair."""
+
+    def common_misses(
+        self, robot: NodeName, service: ServiceName, now: float
+    ) -> Iterator[tuple[InterfaceName, InterfaceName, NodeName | None, CommonMisses]]:
+        """The pairs of interfaces that carried copies of the same requests."""
+
+
 def find(registry: Registry, robot: NodeName, service: ServiceName) -> tuple[Sidecar, ServiceUse]:
     """The robot and its use of the service. Raises UnknownNameError."""
     sidecar = registry.get(robot)
@@ -50,10 +72,21 @@ def find(registry: Registry, robot: NodeName, service: ServiceName) -> tuple[Sid
         raise UnknownNameError(f"no robot {robot} is registered{_nearest(robot, robots)}")
     if sidecar.role is not Role.ROBOT:
         raise UnknownNameError(f"{robot} is a cloud: ask about a robot")
-    for use in sidecar.uses:
+    return sidecar, find_use(sidecar, service, {offer.name for other in registry for offer in other.offers})
+
+
+def find_use(robot: Sidecar, service: ServiceName, offered: Collection[ServiceName] = ()) -> ServiceUse:
+    """The robot's use of the service, or of one of those `offered`. Raises UnknownNameError."""
+    for use in robot.uses:
         if use.name == service:
-            return sidecar, use
-    raise UnknownNameError(f"{robot} carries no service {service}{_nearest(service, (u.name for u in sidecar.uses))}")
+            return use
+    if service in robot.unmet:
+        raise UnknownNameError(
+            f"{robot.name} is configured to carry {service}, and no cloud that it knows of offers it"
+            f"{_nearest(service, offered)}"
+        )
+    known = [use.name for use in robot.uses] or offered
+    raise UnknownNameError(f"{robot.name} carries no service {service}{_nearest(service, known)}")
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:
@@ -70,15 +103,16 @@ def explain(
     *,
     picture: Picture,
     plan: Plan,
-    estimator: Estimator,
-    snapshots: Snapshots,
+    estimator: Measured,
+    sent: tuple[ServiceMapping, ...],
+    sync: ResourceStatus,
     history: History | None,
     now: float,
 ) -> Explanation:
-    """Explain the mapping that is in force for this use of this robot."""
+    """Explain the mapping that is in force for this use of this robot; `sent` and `sync`: what it was told last."""
     key = BlockKey(robot.name, use.name)
     block = next((block for block in picture.problem.blocks if block.key == key), None)
-    mapping = next((found for found in snapshots.mapping.sent or () if found.service == use.name), None)
+    mapping = next((found for found in sent if found.service == use.name), None)
     paths = _paths(robot, picture, key, mapping)
     planned = plan.blocks.get(key)
     return Explanation(
@@ -88,7 +122,7 @@ def explain(
         idempotent=use.idempotent,
         objective=picture.problem.objective.value,
         mapping=mapping,
-        sync=snapshots.mapping.status,
+        sync=sync,
         predicted_miss=planned.predicted_miss if planned is not None else None,
         in_force_s=now - history.since if history is not None else None,
         observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
@@ -115,7 +149,7 @@ def _pairs(
     paths: list[Assignment],
     notes: BlockNotes,
     block: Block | None,
-    estimator: Estimator,
+    estimator: Measured,
     key: BlockKey,
     mapping: ServiceMapping | None,
     now: float,
@@ -168,7 +202,7 @@ def _beliefs(estimates: list[Estimate]) -> Iterator[Belief]:
 
 
 def _joints(
-    robot: NodeName, service: ServiceName, block: Block | None, estimator: Estimator, now: float
+    robot: NodeName, service: ServiceName, block: Block | None, estimator: Measured, now: float
 ) -> tuple[JointExplanation, ...]:
     return tuple(
         JointExplanation(

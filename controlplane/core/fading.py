@@ -146,6 +146,10 @@ class FadedHistogram:
         """Share of the lost; NaN without samples."""
         return self._lost / self._total if self._total > _FORGOTTEN else math.nan
 
+    def snapshot(self) -> NDArray[np.float64]:
+        """Weights of the answered samples by bucket; what comes later makes another array."""
+        return self._counts
+
     def median(self) -> float:
         """Median of the answered samples, within 2 %; NaN without any."""
         answered = self.answered()

@@ -155,7 +155,8 @@ class RobotNetwork:
 
     def forget_paths(self) -> None:
         """Whether paths are up is not known any more, nor what they take by now; requests still tell."""
-        self.paths.clear()
+        # Another table: who holds the one of a robot that went keeps what was known.
+        self.paths = OrderedDict()
         self._fresh = False
 
     def requests(

@@ -109,6 +109,11 @@ class Sidecar:
         """Services it carries."""
         return self.services.uses if self.services is not None else ()
 
+    @property
+    def unmet(self) -> tuple[ServiceName, ...]:
+        """Services that its configuration names and nobody serves."""
+        return self.services.unmet if self.services is not None else ()
+
     def as_peer(self) -> Peer:
         """What its peers are told of it, but with its own token; each is told the one made for it (`ToldPeers`)."""
         # A signature of the run before, or of the certificate before, is none under this credential: they say it anew
@@ -148,6 +153,7 @@ class _Lease:
 
     length_s: float
     end: float
+    heard_at: float
 
 
 class Registry:
@@ -159,7 +165,8 @@ class Registry:
         self._leases: dict[NodeName, _Lease] = {}
         self._sidecars: dict[NodeName, Sidecar] = {}
         self._sessions: dict[SessionId, NodeName] = {}
-        self._removals: OrderedDict[NodeName, RemovalReason] = OrderedDict()
+        self._removals: OrderedDict[NodeName, tuple[RemovalReason, float]] = OrderedDict()
+        """Why, and when each was heard last."""
         # One entry a name, at most as late as its lease ends: renewing a lease does not touch it.
         self._ends: list[tuple[float, NodeName]] = []
         self._awaited: set[NodeName] = set()
@@ -190,7 +197,7 @@ class Registry:
                 return self._refuse(Refusal.FULL)
             self._removals.pop(name, None)
             self._sidecars[name] = Sidecar(registration, stream)
-            self._leases[name] = _Lease(self.lease_s, now + self.lease_s)
+            self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
             self._sessions[registration.session] = name
             self._await_end(name)
             return Admission(replaced=None, new_run=True)
@@ -206,7 +213,7 @@ class Registry:
         self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False)
         del self._sessions[before.session]
         self._sessions[registration.session] = name
-        self._leases[name] = _Lease(self.lease_s, now + self.lease_s)
+        self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
         return Admission(replaced=known.stream, new_run=not same_run)
 
     def remove(self, name: NodeName, reason: RemovalReason) -> Sidecar | None:
@@ -238,6 +245,7 @@ class Registry:
             return False
         lease = self._leases[name]
         lease.end = max(lease.end, now + lease.length_s)
+        lease.heard_at = now
         return True
 
     def _is_current(self, name: NodeName, stream: StreamId) -> bool:
@@ -259,14 +267,15 @@ class Registry:
         return changed != known
 
     def set_services(self, name: NodeName, services: ServiceSet) -> bool:
-        """Replace its services; True if they changed."""
+        """Replace its services; True if they changed for others: which ones are unmet is the operator's business."""
         known = self._sidecars[name]
         now_offered = frozenset(offer.name for offer in services.offers)
         offered = known.offered | now_offered
         if len(offered) > MAX_OFFERED:
             offered = now_offered
         self._sidecars[name] = replace(known, services=services, offered=offered)
-        return services != known.services
+        before = known.services
+        return before is None or (services.offers, services.uses) != (before.offers, before.uses)
 
     def set_revocations(self, name: NodeName, held: RevocationSet) -> None:
         """Note which revocation lists it uses."""
@@ -319,9 +328,9 @@ class Registry:
 
     def _remove(self, name: NodeName, reason: RemovalReason) -> None:
         del self._sessions[self._sidecars.pop(name).registration.session]
-        del self._leases[name]
+        heard_at = self._leases.pop(name).heard_at
         self.counters.departed[reason] += 1
-        self._removals[name] = reason
+        self._removals[name] = reason, heard_at
         self._removals.move_to_end(name)
         if len(self._removals) > MAX_REMEMBERED_REMOVALS:
             self._removals.popitem(last=False)
@@ -329,4 +338,13 @@ class Registry:
 
     def removal_reason(self, name: NodeName) -> RemovalReason:
         """Why that sidecar is not there; "lease expired" of one never known or forgotten, the careful guess."""
-        return self._removals.get(name, RemovalReason.LEASE_EXPIRED)
+        removed = self._removals.get(name)
+        return RemovalReason.LEASE_EXPIRED if removed is None else removed[0]
+
+    def heard_at(self, name: NodeName, now: float) -> float:
+        """When a sidecar, registered or gone, said something last; `now` of one never known or forgotten."""
+        lease = self._leases.get(name)
+        if lease is not None:
+            return lease.heard_at
+        removed = self._removals.get(name)
+        return now if removed is None else removed[1]

@@ -33,4 +33,5 @@ def statuses(
             paths=tuple(estimator.paths(sidecar.name)),
             refused_offers=permits.refused_offers(sidecar),
             revocations=sidecar.revocations,
+            unmet=sidecar.unmet,
         )

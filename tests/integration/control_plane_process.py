@@ -66,6 +66,7 @@ class ControlPlaneProcess:
             "stun_listen": ["127.0.0.1:0"],
             "stun_servers": ["192.0.2.1:3478"],
             "metrics_listen": "127.0.0.1:0",
+            "state_dir": str(folder / "state"),
             "lease_ms": 60_000,
             "report_interval_ms": 100,
             **changes,

@@ -99,6 +99,7 @@ def test_without_certificates_and_without_the_word_insecure_it_does_not_start(tm
         assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.audit("ops-7")
 @pytest.mark.parametrize(
     ("key", "kind"),
     [("listen", socket.SOCK_STREAM), ("stun_listen", socket.SOCK_DGRAM), ("metrics_listen", socket.SOCK_STREAM)],
@@ -115,6 +116,10 @@ def test_an_address_in_use_ends_with_1_and_names_the_key(tmp_path: Path, key: st
     assert done.returncode == 1
     assert f"{key}: cannot listen on" in done.stderr
     assert "Traceback" not in done.stderr
+    lines = done.stderr.splitlines()
+    # Every line is ours, and why is said: gRPC would write one of its own before.
+    assert [line for line in lines if not re.match(r"\d{4}-\d\d-\d\dT\S+ (WARNING|CRITICAL) controlplane", line)] == []
+    assert lines[-1].endswith("Address already in use")
 
 
 def test_the_schema_is_printed() -> None:

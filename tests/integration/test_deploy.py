@@ -15,6 +15,7 @@ import yaml
 from controlplane.__main__ import EXIT_USAGE
 from controlplane.config import load_config as load_controlplane_config
 from controlplane.core.control import ControlCore
+from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics
 from protos.config_fields import split_host_port
 from protos.identity import Identity, IdentityRole, RevocationList
@@ -242,9 +243,10 @@ def exported_metrics() -> dict[str, set[str]]:
         )
     )
     control = Metrics()
+    control.watch_fleet(lambda: Fleet((), (), {}, 0.0, 0.0))
     control.own_certificate(identity, LISTS)
     config = load_controlplane_config(DEPLOY / "config" / "controlplane.yaml")
-    control.update(ControlCore(config.settings(), version_epoch=1, now=0.0), (), 0, 0.0)
+    control.update(ControlCore(config.settings(), version_epoch=1, now=0.0), (), 0)
     families = [*sidecar.collect(), *control.registry.collect()]
     exported: dict[str, set[str]] = {}
     for family in families:

@@ -16,6 +16,7 @@ from pydantic_core import PydanticUndefined
 
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.control import ControlCore
+from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics
 from protos.histogram import Histogram
 from protos.identity import Identity, IdentityRole, RevocationList
@@ -138,8 +139,9 @@ def _control_metrics() -> Iterator[Metric]:
     from controlplane.core.control_events import Settings
 
     metrics = Metrics()
+    metrics.watch_fleet(lambda: Fleet((), (), {}, 0.0, 0.0))
     metrics.own_certificate(Identity(NodeName("control"), IdentityRole.CONTROL_PLANE, 1, 0.0, 1.0), LISTS)
-    metrics.update(ControlCore(Settings(), version_epoch=1, now=0.0), (), 0, 0.0)
+    metrics.update(ControlCore(Settings(), version_epoch=1, now=0.0), (), 0)
     yield from metrics.registry.collect()
 
 

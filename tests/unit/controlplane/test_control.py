@@ -65,7 +65,9 @@ def test_measurements_move_the_mapping(world: World) -> None:
     assert robot.pairs() == {"wlan0": "b", "wwan0": "a"}
     predicted = robot.services[0].predicted_miss
     assert predicted < 1e-4
-    assert world.core.miss_ratios(world.now)[ROBOT, PLAN][0] == pytest.approx(predicted)
+    view = world.core.view(ROBOT, world.now)
+    assert view is not None
+    assert view.misses[0].predicted == pytest.approx(predicted)
 
 
 def test_a_path_that_dies_moves_the_mapping_at_once(world: World) -> None:
@@ -147,7 +149,9 @@ def test_observed_misses_stand_beside_the_predicted(world: World) -> None:
     robot = world.robot()
     world.say(robot, Report(outcomes=(OutcomeReport(PLAN, ok=90, deadline_missed=10),)))
     world.run(SETTLED_S)
-    assert world.core.miss_ratios(world.now)[ROBOT, PLAN][1] == pytest.approx(0.1)
+    view = world.core.view(ROBOT, world.now)
+    assert view is not None
+    assert view.misses[0].observed == pytest.approx(0.1)
 
 
 def test_reports_alone_solve_once_a_second_and_push_nothing_new(world: World) -> None:

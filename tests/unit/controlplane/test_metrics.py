@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
+
 import prometheus_client
 
+from controlplane.fleet_metrics import REUSED_S, Fleet
 from controlplane.metrics import Metrics
 from protos.model import OutcomeReport, Report
 from tests.sim.control_world import World
@@ -11,12 +14,18 @@ from tests.unit.controlplane.samples import PLAN
 
 
 def text(metrics: Metrics, world: World) -> str:
-    metrics.update(world.core, [], 3, world.now)
+    metrics.update(world.core, [], 3)
     return prometheus_client.generate_latest(metrics.registry).decode()
+
+
+def fleet_of(world: World) -> Fleet:
+    views = (world.core.view(sidecar.name, world.now) for sidecar in world.core.registry)
+    return Fleet([view for view in views if view is not None], (), {}, world.now, 1.7e9)
 
 
 def test_metrics_follow_the_core() -> None:
     world, metrics = World(), Metrics()
+    metrics.watch_fleet(lambda: fleet_of(world))
     world.cloud("a")
     robot = world.robot()
     robot.refuse = lambda message: True
@@ -36,6 +45,7 @@ def test_metrics_follow_the_core() -> None:
         assert line in shown
     world.leave(robot)
     world.run(2.0)
+    time.sleep(REUSED_S)
     shown = text(metrics, world)
     assert 'robot="robot"' not in shown
     assert 'plr_departures_total{reason="left"} 1.0' in shown

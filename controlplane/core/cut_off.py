@@ -1,0 +1,33 @@
+"""Whom the access policy leaves nobody to talk to: to its peers, such a member is as good as gone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from protos.model import Role
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from controlplane.core.permits import Permits
+    from controlplane.core.registry import Sidecar
+    from protos.model import NodeName
+
+
+def cut_off(sidecars: Iterable[Sidecar], permits: Permits) -> frozenset[NodeName]:
+    """Those of the sidecars that may have to do with none of the others.
+
+    Nobody is cut off where there is nobody to talk to; and a cloud that has offered nothing yet is not, as nobody knows
+    yet what robots may call there.
+    """
+    if not permits.restricted:
+        return frozenset()
+    members = list(sidecars)
+    clouds = [cloud for cloud in members if cloud.role is Role.CLOUD and cloud.offered]
+    groups = {robot.name: permits.group(robot.name) for robot in members if robot.role is Role.ROBOT}
+    if not clouds or not groups:
+        return frozenset()
+    served = {group: any(permits.of(group, cloud) for cloud in clouds) for group in set(groups.values())}
+    lonely = {name for name, group in groups.items() if not served[group]}
+    lonely.update(cloud.name for cloud in clouds if not any(permits.of(group, cloud) for group in served))
+    return frozenset(lonely)

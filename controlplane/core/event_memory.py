@@ -1,0 +1,103 @@
+"""The last events of the fleet. When they are too many, whoever has most of them loses its oldest: no member, however
+restless, pushes out what is known of others.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from protos.token_bucket import TokenBucket
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from protos.fleet_events import FleetEvent
+
+    Owner = str | None
+
+MAX_EVENTS = 8192
+"""Events remembered: two for each of the sidecars that can be registered."""
+
+EVENTS_BURST = 64.0
+"""Events of one member taken at once: a bad hour."""
+
+EVENTS_PER_S = 1.0 / 30.0
+"""After that; each is written to the disk."""
+
+
+class EventMemory:
+    """Events in the order they came."""
+
+    def __init__(self) -> None:
+        self._events: OrderedDict[int, FleetEvent] = OrderedDict()
+        self._of: dict[Owner, deque[int]] = {}
+        self._holders: dict[int, OrderedDict[Owner, None]] = {}
+        """Who has so many events, by that number."""
+        self._most = 0
+        self._shares: dict[Owner, TokenBucket] = {}
+        """Of those who have events: so there are no more of them than events."""
+        self.evicted = 0
+        self.too_often = 0
+
+    def __len__(self) -> int:
+        return len(self._events)
+
+    def __iter__(self) -> Iterator[FleetEvent]:
+        return iter(self._events.values())
+
+    @property
+    def last_number(self) -> int:
+        """Of the newest event; 0 without any."""
+        return next(reversed(self._events), 0)
+
+    def last(self, count: int) -> list[FleetEvent]:
+        """The last ones, the oldest first."""
+        return [*islice(reversed(self._events.values()), count)][::-1]
+
+    def admits(self, owner: Owner, now: float) -> bool:
+        """Whether one more event of this member is within its share, as the control plane's own always are; `now` in
+        monotonic seconds."""
+        if owner is None:
+            return True
+        share = self._shares.get(owner)
+        if share is None:
+            # Held from its first event on.
+            share = TokenBucket(rate=EVENTS_PER_S, burst=EVENTS_BURST, now=now)
+            if owner in self._of:
+                self._shares[owner] = share
+        if share.take(now):
+            return True
+        self.too_often += 1
+        return False
+
+    def add(self, event: FleetEvent) -> None:
+        """Keep one whose number is above all others'."""
+        self._events[event.number] = event
+        own = self._of.setdefault(event.node, deque())
+        self._count(event.node, len(own), len(own) + 1)
+        own.append(event.number)
+        if len(self._events) > MAX_EVENTS:
+            self._evict()
+
+    def _count(self, owner: Owner, before: int, after: int) -> None:
+        if before:
+            del self._holders[before][owner]
+            if not self._holders[before]:
+                del self._holders[before]
+        if after:
+            self._holders.setdefault(after, OrderedDict())[owner] = None
+            self._most = max(self._most, after)
+        while self._most and self._most not in self._holders:
+            self._most -= 1
+
+    def _evict(self) -> None:
+        owner = next(iter(self._holders[self._most]))
+        own = self._of[owner]
+        self._count(owner, len(own), len(own) - 1)
+        del self._events[own.popleft()]
+        if not own:
+            del self._of[owner]
+            self._shares.pop(owner, None)
+        self.evicted += 1

@@ -1,0 +1,111 @@
+"""What is known of one member, for the metrics: gathered quickly and by reference, so that it can be written down on
+another thread while the core goes on. Times are monotonic seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from controlplane.core.picture import interfaces_of
+from controlplane.core.problem import BlockKey
+from protos.histogram import BUCKETS, MIDS
+from protos.model import Role
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from controlplane.core.estimator import Estimator
+    from controlplane.core.plan import Plan
+    from controlplane.core.registry import Sidecar
+    from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
+
+MAX_VIEWED = 512
+"""Paths, and services, of one robot that are looked at."""
+
+_MIDS = np.array(MIDS)
+
+
+@dataclass(frozen=True, slots=True)
+class PathView:
+    """One path of a robot, as reported last."""
+
+    interface: InterfaceName
+    server: NodeName
+    up: bool
+    round_trips: NDArray[np.float64]
+    """Weights by bucket of `protos.histogram`; never changed."""
+
+
+@dataclass(frozen=True, slots=True)
+class MissView:
+    """How often requests of a robot's service miss the deadline."""
+
+    service: ServiceName
+    predicted: float | None
+    observed: float | None
+    target: float
+    """What its configuration wants; 0: as few as can be."""
+
+
+@dataclass(frozen=True, slots=True)
+class MemberView:
+    """One registered sidecar."""
+
+    name: NodeName
+    role: Role
+    connected: bool
+    seen_at: float
+    paths: tuple[PathView, ...] = ()
+    mapping: tuple[ServiceMapping, ...] = ()
+    misses: tuple[MissView, ...] = ()
+
+
+def view_of(
+    sidecar: Sidecar,
+    mapping: tuple[ServiceMapping, ...],
+    plan: Plan,
+    estimator: Estimator,
+    *,
+    seen_at: float,
+    now: float,
+) -> MemberView:
+    """Look at one; some 30 us for a robot with 15 paths."""
+    connected = sidecar.stream is not None
+    if sidecar.role is not Role.ROBOT:
+        return MemberView(sidecar.name, sidecar.role, connected, seen_at)
+    # Whatever a robot reports: it makes no series of interfaces that it has not announced.
+    interfaces = set(interfaces_of(sidecar))
+    paths = (path for path in estimator.path_views(sidecar.name) if path.interface in interfaces)
+    return MemberView(
+        name=sidecar.name,
+        role=sidecar.role,
+        connected=connected,
+        seen_at=seen_at,
+        paths=tuple(islice(paths, MAX_VIEWED)),
+        mapping=mapping[:MAX_VIEWED],
+        misses=tuple(_misses(sidecar.name, use, plan, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
+    )
+
+
+def _misses(robot: NodeName, use: ServiceUse, plan: Plan, estimator: Estimator, now: float) -> MissView:
+    block = plan.blocks.get(BlockKey(robot, use.name))
+    predicted = block.predicted_miss if block is not None else None
+    return MissView(use.name, predicted, estimator.observed_miss_ratio(robot, use.name, now), use.target_miss)
+
+
+def medians(paths: Sequence[PathView]) -> list[float]:
+    """The median round trip of each path in seconds, within 2 %; NaN where none is known."""
+    if not paths:
+        return []
+    reached = np.cumsum([path.round_trips for path in paths], axis=1)
+    half = reached[:, -1:] / 2
+    # Rounding must not put it beyond the last bucket.
+    index = np.minimum((reached < half).sum(axis=1), BUCKETS - 1)
+    found: list[float] = np.where(half[:, 0] > 0.0, _MIDS[index], np.nan).tolist()
+    return found

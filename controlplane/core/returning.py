@@ -1,0 +1,44 @@
+"""Who was there before the control plane was restarted, and is not back yet: nobody's lease tells of these.
+
+Times are monotonic seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from controlplane.core.departed import Departure
+    from protos.model import NodeName
+
+TEXT = "it was there before the control plane was restarted, and did not come back"
+
+
+class Returning:
+    """Awaits them, until a time."""
+
+    def __init__(self) -> None:
+        self._awaited: dict[NodeName, Departure] = {}
+        self.until: float | None = None
+        """When to ask who is `missing`; None while nobody is awaited."""
+
+    def expect(self, present: Iterable[Departure], until: float) -> None:
+        """These were there; they are noted as departures should they not come back until then."""
+        self._awaited = {one.name: one for one in present}
+        self.until = until if self._awaited else None
+
+    def is_back(self, name: NodeName) -> None:
+        """It is registered."""
+        self._awaited.pop(name, None)
+
+    def missing(self, now: float) -> list[Departure]:
+        """Those that did not come back in time, each once."""
+        if self.until is None or self.until > now:
+            return []
+        gone = [replace(one, at=now, text=TEXT) for one in self._awaited.values()]
+        self._awaited.clear()
+        self.until = None
+        return gone

@@ -1,0 +1,94 @@
+"""One event as a line of JSON: in the control plane's file, and for `plr events --json`."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from protos.errors import DecodeError
+from protos.fleet_events import EventKind, FleetEvent, Why
+from protos.model import Role
+from protos.names import clean_text, node_name
+
+if TYPE_CHECKING:
+    import enum
+
+MAX_LINE_BYTES = 4096
+"""A longer line is damaged: a text has at most 255 bytes."""
+
+MAX_NUMBER = 1 << 62
+
+E = TypeVar("E", bound="enum.Enum")
+
+
+def encode(event: FleetEvent) -> str:
+    """Return the line, without its end."""
+    shown: dict[str, Any] = {"number": event.number, "at": timestamp(event.at), "kind": event.kind.value}
+    if event.node is not None:
+        shown["node"] = event.node
+    if event.role is not None:
+        shown["role"] = event.role.value
+    if event.why is not None:
+        shown["why"] = event.why.value
+    if event.text:
+        shown["text"] = event.text
+    return json.dumps(shown, ensure_ascii=False)
+
+
+def decode(line: bytes) -> FleetEvent:
+    """Read a line. Raises DecodeError if it is not one of ours, or damaged."""
+    if len(line) > MAX_LINE_BYTES:
+        raise DecodeError("the line is too long")
+    try:
+        shown = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise DecodeError("no JSON") from error
+    if not isinstance(shown, dict):
+        raise DecodeError("no JSON object")
+    number = shown.get("number")
+    if type(number) is not int or not 0 < number < MAX_NUMBER:
+        raise DecodeError("no number")
+    kind = _member(EventKind, shown, "kind")
+    if kind is None:
+        raise DecodeError("no kind")
+    node = shown.get("node")
+    text = shown.get("text", "")
+    if not isinstance(text, str) or clean_text(text) != text:
+        raise DecodeError("no text")
+    return FleetEvent(
+        number=number,
+        at=_seconds(shown.get("at")),
+        kind=kind,
+        node=node_name(node, "node") if isinstance(node, str) else None,
+        text=text,
+        role=_member(Role, shown, "role"),
+        why=_member(Why, shown, "why"),
+    )
+
+
+def timestamp(at: float) -> str:
+    """Seconds since 1970 as people and programs read them, in UTC."""
+    return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _seconds(text: object) -> float:
+    if not isinstance(text, str):
+        raise DecodeError("no time")
+    try:
+        at = datetime.fromisoformat(text)
+        if at.tzinfo is None:
+            raise DecodeError("a time without its zone")
+        return at.timestamp()
+    except (ValueError, OverflowError) as error:
+        raise DecodeError("no time") from error
+
+
+def _member(kind: type[E], shown: dict[str, Any], field: str) -> E | None:
+    value = shown.get(field)
+    if value is None:
+        return None
+    try:
+        return kind(value)
+    except ValueError as error:
+        raise DecodeError(f"{field} has no meaning for {value!a}") from error

@@ -1,0 +1,294 @@
+"""The log of events: remembered here, and kept in a file that outlives the program.
+
+    state_dir/events.jsonl   one event a line, JSON (`event_lines`); appended to
+    state_dir/lock           held while the program runs
+
+The file is bounded: when it has grown to MAX_FILE_BYTES it is written anew, with what is remembered. So it is also when
+writing has failed: a full disk costs nothing but time, as long as the program lives. Lines that are damaged (a power
+cut amid one, a bad sector) are skipped and counted. A thread of its own writes: a slow disk holds up nobody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+import threading
+import time
+from collections import deque
+from typing import IO, TYPE_CHECKING
+
+from controlplane.core.event_memory import EventMemory
+from controlplane.event_lines import decode, encode
+from protos.errors import DecodeError
+from protos.fleet_events import EventKind, EventLogState, FleetEvent
+from protos.names import clean_text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from protos.fleet_events import EventQuery, Why
+    from protos.model import NodeName, Role
+
+log = logging.getLogger(__name__)
+
+FILE = "events.jsonl"
+LOCK_FILE = "lock"
+
+MAX_FILE_BYTES = 8 << 20
+"""Then the file is written anew: what is remembered takes half of it at most."""
+
+MAX_UNWRITTEN = 4096
+"""Events that wait for the disk; beyond that the file is written anew as a whole."""
+
+RETRY_S = 10.0
+"""From a failed writing to the next attempt."""
+
+CLOSE_TIMEOUT_S = 2.0
+"""For the last lines: a slow disk must not hold up a stop."""
+
+
+class EventLog:
+    """Takes events on the loop's thread; without a folder it keeps them in memory only."""
+
+    def __init__(
+        self,
+        folder: Path | None,
+        *,
+        wall: Callable[[], float] = time.time,
+        clock: Callable[[], float] = time.monotonic,
+        retry_s: float = RETRY_S,
+    ) -> None:
+        self._folder = folder
+        self._wall = wall
+        self._clock = clock
+        self._retry_s = retry_s
+        self._memory = EventMemory()
+        self._suppressed: dict[NodeName, int] = {}
+        self._damaged = 0
+        self._write_failures = 0
+        self._problem = ""
+        self._condition = threading.Condition()
+        self._unwritten: deque[FleetEvent] = deque()
+        self._write_all = False
+        self._closing = False
+        self._file: IO[bytes] | None = None
+        self._lock: IO[bytes] | None = None
+        self._writer: threading.Thread | None = None
+        if folder is None:
+            return
+        if self._open(folder):
+            self._writer = threading.Thread(target=self._write, name="plr-events", daemon=True)
+            self._writer.start()
+
+    def announce(self) -> None:
+        """Log what is wrong with it. Not at once: a program that does not start has other things to say."""
+        if self._folder is None:
+            log.info("events are kept in memory only, and a restart forgets who is gone: state_dir is not set")
+        elif self._problem:
+            log.error("events are kept in memory only: %s", self._problem)
+        if self._damaged:
+            log.warning("%s: %d damaged lines of the log of events skipped", self._folder, self._damaged)
+
+    # ── for the loop ──
+
+    def record(
+        self,
+        kind: EventKind,
+        node: NodeName | None = None,
+        text: str = "",
+        *,
+        role: Role | None = None,
+        why: Why | None = None,
+    ) -> None:
+        """Something happened."""
+        if not self._memory.admits(node, self._clock()):
+            if node is not None and (node in self._suppressed or len(self._suppressed) < MAX_UNWRITTEN):
+                self._suppressed[node] = self._suppressed.get(node, 0) + 1
+            return
+        if node is not None and (more := self._suppressed.pop(node, 0)):
+            text = f"{text} (and {more} events before it that were too many to keep)"
+        at = self._wall()
+        # Grows also over a log that was lost: who asks for what is new must not wait for numbers to catch up.
+        number = max(self._memory.last_number + 1, int(at * 1e6))
+        event = FleetEvent(number, at, kind, node, clean_text(text.strip()), role, why)
+        with self._condition:
+            self._memory.add(event)
+            if self._writer is None:
+                return
+            self._unwritten.append(event)
+            if len(self._unwritten) > MAX_UNWRITTEN:
+                self._unwritten.clear()
+                self._write_all = True
+            self._condition.notify()
+
+    def events(self) -> list[FleetEvent]:
+        """All that are remembered, the oldest first."""
+        return list(self._memory)
+
+    def last(self, count: int) -> list[FleetEvent]:
+        """The last ones, the oldest first."""
+        return self._memory.last(count)
+
+    def find(self, query: EventQuery) -> tuple[list[FleetEvent], int]:
+        """What is asked for, the oldest first, and how many older ones `query.last` leaves out."""
+        found = [
+            event
+            for event in self._memory
+            if event.number > query.after
+            and event.at >= query.since
+            and (query.node is None or event.node == query.node)
+        ]
+        left_out = max(0, len(found) - query.last) if query.last else 0
+        return found[left_out:], left_out
+
+    @property
+    def state(self) -> EventLogState:
+        """How it is doing."""
+        return EventLogState(
+            kept=len(self._memory),
+            evicted=self._memory.evicted,
+            too_often=self._memory.too_often,
+            damaged=self._damaged,
+            write_failures=self._write_failures,
+            on_disk=self._writer is not None and not self._problem,
+            problem=self._problem,
+        )
+
+    def close(self) -> None:
+        """Write what is still unwritten, if the disk takes it soon."""
+        if self._writer is None:
+            return
+        with self._condition:
+            self._closing = True
+            self._condition.notify()
+        self._writer.join(CLOSE_TIMEOUT_S)
+        self._unlock()
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+
+    # ── the file ──
+
+    def _open(self, folder: Path) -> bool:
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._lock = (folder / LOCK_FILE).open("ab")
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._problem = f"state_dir: another control plane uses {folder}; give each a folder of its own"
+        except OSError as error:
+            self._problem = f"state_dir: {folder}: {error.strerror or error}"
+        if self._problem:
+            self._unlock()
+            return False
+        try:
+            for event in self._read(folder / FILE):
+                self._memory.add(event)
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            log.error("%s cannot be read: %s; events begin anew", folder / FILE, error.strerror or error)
+        self._write_all |= self._damaged > 0
+        return True
+
+    def _read(self, path: Path) -> Iterator[FleetEvent]:
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - 2 * MAX_FILE_BYTES))
+            data = file.read(2 * MAX_FILE_BYTES)
+        # What is appended must not join a line that was cut off.
+        self._write_all = not data.endswith(b"\n")
+        last = 0
+        for line in data.split(b"\n"):
+            if not line:
+                continue
+            try:
+                event = decode(line)
+                if event.number <= last:
+                    raise DecodeError("out of order")
+            except DecodeError:
+                self._damaged += 1
+                continue
+            last = event.number
+            yield event
+
+    # ── the writer's thread ──
+
+    def _write(self) -> None:
+        failed_at: float | None = None
+        while True:
+            with self._condition:
+                while not (self._closing or self._unwritten or self._write_all):
+                    self._condition.wait()
+                if failed_at is not None and not self._closing:
+                    # Everything waits for the disk; what comes meanwhile is written with the rest.
+                    self._condition.wait_for(lambda: self._closing, self._retry_s)
+                closing = self._closing
+                whole = self._write_all or failed_at is not None
+                events = list(self._memory) if whole else list(self._unwritten)
+                self._unwritten.clear()
+                self._write_all = False
+            try:
+                if events or whole:
+                    self._put(events, whole)
+            except OSError as error:
+                failed_at = self._failed(error, told=failed_at is not None)
+                with self._condition:
+                    self._write_all = True
+            else:
+                if failed_at is not None:
+                    log.info("events are on the disk again")
+                failed_at, self._problem = None, ""
+            if closing:
+                self._close_file()
+                return
+
+    def _failed(self, error: OSError, *, told: bool) -> float:
+        self._write_failures += 1
+        self._problem = f"{FILE}: {error.strerror or error}"
+        if not told:
+            log.error("%s not written: %s; tried again, and remembered meanwhile", FILE, error.strerror or error)
+        self._close_file()
+        return self._clock()
+
+    def _close_file(self) -> None:
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._file = None
+
+    def _put(self, events: list[FleetEvent], whole: bool) -> None:
+        assert self._folder is not None
+        data = "".join(f"{encode(event)}\n" for event in events).encode()
+        path = self._folder / FILE
+        if whole:
+            self._close_file()
+            aside = path.with_suffix(".new")
+            try:
+                with aside.open("wb", buffering=0) as file:
+                    _write_through(file, data)
+                aside.replace(path)
+            except OSError:
+                aside.unlink(missing_ok=True)
+                raise
+            return
+        if self._file is not None and not os.fstat(self._file.fileno()).st_nlink:
+            raise FileNotFoundError(errno.ENOENT, "somebody has removed it")
+        if self._file is None:
+            self._file = path.open("ab", buffering=0)
+        _write_through(self._file, data)
+        if self._file.tell() > MAX_FILE_BYTES:
+            with self._condition:
+                self._write_all = True
+
+
+def _write_through(file: IO[bytes], data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[file.write(view) :]
+    os.fdatasync(file.fileno())

@@ -1,0 +1,138 @@
+"""`plr events`: what happened in the fleet, as the control plane's log of events has it."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from controlplane import event_lines, event_text
+from controlplane.admin_client import AskError, add_options, ask
+from controlplane.arguments import checked_name
+from protos.convert import event_list_from_proto, event_query_to_proto
+from protos.fleet_events import EventQuery
+from protos.names import node_name
+
+if TYPE_CHECKING:
+    from controlplane.arguments import Commands
+    from protos.fleet_events import EventList
+
+EXIT_OK = 0
+
+LAST = 100
+
+FOLLOW_S = 2.0
+"""From one look to the next."""
+
+_UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
+
+_EPILOG = """\
+shows: who connected, lost its stream, was refused, and who is gone and why (lease_expired, certificate_expired,
+revoked, drained, left, policy); refusals of what was sent; the control plane's own starts and stops. Times are UTC.
+With --json each event is a line of its own. What each kind means: docs/events.md.
+
+examples:
+  plr events --tls-dir ~/.plr/alice --address control.example.org:50051
+  plr events --tls-dir ~/.plr/alice --node robot-7 --since 2h
+  plr events --insecure --since 2026-03-01T08:00 --json > monday.jsonl
+  plr events --insecure --follow
+"""
+
+
+def add_to(commands: Commands) -> None:
+    """Add the command to `plr`."""
+    events = commands.add_parser(
+        "events",
+        help="what happened in the fleet: who came, who went and why",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    events.add_argument("--node", type=checked_name(node_name), metavar="NAME", help="of this sidecar alone")
+    events.add_argument(
+        "--since",
+        type=_since,
+        default=0.0,
+        metavar="WHEN",
+        help="90s, 30m, 2h, 7d ago, or a time (UTC if none is said)",
+    )
+    events.add_argument(
+        "--last",
+        type=_count,
+        metavar="N",
+        help=f"so many at most, the newest; 0: all (default {LAST}; with --since all)",
+    )
+    events.add_argument("--follow", action="store_true", help="go on with what happens from now on, until Ctrl-C")
+    add_options(events)
+    events.set_defaults(run=_events)
+
+
+def _since(text: str) -> float:
+    ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", text)
+    if ago is not None:
+        return max(0.0, time.time() - float(ago[1]) * _UNITS_S[ago[2]])
+    try:
+        at = datetime.fromisoformat(text)
+        return max(0.0, (at if at.tzinfo is not None else at.replace(tzinfo=UTC)).timestamp())
+    except (ValueError, OverflowError):
+        raise argparse.ArgumentTypeError(f"expected such as 30m, 2h, 7d or 2026-03-01T08:00, got '{text}'") from None
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) > 1 << 31:
+        raise argparse.ArgumentTypeError(f"expected a number of events, got '{text}'")
+    return int(text)
+
+
+def _events(arguments: argparse.Namespace) -> int:
+    last = arguments.last
+    if last is None:
+        last = 0 if arguments.since else LAST
+    query = EventQuery(arguments.node, 0, arguments.since, last)
+    try:
+        found = _ask(arguments, query)
+        _show(found, as_json=arguments.json)
+        if found.left_out and not arguments.json:
+            sys.stderr.write(f"plr: {found.left_out} older events are not shown; --last 0 shows all\n")
+        while arguments.follow:
+            time.sleep(FOLLOW_S)
+            after = found.events[-1].number if found.events else query.after
+            query = replace(query, after=after, last=0)
+            found = _follow(arguments, query)
+            _show(found, as_json=arguments.json)
+    except AskError as error:
+        sys.stderr.write(f"plr: {error}\n")
+        return error.code
+    except KeyboardInterrupt:
+        return EXIT_OK
+    return EXIT_OK
+
+
+def _ask(arguments: argparse.Namespace, query: EventQuery) -> EventList:
+    request = event_query_to_proto(query)
+    _, found = ask(
+        arguments, lambda stub, timeout_s: stub.ListEvents(request, timeout=timeout_s), event_list_from_proto
+    )
+    return found
+
+
+def _follow(arguments: argparse.Namespace, query: EventQuery) -> EventList:
+    """Ask until there is an answer: a control plane that restarts is just what one follows."""
+    told = False
+    while True:
+        try:
+            return _ask(arguments, query)
+        except AskError as error:
+            if not told:
+                sys.stderr.write(f"plr: {error}; trying again\n")
+            told = True
+            time.sleep(FOLLOW_S)
+
+
+def _show(found: EventList, *, as_json: bool) -> None:
+    for event in found.events:
+        sys.stdout.write(f"{event_lines.encode(event) if as_json else event_text.line(event)}\n")
+    sys.stdout.flush()

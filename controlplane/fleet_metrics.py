@@ -1,0 +1,254 @@
+"""What the control plane knows of each member, for Prometheus: robots behind a NAT cannot be scraped themselves.
+
+A scrape asks the loop for what it knows; the loop gathers that in short turns, by reference, and the scrape's own
+thread writes it down, one series at a time: tens of thousands of objects at once would set off the collector of
+garbage, for which all threads wait. The series are bounded, and each robot has its share of them.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import TYPE_CHECKING, cast
+
+from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.samples import Sample
+
+from controlplane.core.fleet_view import medians
+from protos.model import Role
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from prometheus_client import Metric
+
+    from controlplane.core.fleet_view import MemberView, MissView
+    from protos.fleet_events import DepartedSidecar
+    from protos.model import NodeName
+
+MAX_SERIES = 100_000
+"""Of all members."""
+
+SERIES_OF_MEMBER = 3
+"""Of each, there or gone, beside a robot's own."""
+
+MAX_GONE = 1024
+"""Members that are gone and still have series, those that went last."""
+
+REUSED_S = 1.0
+"""Scrapes within this time share their values."""
+
+
+PATHS_AT_ONCE = 1000
+"""Paths whose round trips are worked out together: numpy gives the interpreter up and takes it back with each call, and
+with many small ones the loop, which waits for it, goes without for 0.1 s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """All members at one moment."""
+
+    members: Sequence[MemberView]
+    gone: Sequence[DepartedSidecar]
+    certificates_end: Mapping[NodeName, float]
+    """Seconds since 1970."""
+    now: float
+    """The moment in the members' monotonic seconds ..."""
+    now_wall: float
+    """... and in seconds since 1970."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Room:
+    """How many series of each kind a robot may have."""
+
+    misses: int
+    paths: int
+    mapped: int
+    round_trips: int
+    left_out: int
+
+
+Labels = Sequence[str]
+Rows = Callable[[], Iterator[tuple[Labels, float]]]
+
+
+class _Series:
+    """The samples of a metric, made while they are read."""
+
+    def __init__(self, name: str, labels: Labels, rows: Rows) -> None:
+        self._name = name
+        self._labels = labels
+        self._rows = rows
+
+    def __iter__(self) -> Iterator[Sample]:
+        for values, value in self._rows():
+            yield Sample(self._name, dict(zip(self._labels, values, strict=True)), value)
+
+
+class FleetCollector:
+    """Collects on the thread of a scrape; `ask` gets the fleet from the loop, and may raise TimeoutError."""
+
+    def __init__(self, ask: Callable[[], Fleet]) -> None:
+        self._ask = ask
+        self._lock = threading.Lock()
+        self._fleet: Fleet | None = None
+        self._at = -math.inf
+
+    def collect(self) -> Iterable[Metric]:
+        """All metrics of all members."""
+        with self._lock:
+            if time.monotonic() - self._at >= REUSED_S:
+                self._fleet = None
+                try:
+                    self._fleet = self._ask()
+                except TimeoutError:
+                    # It stops, or is hopelessly busy: no values are better than old ones that look new.
+                    return ()
+                self._at = time.monotonic()
+            fleet = self._fleet
+        return families(fleet) if fleet is not None else ()
+
+
+def families(fleet: Fleet) -> Iterable[Metric]:
+    """Write everything down, while it is read."""
+    fleet = replace(fleet, gone=fleet.gone[:MAX_GONE])
+    robots = [member for member in fleet.members if member.role is Role.ROBOT]
+    free = MAX_SERIES - SERIES_OF_MEMBER * (len(fleet.members) + len(fleet.gone))
+    share = max(0, free) // max(1, len(robots))
+    rooms = [(robot, _room(robot, share)) for robot in robots]
+    return (*_members(fleet), *_robots(rooms))
+
+
+def _room(robot: MemberView, share: int) -> _Room:
+    """Share it out, to what is needed most first."""
+    wanted = (
+        sum((miss.predicted is not None) + (miss.observed is not None) + (miss.target > 0.0) for miss in robot.misses),
+        len(robot.paths),
+        sum(len(mapping.assignments) for mapping in robot.mapping),
+        len(robot.paths),
+    )
+    given = []
+    left = share
+    for count in wanted:
+        given.append(min(count, left))
+        left -= given[-1]
+    return _Room(given[0], given[1], given[2], given[3], sum(wanted) - sum(given))
+
+
+def _gauge(name: str, text: str, labels: Labels, rows: Rows) -> Metric:
+    return _lazy(GaugeMetricFamily(name, text, labels=labels), name, labels, rows)
+
+
+def _info(name: str, text: str, labels: Labels, rows: Rows) -> Metric:
+    return _lazy(InfoMetricFamily(name, text, labels=labels), f"{name}_info", labels, rows)
+
+
+def _lazy(family: Metric, name: str, labels: Labels, rows: Rows) -> Metric:
+    # Whoever reads a metric goes over its samples once.
+    family.samples = cast("list[Sample]", _Series(name, labels, rows))
+    return family
+
+
+def _members(fleet: Fleet) -> Iterator[Metric]:
+    # Who is cut off by the policy is as good as gone, and there.
+    there = {member.name for member in fleet.members}
+    gone = [one for one in fleet.gone if one.name not in there]
+
+    def up() -> Iterator[tuple[Labels, float]]:
+        yield from (((member.name, member.role.value), float(member.connected)) for member in fleet.members)
+        yield from (((one.name, one.role.value), 0.0) for one in gone)
+
+    def seen() -> Iterator[tuple[Labels, float]]:
+        began = fleet.now_wall - fleet.now
+        yield from (((member.name, member.role.value), round(began + member.seen_at, 3)) for member in fleet.members)
+        yield from (((one.name, one.role.value), round(fleet.now_wall - one.seen_s, 3)) for one in gone)
+
+    def ends() -> Iterator[tuple[Labels, float]]:
+        for member in fleet.members:
+            if (end := fleet.certificates_end.get(member.name)) is not None:
+                yield (member.name, member.role.value), end
+
+    def why() -> Iterator[tuple[Labels, float]]:
+        yield from (((one.name, one.role.value, one.why.value), 1.0) for one in fleet.gone)
+
+    labels = ("sidecar", "role")
+    yield _gauge("plr_sidecar_up", "1 while the sidecar's control stream is open.", labels, up)
+    yield _gauge("plr_sidecar_last_seen_timestamp_seconds", "When the sidecar was heard of last.", labels, seen)
+    yield _gauge("plr_sidecar_certificate_expiry_timestamp_seconds", "When its certificate ends.", labels, ends)
+    yield _info("plr_sidecar_gone", "Sidecars that are gone, and why.", (*labels, "why"), why)
+
+
+def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
+    def misses(pick: Callable[[MissView], float | None], before: Sequence[Callable[[MissView], float | None]]) -> Rows:
+        def rows() -> Iterator[tuple[Labels, float]]:
+            for robot, room in rooms:
+                left = room.misses - sum(of(miss) is not None for of in before for miss in robot.misses)
+                found = ((miss.service, value) for miss in robot.misses if (value := pick(miss)) is not None)
+                for service, value in islice(found, max(0, left)):
+                    yield (robot.name, service), value
+
+        return rows
+
+    def predicted(miss: MissView) -> float | None:
+        return miss.predicted
+
+    def observed(miss: MissView) -> float | None:
+        return miss.observed
+
+    def target(miss: MissView) -> float | None:
+        return miss.target or None
+
+    def up() -> Iterator[tuple[Labels, float]]:
+        for robot, room in rooms:
+            for path in robot.paths[: room.paths]:
+                yield (robot.name, path.interface, path.server), float(path.up)
+
+    def mapped() -> Iterator[tuple[Labels, float]]:
+        for robot, room in rooms:
+            pairs = ((mapping.service, pair) for mapping in robot.mapping for pair in mapping.assignments)
+            for service, pair in islice(pairs, room.mapped):
+                yield (robot.name, service, pair.interface, pair.server), 1.0
+
+    def round_trips() -> Iterator[tuple[Labels, float]]:
+        of_all = ((robot.name, path) for robot, room in rooms for path in robot.paths[: room.round_trips])
+        while some := list(islice(of_all, PATHS_AT_ONCE)):
+            for (name, path), rtt in zip(some, medians([path for _, path in some]), strict=True):
+                if not math.isnan(rtt):
+                    yield (name, path.interface, path.server), rtt
+
+    def left_out() -> Iterator[tuple[Labels, float]]:
+        yield (), float(sum(room.left_out for _, room in rooms))
+
+    path, service = ("robot", "interface", "server"), ("robot", "service")
+    yield _gauge(
+        "plr_predicted_miss_probability",
+        "Predicted probability that all copies of a request miss its deadline.",
+        service,
+        misses(predicted, ()),
+    )
+    yield _gauge(
+        "plr_observed_miss_ratio",
+        "Share of recent requests that missed their deadline or failed.",
+        service,
+        misses(observed, (predicted,)),
+    )
+    yield _gauge(
+        "plr_target_miss_probability",
+        "What the robot's configuration wants, where it says so.",
+        service,
+        misses(target, (predicted, observed)),
+    )
+    yield _gauge("plr_robot_path_up", "1 while the robot's path answers, by its last report.", path, up)
+    yield _info(
+        "plr_robot_mapping",
+        "Over which interfaces to which servers requests go.",
+        ("robot", "service", "interface", "server"),
+        mapped,
+    )
+    yield _gauge("plr_robot_path_rtt_seconds", "Median round trip of the robot's path.", path, round_trips)
+    yield _gauge("plr_fleet_series_left_out", "Series of robots beyond their share.", (), left_out)

@@ -1,0 +1,44 @@
+"""What the log of events tells a new run of the control plane: who was gone, and who was there when it ended."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from controlplane.core.departed import Departure
+from protos.fleet_events import EventKind, FleetEvent, Why
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from protos.model import NodeName
+
+
+def departures(events: Sequence[FleetEvent], *, now_wall: float, now: float) -> tuple[list[Departure], list[Departure]]:
+    """Who was gone, who went first first; and who was there, as a departure to be noted if it does not come back.
+
+    `now_wall` is seconds since 1970, `now` the same moment in the monotonic seconds of what is returned.
+    """
+    gone: dict[NodeName, FleetEvent] = {}
+    present: dict[NodeName, FleetEvent] = {}
+    for event in events:
+        node = event.node
+        # Who is refused was not there for that.
+        if node is None or event.role is None or event.kind is EventKind.REFUSED:
+            continue
+        gone.pop(node, None)
+        present.pop(node, None)
+        (gone if event.kind is EventKind.DEPARTED else present)[node] = event
+    # Had it fallen silent before the end of that run, the log would tell.
+    ended_at = events[-1].at if events else now_wall
+
+    def departure(event: FleetEvent, at_wall: float) -> Departure:
+        at = now - max(0.0, now_wall - at_wall)
+        assert event.node is not None
+        assert event.role is not None
+        text = event.text if event.kind is EventKind.DEPARTED else ""
+        return Departure(event.node, event.role, event.why or Why.LEASE_EXPIRED, at, at, text)
+
+    return (
+        [departure(event, event.at) for event in gone.values()],
+        [departure(event, ended_at) for event in present.values()],
+    )

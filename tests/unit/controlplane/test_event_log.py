@@ -1,0 +1,215 @@
+"""The log of events outlives the program, full disks and damaged lines."""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+from typing import IO, TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controlplane import event_log
+from controlplane.event_lines import decode, encode
+from controlplane.event_log import FILE, EventLog
+from controlplane.remembered import departures
+from protos.errors import DecodeError
+from protos.fleet_events import EventKind, EventQuery, FleetEvent, Why
+from protos.model import NodeName, Role
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+pytestmark = pytest.mark.audit("ops-11")
+
+ROBOT = NodeName("robot")
+PATIENCE_S = 30.0
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def write(folder: Path, count: int = 3) -> list[FleetEvent]:
+    log = EventLog(folder)
+    for number in range(count):
+        log.record(EventKind.CONNECTED, NodeName(f"robot-{number}"), "software 1", role=Role.ROBOT)
+    log.record(EventKind.DEPARTED, ROBOT, role=Role.ROBOT, why=Why.REVOKED)
+    written = log.events()
+    log.close()
+    return written
+
+
+def test_it_survives_a_restart_and_its_numbers_only_grow(tmp_path: Path) -> None:
+    written = write(tmp_path / "state")
+    log = EventLog(tmp_path / "state")
+    assert [event.number for event in log.events()] == [event.number for event in written]
+    assert [(event.node, event.why) for event in log.events()] == [(event.node, event.why) for event in written]
+    log.record(EventKind.STOPPED)
+    assert log.events()[-1].number > written[-1].number
+    log.close()
+
+
+def test_damaged_lines_are_skipped_counted_and_not_written_again(tmp_path: Path) -> None:
+    written = write(tmp_path)
+    lines = (tmp_path / FILE).read_bytes().splitlines(keepends=True)
+    damaged = [
+        lines[0],
+        b'{"number": 1',
+        lines[1].replace(b"connected", b"conn\xffcted"),
+        b"\0" * 50 + b"\n",
+        *lines[2:],
+    ]
+    (tmp_path / FILE).write_bytes(b"".join(damaged) + lines[0][:20])
+    log = EventLog(tmp_path)
+    # One cut off amid a line takes the one behind it along.
+    assert log.state.damaged == 3
+    assert [event.number for event in log.events()] == [written[0].number, *(event.number for event in written[2:])]
+    log.record(EventKind.STARTED)
+    log.close()
+    again = EventLog(tmp_path)
+    assert again.state.damaged == 0
+    assert len(again.events()) == len(written)
+    again.close()
+
+
+def test_a_line_without_its_end_does_not_swallow_the_next(tmp_path: Path) -> None:
+    written = write(tmp_path)
+    content = (tmp_path / FILE).read_bytes()
+    (tmp_path / FILE).write_bytes(content.removesuffix(b"\n"))
+    write(tmp_path, count=0)
+    log = EventLog(tmp_path)
+    assert len(log.events()) == len(written) + 1
+    log.close()
+
+
+def test_a_full_disk_costs_nothing_but_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = threading.Event()
+    real = event_log._write_through
+
+    def write_through(file: IO[bytes], data: bytes) -> None:
+        if full.is_set():
+            real(file, data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(file, data)
+
+    monkeypatch.setattr(event_log, "_write_through", write_through)
+    log = EventLog(tmp_path, retry_s=0.05)
+    log.record(EventKind.STARTED)
+    wait_for(lambda: (tmp_path / FILE).exists())
+    full.set()
+    for number in range(5):
+        log.record(EventKind.CONNECTED, NodeName(f"robot-{number}"), role=Role.ROBOT)
+    wait_for(lambda: log.state.write_failures > 1)
+    assert not log.state.on_disk
+    assert "No space left" in log.state.problem
+    assert not (tmp_path / "events.new").exists()
+    full.clear()
+    wait_for(lambda: log.state.on_disk)
+    log.close()
+    again = EventLog(tmp_path)
+    assert [event.node for event in again.events()] == [None, *(f"robot-{number}" for number in range(5))]
+    assert again.state.damaged == 0
+    again.close()
+
+
+def test_the_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(event_log, "MAX_FILE_BYTES", 20_000)
+    monkeypatch.setattr("controlplane.core.event_memory.MAX_EVENTS", 50)
+    log = EventLog(tmp_path)
+    for number in range(2000):
+        log.record(EventKind.CONNECTED, NodeName(f"robot-{number}"), "x" * 100, role=Role.ROBOT)
+        if not number % 50:
+            wait_for(lambda: not log._unwritten)
+            assert (tmp_path / FILE).stat().st_size < 20_000 + 50 * 300
+    log.close()
+    again = EventLog(tmp_path)
+    assert again.events()[-1].node == "robot-1999"
+    again.close()
+
+
+def test_a_folder_in_use_or_out_of_reach_leaves_it_in_memory(tmp_path: Path) -> None:
+    first = EventLog(tmp_path / "state")
+    second = EventLog(tmp_path / "state")
+    assert "another control plane" in second.state.problem
+    (tmp_path / "file").write_text("")
+    third = EventLog(tmp_path / "file" / "state")
+    assert third.state.problem
+    for log in (second, third):
+        log.record(EventKind.STARTED)
+        assert log.state.kept == 1
+        assert not log.state.on_disk
+        log.close()
+    first.close()
+
+
+def test_a_file_that_somebody_removed_is_made_again(tmp_path: Path) -> None:
+    log = EventLog(tmp_path, retry_s=0.05)
+    log.record(EventKind.STARTED)
+    wait_for(lambda: (tmp_path / FILE).exists())
+    (tmp_path / FILE).unlink()
+    log.record(EventKind.STOPPED)
+    wait_for(lambda: (tmp_path / FILE).exists() and log.state.on_disk)
+    log.close()
+    again = EventLog(tmp_path)
+    assert [event.kind for event in again.events()] == [EventKind.STARTED, EventKind.STOPPED]
+    again.close()
+
+
+def test_what_was_left_out_of_a_members_share_is_said(tmp_path: Path) -> None:
+    now = 0.0
+    log = EventLog(None, clock=lambda: now)
+    for _ in range(200):
+        log.record(EventKind.CONNECTED, ROBOT, role=Role.ROBOT)
+    now = 60.0
+    log.record(EventKind.CONNECTED, ROBOT, role=Role.ROBOT)
+    left_out = log.state.too_often
+    assert left_out > 100
+    assert f"and {left_out} events before it" in log.events()[-1].text
+
+
+def test_a_question_is_answered_with_what_it_asks_for() -> None:
+    wall = 1000.0
+    log = EventLog(None, wall=lambda: wall)
+    for number in range(10):
+        wall = 1000.0 + number
+        log.record(EventKind.CONNECTED, NodeName(f"robot-{number % 2}"), role=Role.ROBOT)
+    events = log.events()
+    assert log.find(EventQuery()) == (events, 0)
+    assert log.find(EventQuery(last=3)) == (events[-3:], 7)
+    assert log.find(EventQuery(node=NodeName("robot-1"))) == (events[1::2], 0)
+    assert log.find(EventQuery(since=1007.0)) == (events[7:], 0)
+    assert log.find(EventQuery(after=events[8].number)) == (events[9:], 0)
+
+
+@given(st.binary(max_size=200))
+def test_any_line_is_an_event_or_refused(line: bytes) -> None:
+    try:
+        event = decode(line)
+    except DecodeError:
+        return
+    assert decode(encode(event).encode()) == event
+
+
+def test_who_was_gone_and_who_was_there_follows_from_it() -> None:
+    def event(number: int, kind: EventKind, node: str, why: Why | None = None) -> FleetEvent:
+        return FleetEvent(number, 100.0 + number, kind, NodeName(node), "", Role.ROBOT, why)
+
+    events = [
+        event(1, EventKind.CONNECTED, "there"),
+        event(2, EventKind.CONNECTED, "gone"),
+        event(3, EventKind.DEPARTED, "gone", Why.REVOKED),
+        event(4, EventKind.DEPARTED, "back", Why.LEASE_EXPIRED),
+        event(5, EventKind.CONNECTED, "back"),
+        event(6, EventKind.REFUSED, "gone"),
+        event(7, EventKind.REFUSED, "stranger"),
+    ]
+    gone, present = departures(events, now_wall=207.0, now=50.0)
+    assert [(one.name, one.why, one.at) for one in gone] == [("gone", Why.REVOKED, 50.0 - 104.0)]
+    assert [(one.name, one.seen_at) for one in present] == [("there", -50.0), ("back", -50.0)]

@@ -1,0 +1,58 @@
+"""Events are bounded, and no member's push out others'."""
+
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core.event_memory import EVENTS_BURST, EVENTS_PER_S, MAX_EVENTS, EventMemory
+from protos.fleet_events import EventKind, FleetEvent
+from protos.model import NodeName
+
+pytestmark = pytest.mark.audit("ops-11")
+
+
+def event(number: int, node: str | None) -> FleetEvent:
+    return FleetEvent(number, 0.0, EventKind.CONNECTED, NodeName(node) if node is not None else None)
+
+
+def test_who_has_most_loses_its_oldest() -> None:
+    memory = EventMemory()
+    quiet = [event(number, f"robot-{number}") for number in range(1, 101)]
+    for one in quiet:
+        memory.add(one)
+    for number in range(101, 101 + 3 * MAX_EVENTS):
+        memory.add(event(number, "flapping"))
+    assert len(memory) == MAX_EVENTS
+    assert [one for one in memory if one.node != "flapping"] == quiet
+    assert memory.last_number == 100 + 3 * MAX_EVENTS
+    assert memory.evicted == 100 + 2 * MAX_EVENTS
+
+
+def test_where_all_have_one_the_oldest_goes() -> None:
+    memory = EventMemory()
+    for number in range(1, MAX_EVENTS + 2):
+        memory.add(event(number, f"robot-{number}"))
+    assert [one.number for one in memory][:2] == [2, 3]
+    assert len(memory) == MAX_EVENTS
+
+
+def test_a_member_has_its_share_and_the_control_plane_is_not_counted() -> None:
+    memory = EventMemory()
+    taken = 0
+    for number in range(1, 1001):
+        if memory.admits("flapping", 10.0):
+            memory.add(event(number, "flapping"))
+            taken += 1
+        assert memory.admits(None, 10.0)
+    assert EVENTS_BURST <= taken <= EVENTS_BURST + 1
+    assert memory.too_often == 1000 - taken
+    assert memory.admits("another", 10.0)
+    assert memory.admits("flapping", 10.0 + 1.0 / EVENTS_PER_S)
+
+
+def test_the_last_ones_come_the_oldest_first() -> None:
+    memory = EventMemory()
+    for number in range(1, 6):
+        memory.add(event(number, "robot"))
+    assert [one.number for one in memory.last(2)] == [4, 5]
+    assert [one.number for one in memory.last(9)] == [1, 2, 3, 4, 5]

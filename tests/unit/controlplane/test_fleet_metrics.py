@@ -1,0 +1,252 @@
+"""What the control plane exports of each member: right, bounded, and shared out."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from controlplane.config import ControlPlaneConfig
+from controlplane.core.control_events import Settings
+from controlplane.core.fleet_view import MemberView, MissView, PathView, medians
+from controlplane.core.registry import Refusal
+from controlplane.event_log import EventLog
+from controlplane.fleet_metrics import MAX_GONE, MAX_SERIES, REUSED_S, Fleet, FleetCollector, families
+from controlplane.loop import MEMBERS_A_TURN, ControlLoop
+from controlplane.metrics import Metrics
+from protos.fleet_events import DepartedSidecar, Why
+from protos.histogram import BUCKETS
+from protos.model import (
+    Assignment,
+    InterfaceName,
+    NodeName,
+    OutcomeReport,
+    Report,
+    Role,
+    ServiceMapping,
+    ServiceName,
+    ServiceSet,
+)
+from tests.sim.control_world import SETTLED_S, World
+from tests.unit.controlplane.samples import PLAN, histogram, path, registration, use
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from prometheus_client import Metric
+
+pytestmark = pytest.mark.audit("ops-13")
+
+Series = dict[tuple[str, tuple[tuple[str, str], ...]], float]
+
+
+def series(metrics: Iterable[Metric]) -> Series:
+    return {
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
+        for metric in metrics
+        for sample in metric.samples
+    }
+
+
+def value(found: Series, name: str, **labels: str) -> float | None:
+    return found.get((name, tuple(sorted(labels.items()))))
+
+
+def fleet_of(world: World) -> Fleet:
+    views = (world.core.view(sidecar.name, world.now) for sidecar in world.core.registry)
+    return Fleet(
+        members=[view for view in views if view is not None],
+        gone=world.core.departed.told(world.now, MAX_GONE),
+        certificates_end={NodeName("robot"): 1.8e9},
+        now=world.now,
+        now_wall=1.7e9,
+    )
+
+
+def test_what_is_known_of_a_robot_is_exported() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    world.cloud("a")
+    robot = world.robot(target_miss=0.01)
+    world.say(
+        robot,
+        Report(
+            paths=(
+                path("wlan0", "a", rtt=histogram(0.02, 0.03, 0.04, times=9)),
+                path("wwan0", "a", up=False),
+                path("made-up", "a"),
+            ),
+            outcomes=(OutcomeReport(PLAN, ok=90, deadline_missed=10),),
+        ),
+    )
+    world.run(SETTLED_S)
+    found = series(families(fleet_of(world)))
+    wlan, wwan = ({"robot": "robot", "interface": nic, "server": "a"} for nic in ("wlan0", "wwan0"))
+    assert value(found, "plr_robot_path_up", **wlan) == 1.0
+    assert value(found, "plr_robot_path_up", **wwan) == 0.0
+    assert value(found, "plr_robot_path_rtt_seconds", **wlan) == pytest.approx(0.03, rel=0.03)
+    assert value(found, "plr_robot_path_rtt_seconds", **wwan) is None
+    assert not [key for key in found if ("interface", "made-up") in key[1]]
+    assert value(found, "plr_robot_mapping_info", service=PLAN, **wlan) == 1.0
+    of_service = {"robot": "robot", "service": PLAN}
+    assert value(found, "plr_observed_miss_ratio", **of_service) == pytest.approx(0.1)
+    assert value(found, "plr_predicted_miss_probability", **of_service) is not None
+    assert value(found, "plr_target_miss_probability", **of_service) == 0.01
+    member = {"sidecar": "robot", "role": "robot"}
+    assert value(found, "plr_sidecar_up", **member) == 1.0
+    assert value(found, "plr_sidecar_certificate_expiry_timestamp_seconds", **member) == 1.8e9
+    seen = value(found, "plr_sidecar_last_seen_timestamp_seconds", **member)
+    assert seen == pytest.approx(1.7e9, abs=world.settings.lease_s)
+
+
+def test_who_is_gone_has_series_that_say_so() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    robot = world.robot()
+    world.run(SETTLED_S)
+    member = {"sidecar": "robot", "role": "robot"}
+    world.drop_stream(robot)
+    found = series(families(fleet_of(world)))
+    assert value(found, "plr_sidecar_up", **member) == 0.0
+    assert value(found, "plr_sidecar_gone_info", why="lease_expired", **member) is None
+    world.run(world.settings.lease_s + 100.0)
+    found = series(families(fleet_of(world)))
+    assert value(found, "plr_sidecar_up", **member) == 0.0
+    assert value(found, "plr_sidecar_gone_info", why="lease_expired", **member) == 1.0
+    seen = value(found, "plr_sidecar_last_seen_timestamp_seconds", **member)
+    assert seen == pytest.approx(1.7e9 - world.settings.lease_s - 100.0, abs=world.settings.lease_s)
+    world.robot()
+    found = series(families(fleet_of(world)))
+    assert value(found, "plr_sidecar_up", **member) == 1.0
+    assert value(found, "plr_sidecar_gone_info", why="lease_expired", **member) is None
+
+
+def test_a_member_is_told_of_once_also_where_the_policy_cut_it_off() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    world.robot()
+    world.say(world.sidecars[NodeName("robot")], ServiceSet((), (use(),)))
+    fleet = fleet_of(world)
+    cut = DepartedSidecar(NodeName("robot"), Role.ROBOT, Why.POLICY, 1.0, 1.0)
+    found = Fleet(fleet.members, [cut], {}, fleet.now, fleet.now_wall)
+    names = Counter((sample.name, *sorted(sample.labels.items())) for m in families(found) for sample in m.samples)
+    assert max(names.values()) == 1
+    assert value(series(families(found)), "plr_sidecar_up", sidecar="robot", role="robot") == 1.0
+
+
+def robot_view(name: str, interfaces: int, servers: int, services: int) -> MemberView:
+    weights = np.zeros(BUCKETS)
+    weights[100] = 1.0
+    nics = [InterfaceName(f"nic{number}") for number in range(interfaces)]
+    clouds = [NodeName(f"cloud-{number}") for number in range(servers)]
+    names = [ServiceName(f"/service_{number}") for number in range(services)]
+    return MemberView(
+        name=NodeName(name),
+        role=Role.ROBOT,
+        connected=True,
+        seen_at=0.0,
+        paths=tuple(PathView(nic, cloud, True, weights) for nic in nics for cloud in clouds),
+        mapping=tuple(
+            ServiceMapping(service, tuple(Assignment(nic, cloud) for nic, cloud in zip(nics, clouds, strict=False)))
+            for service in names
+        ),
+        misses=tuple(MissView(service, 0.001, 0.002, 0.01) for service in names),
+    )
+
+
+def fleet(robots: list[MemberView], *, gone: int = 0) -> Fleet:
+    clouds = [MemberView(NodeName(f"cloud-{number}"), Role.CLOUD, True, 0.0) for number in range(5)]
+    members = [*robots, *clouds]
+    left = [DepartedSidecar(NodeName(f"gone-{n}"), Role.ROBOT, Why.LEASE_EXPIRED, 1.0, 1.0) for n in range(gone)]
+    return Fleet(members, left, {member.name: 1.0 for member in members}, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("services", "expected"), [(1, 39_016), (4, 57_016)])
+def test_a_thousand_robots_take_as_many_series_as_documented(services: int, expected: int) -> None:
+    found = series(families(fleet([robot_view(f"robot-{number}", 3, 5, services) for number in range(1000)])))
+    assert len(found) == expected
+    assert value(found, "plr_fleet_series_left_out") == 0.0
+
+
+def test_series_are_bounded_and_one_robot_takes_none_of_others() -> None:
+    robots = [robot_view(f"robot-{number}", 3, 5, 4) for number in range(999)]
+    greedy = robot_view("greedy", 64, 64, 64)
+    found = series(families(fleet([greedy, *robots], gone=MAX_GONE)))
+    assert len(found) <= MAX_SERIES + 1
+    of_robot = Counter(dict(labels).get("robot") for _, labels in found)
+    assert {of_robot[f"robot-{number}"] for number in range(999)} == {54}
+    assert of_robot["greedy"] < 100
+    assert (value(found, "plr_fleet_series_left_out") or 0.0) > 1000.0
+
+
+def test_also_as_many_members_as_can_be_there_at_all() -> None:
+    robots = [robot_view(f"robot-{number}", 8, 8, 8) for number in range(4096)]
+    assert len(series(families(fleet(robots, gone=MAX_GONE)))) <= MAX_SERIES + 1
+
+
+def test_medians_are_those_of_the_histogram() -> None:
+    views = []
+    for seconds in (0.001, 0.03, 5.0):
+        weights = histogram(seconds, seconds * 1.5, seconds / 1.5).counts.astype(np.float64) / 4.0
+        views.append(PathView(InterfaceName("wlan0"), NodeName("a"), True, weights))
+    views.append(PathView(InterfaceName("wlan0"), NodeName("b"), True, np.zeros(BUCKETS)))
+    assert medians(views) == pytest.approx([0.001, 0.03, 5.0, np.nan], rel=0.03, nan_ok=True)
+    assert medians([]) == []
+
+
+@pytest.mark.parametrize("threaded", [False, True])
+def test_gathering_leaves_the_loop_to_others_in_between(threaded: bool) -> None:
+    members = 10 * MEMBERS_A_TURN
+
+    async def gather() -> tuple[Fleet, int]:
+        loop = make_loop()
+        for number in range(members):
+            assert not isinstance(loop.register(registration(f"robot-{number}"), None), Refusal)
+        turns = 0
+
+        async def others() -> None:
+            nonlocal turns
+            while True:
+                turns += 1
+                await asyncio.sleep(0)
+
+        other = asyncio.create_task(others())
+        fleet = await asyncio.to_thread(loop.ask_fleet) if threaded else await loop.gather_fleet()
+        other.cancel()
+        return fleet, turns
+
+    found, turns = asyncio.run(gather())
+    assert len(found.members) == members
+    assert turns >= 10
+
+
+def make_loop() -> ControlLoop:
+    return ControlLoop(ControlPlaneConfig(insecure=True, listen="127.0.0.1:0"), Metrics(), EventLog(None))
+
+
+def test_a_loop_that_has_ended_gives_no_fleet() -> None:
+    async def make() -> ControlLoop:
+        return make_loop()
+
+    loop = asyncio.run(make())
+    with pytest.raises(TimeoutError):
+        loop.ask_fleet()
+
+
+def test_scrapes_at_once_share_their_values_and_a_busy_loop_gives_none() -> None:
+    asked = 0
+
+    def ask() -> Fleet:
+        nonlocal asked
+        asked += 1
+        if asked > 1:
+            raise TimeoutError
+        return fleet([])
+
+    collector = FleetCollector(ask)
+    assert collector.collect()
+    assert collector.collect()
+    assert asked == 1
+    time.sleep(REUSED_S)
+    assert not list(collector.collect())
