@@ -223,8 +223,6 @@ class ControlCore:
         if change is not Change.REPORT:
             self._drawing.robot_changed(name, anew=surprised)
         self._debounce.note(change, now)
-        # What else it says is estimated with the next routine drawing.
-        self._debounce.note(Change.REPORT, now)
         if reaches_again:
             self._publish_soon(now)
 

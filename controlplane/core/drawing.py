@@ -34,6 +34,9 @@ SLICE_PAIRS = 40
 KEPT_PAIRS = 8
 """Pairs whose estimates are kept take as long as one that is estimated."""
 
+FEW_ROBOTS = 16
+"""Robots that are all estimated anew when they are to be drawn at once: of more, those only that have to be."""
+
 ROUTINE_PAIRS = 4000
 """Pairs estimated between two routine solvings because of reports alone: a tenth of a processor."""
 
@@ -101,7 +104,7 @@ class Drawing:
         self._at: dict[NodeName, float] = {}
         """When each robot was drawn last."""
         self._urgent: dict[NodeName, bool] = {}
-        """Robots to draw whatever it costs, and whether their pairs are to be estimated anew."""
+        """Robots to draw whatever it costs, and whether their pairs have to be estimated anew."""
         self._surprise: dict[NodeName, float] = {}
         """Robots that reported since they were drawn, and their misses beyond those believed in."""
         self._routine = False
@@ -119,8 +122,9 @@ class Drawing:
     def robot_changed(self, robot: NodeName, *, anew: bool = True) -> None:
         """Draw this robot in the next picture whatever it costs.
 
-        Unless `anew`, pairs that it has already keep their estimates: its paths changed, not what is known of them.
-        When a server dies that is so for all of its robots, and they are to have other mappings within a second.
+        Unless `anew`, pairs that it has already may keep their estimates: its paths changed, not what is known of them.
+        They do where many robots changed at once, as when a server dies: all are to have other mappings within a
+        second, and are estimated anew in their turn.
         """
         self._urgent[robot] = anew or self._urgent.get(robot, False)
 
@@ -155,7 +159,8 @@ class Drawing:
         if self._queue is None:
             routine = self._next_routine(self._frame, now) if self._routine else []
             self._queue = [(name, True) for name in routine]
-        self._queue += reversed(self._urgent.items())
+        few = len(self._urgent) <= FEW_ROBOTS
+        self._queue += [(name, anew or few) for name, anew in reversed(self._urgent.items())]
         self._urgent.clear()
         pairs = 0
         while (self._rest or self._queue) and pairs < SLICE_PAIRS:

@@ -8,6 +8,7 @@ import pytest
 
 from controlplane.core.drawing import (
     EPSILON_SHARE,
+    FEW_ROBOTS,
     LIFT_SHARE,
     ROUTINE_PAIRS,
     SLICE_PAIRS,
@@ -87,6 +88,24 @@ def test_a_dead_path_and_unexpected_misses_draw_their_robots_alone_at_once() -> 
     before = fleet.blocks()
     fleet.draw(routine=False)
     assert not fleet.moved(before), "as expected by now"
+
+
+@pytest.mark.parametrize("robots", [FEW_ROBOTS, FEW_ROBOTS + 1])
+def test_a_changed_path_brings_its_news_at_once_unless_many_changed(robots: int) -> None:
+    """What else its report tells is estimated with it; of many, at the next routine drawing."""
+    fleet = Fleet(robots)
+    before = fleet.blocks()
+    for name in fleet.names:
+        told = Report((latency("wwan0", "b", histogram(0.01, times=50)),), ONE_DOWN)
+        fleet.estimator.merge(name, told, fleet.now)
+        fleet.drawing.reported(name, told)
+        fleet.drawing.robot_changed(name, anew=False)
+    fleet.draw(routine=False)
+    assert all(block.epsilon[0][0] is None for block in fleet.blocks().values()), "the path is down for all"
+    at_once = [block.epsilon[1][1] != before[name].epsilon[1][1] for name, block in fleet.blocks().items()]
+    assert all(at_once) if robots == FEW_ROBOTS else not any(at_once)
+    fleet.draw(routine=True)
+    assert all(block.epsilon[1][1] != before[name].epsilon[1][1] for name, block in fleet.blocks().items())
 
 
 def test_blocks_whose_estimates_stay_are_the_same_objects() -> None:
