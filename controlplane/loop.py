@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from controlplane.core.claims import check_claims, check_unproven_claims
-from controlplane.core.control import ControlCore
+from controlplane.core.control import ControlCore, Settled
 from controlplane.core.control_events import (
     Close,
     CloseReason,
@@ -378,11 +378,8 @@ class ControlLoop:
 
     async def _solve(self, picture: Picture) -> None:
         began = time.monotonic()
-        limit_s = self._config.solver_time_limit_ms / 1000
-        hint = self._core.plan
-
         try:
-            plan = await self._loop.run_in_executor(self._executor, self._matcher.solve, picture.problem, limit_s, hint)
+            settled = await self._loop.run_in_executor(self._executor, self._solve_and_settle, picture)
         except Exception:
             # The plan in force goes on; one failed solving must not take the streams down.
             log.exception("solving failed; the plan in force stays")
@@ -390,10 +387,16 @@ class ControlLoop:
             return
         self._metrics.solve_duration.observe(time.monotonic() - began)
         relaxed = self._core.plan.relaxed
-        self._core.solved(picture, plan, self._loop.time())
+        self._core.solved(settled, self._loop.time())
         if self._core.plan.relaxed != relaxed:
             log.warning("capacities are exceeded by %d interfaces in all", self._core.plan.relaxed)
         self._dispatch()
+
+    def _solve_and_settle(self, picture: Picture) -> Settled:
+        """On the solver's thread."""
+        limit_s = self._config.solver_time_limit_ms / 1000
+        plan = self._matcher.solve(picture.problem, limit_s, self._core.plan)
+        return self._core.settle(picture, plan, self._loop.time())
 
     def _update_metrics(self) -> None:
         superseded = self._superseded + sum(mailbox.superseded for mailbox in self._mailboxes.values())

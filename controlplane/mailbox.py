@@ -1,4 +1,7 @@
-"""What waits to be written to one stream: bounded, as a newer resource takes the place of an unsent older one."""
+"""What waits to be written to one stream: bounded, as a newer resource takes the place of an unsent older one.
+
+Changes of the peers are put together with what they are upon if that is unsent, too.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from protos.model import MappingSet, PeerSet, Welcome
+from protos.peer_changes import put_together
 
 if TYPE_CHECKING:
     from controlplane.core.control_events import CloseReason
@@ -27,7 +31,10 @@ class Mailbox:
 
     def put(self, message: ControlMessage) -> None:
         """Send this, instead of an unsent older message of its type."""
-        self.superseded += type(message) in self._waiting
+        unsent = self._waiting.get(type(message))
+        self.superseded += unsent is not None
+        if isinstance(message, PeerSet) and isinstance(unsent, PeerSet):
+            message = put_together(unsent, message)
         self._waiting[type(message)] = message
         self._changed.set()
 

@@ -12,7 +12,8 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 from controlplane.core.control_events import CloseReason
 from controlplane.core.registry import Refusal
 from controlplane.limits import MAX_STREAMS_PER_NAME, TOO_FAST, TOO_MANY_STREAMS, StreamCount, StreamRate
-from protos.convert import control_message_to_proto, parse_sidecar_message
+from controlplane.stream_encoder import StreamEncoder
+from protos.convert import parse_sidecar_message
 from protos.errors import DecodeError
 from protos.model import PROTOCOL_VERSION, Registration
 from protos.plr.v1 import control_pb2
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from controlplane.tls_gate import Caller
     from protos.model import SidecarMessage
 
-    Context = grpc.aio.ServicerContext[bytes, control_pb2.ControlMessage]
+    Context = grpc.aio.ServicerContext[bytes, bytes]
 
 SERVICE_NAME = control_pb2.DESCRIPTOR.services_by_name["ControlPlane"].full_name
 
@@ -79,12 +80,12 @@ class ControlPlaneService:
         self._caller = caller
         self._streams = StreamCount()
         self._turn = asyncio.Semaphore(REGISTERED_AT_ONCE)
+        self._encoder = StreamEncoder()
 
     def add_to(self, server: grpc.aio.Server) -> None:
         """Serve on this server."""
-        handler: grpc.RpcMethodHandler[bytes, control_pb2.ControlMessage] = grpc.stream_stream_rpc_method_handler(
+        handler: grpc.RpcMethodHandler[bytes, bytes] = grpc.stream_stream_rpc_method_handler(
             self.connect,
-            response_serializer=control_pb2.ControlMessage.SerializeToString,
         )
         server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE_NAME, {"Connect": handler}),))
 
@@ -108,10 +109,10 @@ class ControlPlaneService:
                 await context.abort(end.code, end.details)
 
     async def _serve(self, context: Context, caller: Caller | None) -> NoReturn:
-        stream, mailbox = await self._register(context, caller)
+        stream, mailbox, incremental = await self._register(context, caller)
         try:
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(self._write(mailbox, context))
+                tasks.create_task(self._write(mailbox, context, incremental=incremental))
                 tasks.create_task(self._read(stream, context))
         except BaseExceptionGroup as group:
             ends, others = group.split(_StreamEndError)
@@ -122,7 +123,8 @@ class ControlPlaneService:
             self._loop.disconnected(stream)
         raise AssertionError("neither task ends but by an exception")
 
-    async def _register(self, context: Context, caller: Caller | None) -> tuple[StreamId, Mailbox]:
+    async def _register(self, context: Context, caller: Caller | None) -> tuple[StreamId, Mailbox, bool]:
+        """Returns the stream, what to write to it, and whether it takes changes."""
         try:
             async with asyncio.timeout(REGISTER_TIMEOUT_S):
                 data = await self._receive(context)
@@ -138,7 +140,7 @@ class ControlPlaneService:
             result = self._loop.register(registration, caller)
         if isinstance(result, Refusal):
             raise _StreamEndError(_REFUSAL_CODES[result], f"{registration.name}: {result.value}")
-        return result
+        return *result, registration.incremental
 
     def _caller_of(self, context: Context) -> Caller | None:
         if self._caller is None:
@@ -169,17 +171,17 @@ class ControlPlaneService:
             except DecodeError as error:
                 raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, str(error)) from error
 
-    @staticmethod
-    async def _write(mailbox: Mailbox, context: Context) -> NoReturn:
+    async def _write(self, mailbox: Mailbox, context: Context, *, incremental: bool) -> NoReturn:
         while True:
             message = await mailbox.get()
             if isinstance(message, CloseReason):
                 raise _StreamEndError(_CLOSE_CODES[message], message.value)
-            try:
-                await context.write(control_message_to_proto(message))
-            except grpc.aio.InternalError as error:
-                # The connection broke under the message: so gRPC says it to whoever writes.
-                raise _StreamEndError(None, "the connection broke") from error
+            for data in self._encoder.encode(message, incremental=incremental):
+                try:
+                    await context.write(data)
+                except grpc.aio.InternalError as error:
+                    # The connection broke under the message: so gRPC says it to whoever writes.
+                    raise _StreamEndError(None, "the connection broke") from error
 
 
 def _parse(data: bytes) -> SidecarMessage:

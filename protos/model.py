@@ -59,6 +59,9 @@ MAX_SIGNATURE_BYTES = 72
 MAX_CANDIDATES_OF_INTERFACE = 8
 """Addresses under which peers look for one interface: IPv4, some of IPv6, what a NAT makes of each, one advertised."""
 
+MAX_PEERS = 4096
+"""Peers of one sidecar: as many sidecars as a control plane registers."""
+
 MAX_LATENCIES = 4096
 """Pairs (interface, server) in one report, counted anew for each service and size class that they carried."""
 
@@ -211,7 +214,7 @@ class RemovedPeer:
 
 @dataclass(frozen=True, slots=True)
 class PeerSet:
-    """All peers of one sidecar at one version."""
+    """The peers of one sidecar at one version: all of them, or what changed since another version."""
 
     version: Version
     nonce: int
@@ -219,6 +222,10 @@ class PeerSet:
     removed: tuple[RemovedPeer, ...] = ()
     policy: int = POLICY_PENDING
     """Fingerprint of the access policy that this set follows, or POLICY_PENDING, or NO_POLICY."""
+    base: Version = Version(0)
+    """Above 0: `peers` are those that are new or different since this version, and `removed` left since then."""
+    more: bool = False
+    """The next message goes on with this set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,6 +274,8 @@ class Registration:
     credential: bytes = field(default=b"", repr=False)
     region: str = ""
     """Of a cloud: where it stands; clouds with the same one fail together. Empty: not known."""
+    incremental: bool = False
+    """It takes changes of its peers, and sets in several messages."""
 
 
 @dataclass(frozen=True, slots=True)

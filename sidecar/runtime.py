@@ -137,6 +137,7 @@ class Sidecar:
                 region=config.region or "",
             ),
             random.SystemRandom(),
+            last.peers,
         )
         names = config.control_plane
         self._dialer = ControlDialer(

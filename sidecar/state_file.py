@@ -130,6 +130,8 @@ def decode_last_good(data: bytes, owner: NodeName) -> LastGood:
     last = LastGood(owner)
     while end < len(body):
         message, end = _pull_message(body, end)
+        if isinstance(message, PeerSet) and (message.base or message.more):
+            raise DecodeError("it holds a part of a peer set")
         last = last.with_message(message)
     return last
 

@@ -163,7 +163,7 @@ class Crowd:
                 picture = self.core.start_solving(self.now)
         plan = self.matcher.solve(picture.problem, time_limit_s=SOLVE_LIMIT_S, hint=self.core.plan)
         with self._turn("settle"):
-            self.core.solved(picture, plan, self.now)
+            self.core.solved(self.core.settle(picture, plan, self.now), self.now)
         return self.drain()
 
     def drain(self) -> int:

@@ -82,7 +82,7 @@ class Plane:
         picture = self._core.start_solving(now)
         if picture is not None:
             plan = self._matcher.solve(picture.problem, time_limit_s=SOLVER_LIMIT_S, hint=self._core.plan)
-            self._core.solved(picture, plan, now)
+            self._core.solved(self._core.settle(picture, plan, now), now)
         while (event := self._core.next_event()) is not None:
             if isinstance(event, Send) and event.stream == self._robot and isinstance(event.message, MappingSet):
                 self.mapping = next(iter(event.message.services), None)

@@ -1,15 +1,15 @@
 """The control plane without IO: messages of sidecars and time in, messages and closings of streams out.
 
 A driver calls `register`, `receive` and `disconnected` as streams come, speak and go, `handle_timer` when
-`next_timer` says so, and `start_solving` / `solved` around the solver, which may run elsewhere meanwhile; after each
-call it drains `next_event`. Times are monotonic seconds.
+`next_timer` says so, and `start_solving`, `settle` and `solved` around the solver, which may run elsewhere meanwhile;
+after each call it drains `next_event`. Times are monotonic seconds.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, assert_never
 
 from controlplane.core.control_events import (
@@ -70,7 +70,7 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Set
 
     from controlplane.core.policy import Policy
     from controlplane.core.registry import Sidecar
@@ -96,6 +96,17 @@ _CLOSED_FOR = {
     RemovalReason.REVOKED: CloseReason.REVOKED,
     RemovalReason.EXPIRED: CloseReason.CERTIFICATE_ENDED,
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """What is to be in force, and for which robots that may be news."""
+
+    picture: Picture
+    plan: Plan
+    robots: Set[NodeName]
+    unproven: int
+    """Groups of the solver's answer that are not proven to be the best."""
 
 
 class ControlCore:
@@ -184,7 +195,9 @@ class ControlCore:
             case Nack():
                 self._receive_nack(name, message, now)
             case Drain():
-                if self.registry.set_draining(name):
+                sidecar = self.registry.get(name)
+                if sidecar is not None and self.registry.set_draining(name):
+                    self._publisher.changed(name, sidecar.role)
                     self._came_or_went(name, now)
             case RevocationSet():
                 self.registry.set_revocations(name, message)
@@ -201,7 +214,9 @@ class ControlCore:
             if told.unmet and known is not None and told.unmet != known.unmet:
                 self._events.append(UnmetNotice(name, told.unmet))
             changed = self.registry.set_services(name, told)
-        if changed:
+        sidecar = self.registry.get(name)
+        if changed and sidecar is not None:
+            self._publisher.changed(name, sidecar.role)
             self._members_changed(now)
             if isinstance(told, ServiceSet):
                 self._note_refused_offers(name)
@@ -237,6 +252,8 @@ class ControlCore:
             self.counters.stale_answers += 1
             return
         self.counters.nacks[nack.resource] += 1
+        if self._publisher.is_due(name):
+            self._publish_soon(now)
         if not self._publisher[name].track(nack.resource).refused_as_before:
             self._events.append(NackNotice(name, nack))
 
@@ -315,6 +332,7 @@ class ControlCore:
         self._refused_offers.clear()
         for sidecar in self.registry:
             self._note_refused_offers(sidecar.name)
+        self._publisher.all_changed()
         self._members_changed(now)
 
     def _note_cut_off(self, before: frozenset[NodeName], after: frozenset[NodeName], now: float) -> None:
@@ -402,7 +420,7 @@ class ControlCore:
         self._forget_paths(name)
         self._refused_offers.forget(name)
         self.restlessness.forget(name)
-        self._publisher.forget(name)
+        self._publisher.forget(name, sidecar.role)
         del self._told_intervals[name]
 
     def _forget_paths(self, name: NodeName) -> None:
@@ -447,21 +465,32 @@ class ControlCore:
         self._drawing_since = None
         return self._drawing.picture()
 
-    def solved(self, picture: Picture, plan: Plan, now: float) -> None:
-        """The solver's answer to the problem of `start_solving`; what is worth a change is published."""
-        self._debounce.finished(now)
+    def settle(self, picture: Picture, plan: Plan, now: float) -> Settled:
+        """Decide what of the solver's answer is worth a change, for `solved`.
+
+        It changes nothing that other calls look at, so it may run on another thread between `start_solving` and
+        `solved`: for a large fleet it takes as long as some hundred reports.
+        """
         settled = self._stability.settle(picture.problem, plan, self.plan, now)
-        self.counters.solved += 1
-        self.counters.unproven += plan.unproven
-        if settled.relaxed and settled.relaxed != self.plan.relaxed:
-            self.counters.relaxations += 1
         settled = replace(settled, explore=self._exploration.update(picture.problem, settled))
-        robots = changed_robots(self.plan, settled, self._picture, picture)
-        self.plan = settled
-        self._picture = picture
+        return Settled(picture, settled, changed_robots(self.plan, settled, self._picture, picture), plan.unproven)
+
+    def solved(self, settled: Settled, now: float) -> None:
+        """The answer to the problem of `start_solving`, settled: what is new is published."""
+        self._debounce.finished(now)
+        plan = settled.plan
+        self.counters.solved += 1
+        self.counters.unproven += settled.unproven
+        if plan.relaxed and plan.relaxed != self.plan.relaxed:
+            self.counters.relaxations += 1
+        self.plan = plan
+        self._picture = settled.picture
         if self._publish_at is None:
-            self._begin_publishing(self._publisher.publish_plan(robots, self.permits, settled, picture), now)
+            self._begin_publishing(
+                self._publisher.publish_plan(settled.robots, self.permits, plan, settled.picture), now
+            )
         else:
+            self._publisher.plan_changed(settled.robots)
             self._publish(now)
 
     def solving_failed(self, now: float) -> None:

@@ -7,6 +7,13 @@ nothing, and clouds (they find their robots by the robots' own probes), are serv
 policy before the warm-up is over (PeerSet.policy): a peer that is merely not back yet would be taken for one that the
 policy leaves nothing to do.
 
+Changes. A sidecar that takes changes of its peers is sent those that are new or different since what it was sent
+before, on the same stream or, as it says when it registers, on an earlier one. At a gap, that is if it refuses, it is
+sent all of them.
+
+Who is looked at. A change of a robot is news to that robot and to the clouds, one of a cloud or of the policy to
+everybody: the others are not looked at.
+
 Refusals. A sidecar refuses what it cannot hold at the moment: its interface went and is back, its driver hung. That
 passes, and what it is to hold need not change for it. So what is refused is sent again until it is taken.
 """
@@ -21,8 +28,8 @@ from controlplane.core.control_events import Send
 from controlplane.core.registry import MAX_SIDECARS
 from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
 from controlplane.core.told_peers import ToldPeers
-from controlplane.core.views import ToldRobots, Views
-from protos.model import POLICY_PENDING, ResourceKind, Role
+from controlplane.core.views import KnownPeers, Views
+from protos.model import POLICY_PENDING, ResourceKind, Role, Version
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -48,7 +55,7 @@ class Publisher:
     def __init__(self, registry: Registry, *, version_epoch: int, warm_until: float | None) -> None:
         self._registry = registry
         self._versions = VersionSource(version_epoch)
-        self._told_robots = ToldRobots()
+        self._known_peers = KnownPeers()
         self._snapshots: dict[NodeName, Snapshots] = {}
         self._gone: OrderedDict[NodeName, Snapshots] = OrderedDict()
         self.warm_until = warm_until
@@ -57,6 +64,10 @@ class Publisher:
         """Robots, and the servers that they wait for; None before their first report."""
         self.resend_at: float | None = None
         """When to `send_refused_again`, to all in one go; None while nothing is refused."""
+        self._due: set[NodeName] = set()
+        """To look at for news with the next `publish`, beside those held back."""
+        self._clouds_due = False
+        self._all_due = False
 
     def __getitem__(self, name: NodeName) -> Snapshots:
         return self._snapshots[name]
@@ -68,14 +79,28 @@ class Publisher:
         self._snapshots[name] = snapshots
         snapshots.peers.begin_stream(registration.peers_version)
         snapshots.mapping.begin_stream(registration.mapping_version)
+        self.changed(name, registration.role)
         holds = max(registration.peers_version, registration.mapping_version)
         if registration.role is Role.ROBOT and holds and self.warm_until is not None and not snapshots.known_names:
             self._held_back[name] = None
 
-    def forget(self, name: NodeName) -> None:
+    def changed(self, name: NodeName, role: Role) -> None:
+        """What this sidecar is told, or what others are told of it, may have changed."""
+        self._due.add(name)
+        if role is Role.CLOUD:
+            self._all_due = True
+        else:
+            self._clouds_due = True
+
+    def all_changed(self) -> None:
+        """What everybody is told may have changed."""
+        self._all_due = True
+
+    def forget(self, name: NodeName, role: Role) -> None:
         """A sidecar is not registered any more."""
+        self.changed(name, role)
         self._held_back.pop(name, None)
-        self._told_robots.forget(name)
+        self._known_peers.forget(name)
         self._gone[name] = self._snapshots.pop(name)
         if len(self._gone) > MAX_GONE_SNAPSHOTS:
             self._gone.popitem(last=False)
@@ -91,6 +116,7 @@ class Publisher:
         """Whoever is not back now is gone."""
         self.warm_until = None
         self._held_back.clear()
+        self.all_changed()
 
     def acked(self, name: NodeName, ack: Ack) -> bool:
         """A sidecar applied what it was sent; False if that is stale."""
@@ -99,26 +125,33 @@ class Publisher:
 
     def nacked(self, name: NodeName, nack: Nack, now: float) -> bool:
         """A sidecar refused what it was sent; False if that is stale."""
-        if not self._snapshots[name].track(nack.resource).nack(nack):
+        snapshots = self._snapshots[name]
+        if not snapshots.track(nack.resource).nack(nack):
             return False
-        if self.resend_at is None:
+        if nack.resource is ResourceKind.PEERS and snapshots.wants_whole_now(now, RESEND_S):
+            self._due.add(name)
+        elif self.resend_at is None:
             self.resend_at = now + RESEND_S
         return True
+
+    def is_due(self, name: NodeName) -> bool:
+        """Whether there may be news for this sidecar in particular."""
+        return name in self._due
 
     def send_refused_again(self) -> None:
         """What is refused now goes out with the next `publish`; the next refusal sets the time anew."""
         self.resend_at = None
-        for snapshots in self._snapshots.values():
-            snapshots.send_refused_again()
+        for name, snapshots in self._snapshots.items():
+            if snapshots.send_refused_again():
+                self._due.add(name)
 
     def publish(self, permits: Permits, plan: Plan, picture: Picture) -> Iterator[Send | None]:
         """Everything that is news to somebody, and None before each sidecar: so often other work may come in between.
 
         Clouds first: what a robot learns that it may call shall be refused nowhere.
         """
-        views = Views(self._registry, permits, self._told_robots)
-        names = [one.name for one in sorted(self._registry, key=lambda one: one.role is Role.ROBOT)]
-        for name in names:
+        views = Views(self._registry, permits, self._known_peers)
+        for name in self._take_due():
             yield None
             sidecar = self._registry.get(name)
             if sidecar is None or sidecar.stream is None or self._is_held_back(sidecar, permits):
@@ -127,11 +160,30 @@ class Publisher:
             if sidecar.role is Role.ROBOT:
                 yield from self._mapping(sidecar, sidecar.stream, views, plan, picture)
 
+    def _take_due(self) -> list[NodeName]:
+        """Whom to look at now, clouds first."""
+        everybody, clouds = self._all_due, self._all_due or self._clouds_due
+        due = self._due | self._held_back.keys()
+        self._due, self._clouds_due, self._all_due = set(), False, False
+        clouds_due: list[NodeName] = []
+        robots_due: list[NodeName] = []
+        for sidecar in self._registry:
+            if sidecar.role is Role.CLOUD:
+                if clouds or sidecar.name in due:
+                    clouds_due.append(sidecar.name)
+            elif everybody or sidecar.name in due:
+                robots_due.append(sidecar.name)
+        return clouds_due + robots_due
+
+    def plan_changed(self, robots: Iterable[NodeName]) -> None:
+        """The mappings of these robots may be news with the next `publish`."""
+        self._due.update(robots)
+
     def publish_plan(
         self, robots: Iterable[NodeName], permits: Permits, plan: Plan, picture: Picture
     ) -> Iterator[Send | None]:
         """The mappings of these robots, where they are news; who is there did not change since `publish`."""
-        views = Views(self._registry, permits, self._told_robots)
+        views = Views(self._registry, permits, self._known_peers)
         for name in robots:
             yield None
             robot = self._registry.get(name)
@@ -158,10 +210,14 @@ class Publisher:
         snapshots = self._snapshots[sidecar.name]
         judged = self.warm_until is None or not permits.restricted
         view = PeerView(views.peers_of(sidecar), permits.fingerprint if judged else POLICY_PENDING)
-        if snapshots.peers.send_again or view != snapshots.peers.sent:
-            told = ToldPeers(view.peers, sidecar.name, sidecar.role)
-            removed = views.removed(sidecar, snapshots.known_names)
-            yield Send(stream, snapshots.send_peers(view, told, removed, self._versions))
+        sent = snapshots.peers.sent
+        if not snapshots.peers.send_again and view == sent:
+            return
+        base = snapshots.base if sidecar.registration.incremental else Version(0)
+        peers = views.changes(sent.peers, sidecar) if base and sent is not None else view.peers
+        told = ToldPeers(peers, sidecar.name, sidecar.role)
+        removed = views.removed(sidecar, snapshots.known_names)
+        yield Send(stream, snapshots.send_peers(view, told, removed, base, self._versions))
 
     def _mapping(self, robot: Sidecar, stream: StreamId, views: Views, plan: Plan, picture: Picture) -> Iterator[Send]:
         snapshots = self._snapshots[robot.name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -123,21 +124,39 @@ class Track(Generic[C]):
 class Snapshots:
     """Both resources of one sidecar."""
 
-    __slots__ = ("known_names", "mapping", "peers")
+    __slots__ = ("known_names", "mapping", "peers", "sent_changes", "whole_again_at")
 
     def __init__(self) -> None:
         self.peers: Track[PeerView] = Track()
         self.mapping: Track[tuple[ServiceMapping, ...]] = Track()
         self.known_names: set[NodeName] = set()
         """Peers the sidecar may know: of the set it acknowledged last and of all sent since."""
+        self.sent_changes = False
+        """Whether the last peers sent were changes of those before."""
+        self.whole_again_at = -math.inf
+        """From when on the refusal of changes is answered at once with the whole set."""
+
+    @property
+    def base(self) -> Version:
+        """What changes of the peers can be upon: what the sidecar holds or is about to; 0 if only all of them will do.
+
+        Messages of a stream arrive in order. Had the sidecar refused what went before, it would refuse the changes.
+        """
+        track = self.peers
+        usable = track.sent is not None and track.state is not SyncState.REJECTED and not track.send_again
+        return track.version_sent if usable else Version(0)
 
     def send_peers(
-        self, view: PeerView, told: ToldPeers, removed: tuple[RemovedPeer, ...], versions: VersionSource
+        self, view: PeerView, told: ToldPeers, removed: tuple[RemovedPeer, ...], base: Version, versions: VersionSource
     ) -> PeerSet:
-        """Send the sidecar its peers; `told` is the view's as this sidecar is told of them."""
+        """Send the sidecar its peers; `told` are those that it is told, all of the view's or what changed upon `base`.
+
+        `removed` names those that it may know and the view does not have.
+        """
         version = self.peers.send(view, versions)
-        self.known_names.update(peer.name for peer in view.peers)
-        return PeerSet(version, self.peers.nonce, told, removed, view.policy)
+        self.sent_changes = base > 0
+        self.known_names.update(told.names())
+        return PeerSet(version, self.peers.nonce, told, removed, view.policy, base)
 
     def send_mapping(self, services: tuple[ServiceMapping, ...], versions: VersionSource) -> MappingSet:
         """Send the sidecar its mapping."""
@@ -148,10 +167,11 @@ class Snapshots:
         """One of the two."""
         return self.peers if resource is ResourceKind.PEERS else self.mapping
 
-    def send_refused_again(self) -> None:
-        """What is refused is due once more; as it is wanted then, and as a new version."""
+    def send_refused_again(self) -> bool:
+        """What is refused is due once more; as it is wanted then, and as a new version. Returns whether anything is."""
         for track in (self.peers, self.mapping):
             track.send_again = track.refused
+        return self.peers.send_again or self.mapping.send_again
 
     def peers_acked(self, ack: Ack) -> bool:
         """The sidecar applied its peers: it forgot all others."""
@@ -159,4 +179,15 @@ class Snapshots:
             return False
         if self.peers.sent is not None:
             self.known_names = {peer.name for peer in self.peers.sent.peers}
+        return True
+
+    def wants_whole_now(self, now: float, again_s: float) -> bool:
+        """The peers were refused: whether that calls for the whole set at once, at most once in `again_s` seconds.
+
+        Changes may be refused for want of what they are upon, and the whole set is then taken.
+        """
+        if not self.sent_changes or now < self.whole_again_at:
+            return False
+        self.whole_again_at = now + again_s
+        self.peers.send_again = True
         return True

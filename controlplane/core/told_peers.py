@@ -34,6 +34,15 @@ class ToldPeers(Sequence["Peer"]):
     def __iter__(self) -> Iterator[Peer]:
         return map(self._told, self._peers)
 
+    def names(self) -> Iterator[NodeName]:
+        """Their names, without making any token."""
+        return (peer.name for peer in self._peers)
+
+    def with_tokens(self) -> Iterator[tuple[Peer, bytes]]:
+        """Each peer as all are told it, but for its token, and the token that this sidecar is told."""
+        for peer in self._peers:
+            yield peer, pair_token(peer.token, self._name, self._role)
+
     @overload
     def __getitem__(self, index: int) -> Peer: ...
     @overload

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from protos.model import RemovalReason, RemovedPeer, Role
+from protos.model import ALL_CALLS, RemovalReason, RemovedPeer, Role
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -24,8 +24,8 @@ MAX_PERMITS_KEPT = 64
 """Of one robot; clouds that the same rules are about have the same."""
 
 
-class ToldRobots:
-    """Robots as clouds are told of them, from one publication to the next: nearly all are as they were.
+class KnownPeers:
+    """Sidecars as their peers are told of them, from one publication to the next: nearly all are as they were.
 
     So they are the same objects, and two views are compared by them without a look inside.
     """
@@ -33,16 +33,16 @@ class ToldRobots:
     def __init__(self) -> None:
         self._made: dict[NodeName, tuple[Sidecar, dict[CallPermit, Peer]]] = {}
 
-    def peer(self, robot: Sidecar, permit: CallPermit) -> Peer:
-        """The robot with this permit."""
-        made = self._made.get(robot.name)
-        if made is None or made[0] is not robot:
-            made = self._made[robot.name] = robot, {}
+    def peer(self, sidecar: Sidecar, permit: CallPermit) -> Peer:
+        """A robot that has this permit, or a cloud to those who have it there."""
+        made = self._made.get(sidecar.name)
+        if made is None or made[0] is not sidecar:
+            made = self._made[sidecar.name] = sidecar, {}
         peer = made[1].get(permit)
         if peer is None:
             if len(made[1]) >= MAX_PERMITS_KEPT:
                 made[1].clear()  # of policies that are not in force any more
-            peer = made[1][permit] = dataclasses.replace(robot.as_peer(), may_call=permit)
+            peer = made[1][permit] = _as_told(sidecar, permit)
         return peer
 
     def forget(self, name: NodeName) -> None:
@@ -50,11 +50,18 @@ class ToldRobots:
         self._made.pop(name, None)
 
 
+def _as_told(sidecar: Sidecar, permit: CallPermit) -> Peer:
+    peer = sidecar.as_peer()
+    if sidecar.role is Role.ROBOT:
+        return dataclasses.replace(peer, may_call=permit)
+    return dataclasses.replace(peer, offers=tuple(offer for offer in peer.offers if offer.name in permit))
+
+
 class Views:
     """The views of all sidecars at one moment."""
 
-    def __init__(self, registry: Registry, permits: Permits, told: ToldRobots) -> None:
-        self._told = told
+    def __init__(self, registry: Registry, permits: Permits, known: KnownPeers) -> None:
+        self._known = known
         self._registry = registry
         self._permits = permits
         ready = sorted((sidecar for sidecar in registry if sidecar.ready), key=lambda sidecar: sidecar.name)
@@ -63,7 +70,8 @@ class Views:
         self._of_robots: dict[Group, tuple[Peer, ...]] = {}
         self._of_clouds: dict[NodeName, tuple[Peer, ...]] = {}
         self._permitted: dict[tuple[CallPermit, ...], tuple[Peer, ...]] = {}
-        self._offers: dict[tuple[NodeName, CallPermit], Peer] = {}
+        self._changes: dict[tuple[int, int], tuple[tuple[Peer, ...], tuple[Peer, ...]]] = {}
+        """By the identities of a former and of a present view: the former one, so that it stays, and what differs."""
         self._servers: dict[Group, Mapping[NodeName, CallPermit]] = {}
 
     def peers_of(self, sidecar: Sidecar) -> tuple[Peer, ...]:
@@ -76,7 +84,8 @@ class Views:
         peers = self._of_robots.get(group)
         if peers is None:
             servers = self.servers_of(sidecar.name)
-            peers = tuple(self._offering(cloud, servers[cloud.name]) for cloud in self._clouds if cloud.name in servers)
+            clouds = ((cloud, servers.get(cloud.name)) for cloud in self._clouds)
+            peers = tuple(self._known.peer(cloud, permit) for cloud, permit in clouds if permit is not None)
             self._of_robots[group] = peers
         return peers
 
@@ -89,23 +98,27 @@ class Views:
             servers = self._servers[group] = {name: permit for name, permit in found if permit}
         return servers
 
-    def _offering(self, cloud: Sidecar, permit: CallPermit) -> Peer:
-        key = cloud.name, permit
-        peer = self._offers.get(key)
-        if peer is None:
-            peer = cloud.as_peer()
-            offers = tuple(offer for offer in peer.offers if offer.name in permit)
-            peer = self._offers[key] = dataclasses.replace(peer, offers=offers)
-        return peer
-
     def _robots_for(self, cloud: Sidecar) -> tuple[Peer, ...]:
-        permits = tuple(self._permits.of(self._permits.group(robot.name), cloud) for robot in self._robots)
+        if self._permits.restricted:
+            permits = tuple(self._permits.of(self._permits.group(robot.name), cloud) for robot in self._robots)
+        else:
+            permits = (ALL_CALLS,) * len(self._robots)
         peers = self._permitted.get(permits)
         if peers is None:
             pairs = zip(self._robots, permits, strict=True)
-            peers = tuple(self._told.peer(robot, permit) for robot, permit in pairs if permit)
+            peers = tuple(self._known.peer(robot, permit) for robot, permit in pairs if permit)
             self._permitted[permits] = peers
         return peers
+
+    def changes(self, before: tuple[Peer, ...], sidecar: Sidecar) -> tuple[Peer, ...]:
+        """The peers of a sidecar that are not as it was told of them `before`."""
+        peers = self.peers_of(sidecar)
+        found = self._changes.get((id(before), id(peers)))
+        if found is None:
+            old = {peer.name: peer for peer in before}
+            changed = tuple(peer for peer in peers if (was := old.get(peer.name)) is not peer and was != peer)
+            found = self._changes[id(before), id(peers)] = before, changed
+        return found[1]
 
     def removed(self, sidecar: Sidecar, known_names: Collection[NodeName]) -> tuple[RemovedPeer, ...]:
         """Notices on those a sidecar may know and should not list any more, with the reason, by name."""

@@ -8,7 +8,6 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from protos.convert.fields import (
     MAX_CRL_BYTES,
-    MAX_PEERS,
     MAX_REMOVED,
     MAX_STUN_SERVERS,
     MAX_USES,
@@ -42,6 +41,7 @@ from protos.convert.types import (
 from protos.errors import DecodeError
 from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import (
+    MAX_PEERS,
     MAX_UNMET,
     TOKEN_BYTES,
     Ack,
@@ -262,6 +262,7 @@ def _registration_from_proto(message: control_pb2.Register) -> Registration:
         mapping_version=version(message.mapping_version, "mapping_version"),
         credential=credential_from_proto(message.credential),
         region=domain_label(message.region, "region"),
+        incremental=message.incremental,
     )
 
 
@@ -278,6 +279,7 @@ def _registration_to_proto(value: Registration) -> control_pb2.Register:
         mapping_version=value.mapping_version,
         credential=value.credential,
         region=value.region,
+        incremental=value.incremental,
     )
 
 
@@ -305,19 +307,29 @@ def _peer_set_from_proto(message: control_pb2.PeerSet) -> PeerSet:
         peers=peers,
         removed=removed,
         policy=message.policy,
+        base=version(message.base_version, "base version"),
+        more=message.more,
     )
 
 
 def _peer_set_to_proto(value: PeerSet) -> control_pb2.PeerSet:
+    message = peer_set_header_to_proto(value)
+    message.peers.extend(map(peer_to_proto, value.peers))
+    message.more = value.more
+    return message
+
+
+def peer_set_header_to_proto(value: PeerSet) -> control_pb2.PeerSet:
+    """Encode a set of peers without the peers, and as one that does not go on."""
     return control_pb2.PeerSet(
         version=value.version,
         nonce=value.nonce,
-        peers=map(peer_to_proto, value.peers),
         removed=(
             control_pb2.RemovedPeer(name=removed.name, reason=_REASON_NUMBERS[removed.reason])
             for removed in value.removed
         ),
         policy=value.policy,
+        base_version=value.base,
     )
 
 

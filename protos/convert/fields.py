@@ -22,9 +22,6 @@ MAX_OFFERS = 1024
 MAX_USES = 1024
 """Services one robot sidecar carries."""
 
-MAX_PEERS = 4096
-"""Peers in one set: with 1 kB each, most of it the credential, it still fits gRPC's default message of 4 MiB."""
-
 MAX_REMOVED = 4096
 """Removal notices in one set."""
 

@@ -4,9 +4,10 @@
        ▲                                       │                        │
        └───────(stream ended, no Welcome)──────┴────────────────────────┘
 
-The rules are xDS's. A resource comes whole, with a version and a nonce; the answer repeats the nonce with the version
-that is then in force. Only the newest answer for each resource matters, since the control plane ignores stale nonces:
-so what waits to be sent is bounded without any queue.
+The rules are xDS's. A resource comes with a version and a nonce; the answer repeats the nonce with the version that is
+then in force. Only the newest answer for each resource matters, since the control plane ignores stale nonces: so what
+waits to be sent is bounded without any queue. A mapping comes whole. Peers come whole or as changes, and in one message
+or several: what is put in force is whole (`PeerAssembly`).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from protos.model import (
     Welcome,
 )
 from sidecar.core.backoff import Backoff
+from sidecar.core.peer_assembly import PeerAssembly
 
 if TYPE_CHECKING:
     import random
@@ -112,11 +114,12 @@ ControlEvent = Welcome | Apply
 class ControlSession:
     """One sidecar's dialogue with the control plane, over however many streams.
 
-    `registration` names the versions already in force, such as those loaded from disk.
+    `registration` names the versions already in force, such as those loaded from disk, `peers` the set of that version.
     """
 
-    def __init__(self, registration: Registration, rng: random.Random) -> None:
-        self._registration = registration
+    def __init__(self, registration: Registration, rng: random.Random, peers: PeerSet | None = None) -> None:
+        self._registration = replace(registration, incremental=True)
+        self._assembly = PeerAssembly(peers)
         self._in_force = {
             ResourceKind.PEERS: registration.peers_version,
             ResourceKind.MAPPING: registration.mapping_version,
@@ -169,6 +172,8 @@ class ControlSession:
     def not_restored(self, held: Apply) -> None:
         """What the registration said we hold could not be put in force: it is asked for anew."""
         self._in_force[held.resource] = Version(0)
+        if held.resource is ResourceKind.PEERS:
+            self._assembly = PeerAssembly(None)
         self._keep_if_refused(held, refused=True)
 
     # ── the stream ──
@@ -176,6 +181,7 @@ class ControlSession:
     def opened(self, now: float) -> None:
         """A stream is being opened: everything is said anew on it."""
         self._clear_outgoing()
+        self._assembly.begin_stream()
         self.state = ControlState.REGISTERING
         self.stats.attempts += 1
         self._opened_at = now
@@ -222,7 +228,7 @@ class ControlSession:
             case Welcome():
                 return self._receive_welcome(message, now)
             case PeerSet():
-                return self._receive_resource(ResourceKind.PEERS, message)
+                return self._receive_peers(message)
             case MappingSet():
                 return self._receive_resource(ResourceKind.MAPPING, message)
 
@@ -243,6 +249,19 @@ class ControlSession:
         )
         return welcome
 
+    def _receive_peers(self, message: PeerSet) -> Apply | None:
+        said = self._assembly.take(message)
+        if said is None:
+            return None
+        if said.version <= self._in_force[ResourceKind.PEERS]:
+            return self._receive_resource(ResourceKind.PEERS, said)
+        whole = self._assembly.whole(said)
+        if isinstance(whole, str):
+            self.stats.ignored["peers_without_base"] += 1
+            self._nack(ResourceKind.PEERS, said.nonce, whole)
+            return None
+        return self._receive_resource(ResourceKind.PEERS, whole)
+
     def _receive_resource(self, resource: ResourceKind, content: PeerSet | MappingSet) -> Apply | None:
         in_force = self._in_force[resource]
         if content.version > in_force:
@@ -262,7 +281,8 @@ class ControlSession:
             self._nack(apply.resource, apply.content.nonce, error)
             return
         self._in_force[apply.resource] = apply.content.version
-        if apply.resource is ResourceKind.PEERS:
+        if isinstance(apply.content, PeerSet):
+            self._assembly.in_force(apply.content)
             # A control plane that has just started believes what is said of a server only once that is back, too.
             self._report_at = min(self._report_at, self._soonest_report())
         self._ack(apply.resource, apply.content.nonce)
@@ -282,6 +302,8 @@ class ControlSession:
     def undecodable(self, resource: ResourceKind | None, nonce: int, error: str) -> None:
         """A message broke its format; `resource` and `nonce` as far as they could be read."""
         self.stats.ignored["undecodable"] += 1
+        if resource is ResourceKind.PEERS:
+            self._assembly.leave_out(nonce)
         if resource is not None:
             self._nack(resource, nonce, error)
 

@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
-from protos.model import MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
+from protos.model import MAX_PEERS, MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.attention import Attention
 from sidecar.core.backlog import SLICE, Backlog, Step, rest
 from sidecar.core.events import (
@@ -58,7 +58,7 @@ from sidecar.core.messages import (
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.peers import MAX_PEERS, Peers
+from sidecar.core.peers import Peers
 from sidecar.core.penalties import Penalties
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable

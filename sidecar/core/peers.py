@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from protos.identity import CertificateError
-from protos.model import NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
+from protos.model import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
 from sidecar.core.announced import Announced
 from sidecar.core.link_events import LinkPeer
 from sidecar.core.verification_budget import VerificationBudget
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from sidecar.core.link_events import PeerRenewed, PeerRestarted
     from sidecar.core.session import OwnSession
 
-MAX_PEERS = 4096
-"""Peers kept; a control plane that names more is refused."""
 RESTART_GAP_S = 1.0
 """A peer that restarts more often is not believed: every restart costs all links work. What it costs to look at the
 credentials of those who say so has a budget of its own (`verification_budget.py`)."""

@@ -184,7 +184,7 @@ class World:
         if picture is not None:
             self.solvings += 1
             plan = solve(picture.problem, time_limit_s=SOLVER_LIMIT_S, hint=self.core.plan)
-            self.core.solved(picture, plan, self.now)
+            self.core.solved(self.core.settle(picture, plan, self.now), self.now)
             self.dispatch()
 
     def dispatch(self) -> None:

@@ -91,7 +91,8 @@ class JoinedPlanes:
         self.core.handle_timer(now)
         picture = self.core.start_solving(now)
         if picture is not None:
-            self.core.solved(picture, solve(picture.problem, time_limit_s=60.0, hint=self.core.plan), now)
+            plan = solve(picture.problem, time_limit_s=60.0, hint=self.core.plan)
+            self.core.solved(self.core.settle(picture, plan, now), now)
         while (event := self.core.next_event()) is not None:
             if isinstance(event, Send) and event.stream in self.streams:
                 self._deliver(event.stream, event.message)

@@ -151,6 +151,7 @@ class Register(_message.Message):
     MAPPING_VERSION_FIELD_NUMBER: _builtins.int
     CREDENTIAL_FIELD_NUMBER: _builtins.int
     REGION_FIELD_NUMBER: _builtins.int
+    INCREMENTAL_FIELD_NUMBER: _builtins.int
     protocol_version: _builtins.int
     name: _builtins.str
     role: _types_pb2.Role.ValueType
@@ -166,6 +167,8 @@ class Register(_message.Message):
     """What this run says of itself to its peers, signed by itself (protos/credential.py)."""
     region: _builtins.str
     """Of a cloud: where it stands; clouds with the same one fail together. Empty: not known."""
+    incremental: _builtins.bool
+    """It takes changes (PeerSet.base_version) and sets in several messages (PeerSet.more)."""
     def __init__(
         self,
         *,
@@ -180,10 +183,11 @@ class Register(_message.Message):
         mapping_version: _builtins.int = ...,
         credential: _builtins.bytes = ...,
         region: _builtins.str = ...,
+        incremental: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["credential", b"credential", "incarnation", b"incarnation", "mapping_version", b"mapping_version", "name", b"name", "peers_version", b"peers_version", "protocol_version", b"protocol_version", "region", b"region", "role", b"role", "session", b"session", "software_version", b"software_version", "token", b"token"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["credential", b"credential", "incarnation", b"incarnation", "incremental", b"incremental", "mapping_version", b"mapping_version", "name", b"name", "peers_version", b"peers_version", "protocol_version", b"protocol_version", "region", b"region", "role", b"role", "session", b"session", "software_version", b"software_version", "token", b"token"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -782,6 +786,8 @@ class PeerSet(_message.Message):
     PEERS_FIELD_NUMBER: _builtins.int
     REMOVED_FIELD_NUMBER: _builtins.int
     POLICY_FIELD_NUMBER: _builtins.int
+    BASE_VERSION_FIELD_NUMBER: _builtins.int
+    MORE_FIELD_NUMBER: _builtins.int
     version: _builtins.int
     nonce: _builtins.int
     policy: _builtins.int
@@ -790,6 +796,12 @@ class PeerSet(_message.Message):
     0: not yet to be judged by it (right after a start, while peers are still coming back). 1: there is no policy;
     then nothing need go.
     """
+    base_version: _builtins.int
+    """0: `peers` are all. Else the version that these changes are upon: `peers` are new or different, `removed` left,
+    all others are as they were.
+    """
+    more: _builtins.bool
+    """The next message goes on with this set, under the same version, nonce and base_version."""
     @_builtins.property
     def peers(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.Peer]: ...
     @_builtins.property
@@ -804,10 +816,12 @@ class PeerSet(_message.Message):
         peers: _abc.Iterable[_types_pb2.Peer] | None = ...,
         removed: _abc.Iterable[Global___RemovedPeer] | None = ...,
         policy: _builtins.int = ...,
+        base_version: _builtins.int = ...,
+        more: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["nonce", b"nonce", "peers", b"peers", "policy", b"policy", "removed", b"removed", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_version", b"base_version", "more", b"more", "nonce", b"nonce", "peers", b"peers", "policy", b"policy", "removed", b"removed", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

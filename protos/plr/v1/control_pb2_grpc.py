@@ -26,10 +26,12 @@ if _version_not_supported:
 
 
 class ControlPlaneStub:
-    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
-    version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
-    and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
-    What is refused is sent again every few seconds, as a new version: the cause may have passed.
+    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent with a version and a
+    nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
+    still in force; a stale nonce is ignored; versions only grow, also over restarts of the server. The mapping is sent
+    whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
+    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
+    sent again every few seconds, whole and as a new version: the cause may have passed.
     """
 
     def __init__(self, channel):
@@ -46,10 +48,12 @@ class ControlPlaneStub:
 
 
 class ControlPlaneServicer:
-    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
-    version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
-    and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
-    What is refused is sent again every few seconds, as a new version: the cause may have passed.
+    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent with a version and a
+    nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
+    still in force; a stale nonce is ignored; versions only grow, also over restarts of the server. The mapping is sent
+    whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
+    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
+    sent again every few seconds, whole and as a new version: the cause may have passed.
     """
 
     def Connect(self, request_iterator, context):
@@ -75,10 +79,12 @@ def add_ControlPlaneServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class ControlPlane:
-    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
-    version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
-    and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
-    What is refused is sent again every few seconds, as a new version: the cause may have passed.
+    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent with a version and a
+    nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
+    still in force; a stale nonce is ignored; versions only grow, also over restarts of the server. The mapping is sent
+    whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
+    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
+    sent again every few seconds, whole and as a new version: the cause may have passed.
     """
 
     @staticmethod

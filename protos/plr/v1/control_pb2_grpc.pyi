@@ -27,10 +27,12 @@ GRPC_GENERATED_VERSION: str
 GRPC_VERSION: str
 
 class ControlPlaneStub:
-    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
-    version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
-    and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
-    What is refused is sent again every few seconds, as a new version: the cause may have passed.
+    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent with a version and a
+    nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
+    still in force; a stale nonce is ignored; versions only grow, also over restarts of the server. The mapping is sent
+    whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
+    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
+    sent again every few seconds, whole and as a new version: the cause may have passed.
     """
 
     @_typing.overload
@@ -41,20 +43,24 @@ class ControlPlaneStub:
 
 @_typing.type_check_only
 class ControlPlaneAsyncStub(ControlPlaneStub):
-    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
-    version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
-    and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
-    What is refused is sent again every few seconds, as a new version: the cause may have passed.
+    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent with a version and a
+    nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
+    still in force; a stale nonce is ignored; versions only grow, also over restarts of the server. The mapping is sent
+    whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
+    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
+    sent again every few seconds, whole and as a new version: the cause may have passed.
     """
 
     def __init__(self, channel: _aio.Channel) -> None: ...
     Connect: _aio.StreamStreamMultiCallable[_control_pb2.SidecarMessage, _control_pb2.ControlMessage]  # type: ignore[assignment]
 
 class ControlPlaneServicer(metaclass=_abc_1.ABCMeta):
-    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent whole with a
-    version and a nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error
-    and the version still in force; a stale nonce is ignored; versions only grow, also over restarts of the server.
-    What is refused is sent again every few seconds, as a new version: the cause may have passed.
+    """One stream for each sidecar. The rules are xDS's: a resource (the peers, the mapping) is sent with a version and a
+    nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
+    still in force; a stale nonce is ignored; versions only grow, also over restarts of the server. The mapping is sent
+    whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
+    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
+    sent again every few seconds, whole and as a new version: the cause may have passed.
     """
 
     @_abc_1.abstractmethod

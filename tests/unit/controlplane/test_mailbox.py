@@ -6,7 +6,18 @@ import asyncio
 
 from controlplane.core.control_events import CloseReason
 from controlplane.mailbox import Mailbox
-from protos.model import MappingSet, PeerSet, Version, Welcome
+from protos.model import (
+    MappingSet,
+    NodeName,
+    Peer,
+    PeerSet,
+    RemovalReason,
+    RemovedPeer,
+    Role,
+    SessionId,
+    Version,
+    Welcome,
+)
 
 WELCOME = Welcome(5.0, 0.5)
 
@@ -35,6 +46,27 @@ def test_a_newer_resource_takes_the_place_of_an_unsent_older_one() -> None:
         assert mailbox.superseded == 2 * 999
 
     asyncio.run(scenario())
+
+
+def test_unsent_changes_are_put_together() -> None:
+    async def scenario() -> None:
+        mailbox = Mailbox()
+        mailbox.put(PeerSet(Version(5), 1, (peer("a"), peer("b")), base=Version(4)))
+        mailbox.put(PeerSet(Version(6), 2, (peer("c"),), (gone("a"),), base=Version(5)))
+        assert await mailbox.get() == PeerSet(Version(6), 2, (peer("b"), peer("c")), (gone("a"),), base=Version(4))
+        mailbox.put(PeerSet(Version(7), 3, (peer("d"),)))
+        mailbox.put(PeerSet(Version(8), 4, (), (gone("d"),), 77, base=Version(7)))
+        assert await mailbox.get() == PeerSet(Version(8), 4, (), (gone("d"),), 77)
+
+    asyncio.run(scenario())
+
+
+def peer(name: str) -> Peer:
+    return Peer(NodeName(name), Role.CLOUD, SessionId(1), bytes(16), 1)
+
+
+def gone(name: str) -> RemovedPeer:
+    return RemovedPeer(NodeName(name), RemovalReason.LEFT)
 
 
 def test_waiting_ends_with_a_message_or_with_the_close() -> None:

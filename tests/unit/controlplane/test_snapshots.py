@@ -196,7 +196,7 @@ def peer(name: str) -> Peer:
 
 def send_peers(snapshots: Snapshots, versions: VersionSource, *names: str) -> None:
     peers = tuple(peer(name) for name in names)
-    snapshots.send_peers(PeerView(peers), ToldPeers(peers, NodeName("robot"), Role.ROBOT), (), versions)
+    snapshots.send_peers(PeerView(peers), ToldPeers(peers, NodeName("robot"), Role.ROBOT), (), Version(0), versions)
 
 
 def test_names_a_sidecar_may_know_grow_until_it_acknowledges(versions: VersionSource) -> None:

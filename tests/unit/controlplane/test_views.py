@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from controlplane.core.permits import Permits
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.registry import Registry, Sidecar
-from controlplane.core.views import ToldRobots, Views
+from controlplane.core.views import KnownPeers, Views
 from protos.model import (
     ALL_CALLS,
     CallPermit,
@@ -52,7 +52,7 @@ def names(views: Views, sidecar: Sidecar) -> list[str]:
 def test_peers_are_the_other_role_by_name_when_ready() -> None:
     members = registry({"b": (), "a": ()})
     members.register(registration("late", Role.CLOUD), stream(9), 0.0)
-    views = Views(members, Permits(None), ToldRobots())
+    views = Views(members, Permits(None), KnownPeers())
     assert names(views, of(members, "robot")) == ["a", "b"]
     assert names(views, of(members, "a")) == ["robot"]
     assert [peer.may_call for peer in views.peers_of(of(members, "a"))] == [ALL_CALLS]
@@ -62,7 +62,7 @@ def test_notices_name_those_known_but_not_listed_with_their_reason() -> None:
     members = registry({"a": (), "c": ()})
     members.set_draining(A)
     members.disconnect(A, stream(0))
-    views = Views(members, Permits(None), ToldRobots())
+    views = Views(members, Permits(None), KnownPeers())
     assert views.removed(of(members, "robot"), {A, B, C}) == (
         RemovedPeer(A, RemovalReason.LEFT),
         RemovedPeer(B, RemovalReason.LEASE_EXPIRED),
@@ -71,7 +71,7 @@ def test_notices_name_those_known_but_not_listed_with_their_reason() -> None:
 
 def test_who_has_nothing_to_call_is_not_told_of_and_goes_at_once() -> None:
     members = registry({"a": ("/plan",), "b": ("/plan",)})
-    views = Views(members, Permits(ONLY_A), ToldRobots())
+    views = Views(members, Permits(ONLY_A), KnownPeers())
     robot = of(members, "robot")
     assert names(views, robot) == ["a"]
     assert names(views, of(members, "b")) == []
@@ -81,7 +81,7 @@ def test_who_has_nothing_to_call_is_not_told_of_and_goes_at_once() -> None:
 
 def test_offers_that_a_robot_may_not_call_are_not_told() -> None:
     members = registry({"a": ("/plan", "/secret")})
-    (peer,) = Views(members, Permits(ONLY_A), ToldRobots()).peers_of(of(members, "robot"))
+    (peer,) = Views(members, Permits(ONLY_A), KnownPeers()).peers_of(of(members, "robot"))
     assert [offered.name for offered in peer.offers] == ["/plan"]
 
 
@@ -89,7 +89,7 @@ def test_a_server_that_is_away_costs_no_robot_its_place() -> None:
     """Its cloud offers nothing for a moment; what is in flight must not lose its session over that."""
     members = registry({"a": ("/plan",)})
     members.set_services(A, ServiceSet(()))
-    views = Views(members, Permits(ONLY_A), ToldRobots())
+    views = Views(members, Permits(ONLY_A), KnownPeers())
     (cloud,) = views.peers_of(of(members, "robot"))
     assert cloud.offers == ()
     (robot,) = views.peers_of(of(members, "a"))
@@ -98,23 +98,23 @@ def test_a_server_that_is_away_costs_no_robot_its_place() -> None:
 
 def test_a_cloud_that_has_offered_nothing_yet_is_not_called_forbidden() -> None:
     members = registry({"a": ()})
-    views = Views(members, Permits(ONLY_A), ToldRobots())
+    views = Views(members, Permits(ONLY_A), KnownPeers())
     assert views.removed(of(members, "robot"), {A}) == (RemovedPeer(A, RemovalReason.LEASE_EXPIRED),)
 
 
 def test_permits_follow_the_offers() -> None:
     members = registry({"a": ("/detect",)})
     permits = Permits(ONLY_A)
-    assert names(Views(members, permits, ToldRobots()), of(members, "robot")) == []
+    assert names(Views(members, permits, KnownPeers()), of(members, "robot")) == []
     members.set_services(A, ServiceSet((offer("/plan"),)))
-    assert names(Views(members, permits, ToldRobots()), of(members, "robot")) == ["a"]
+    assert names(Views(members, permits, KnownPeers()), of(members, "robot")) == ["a"]
 
 
 @given(policies, st.tuples(*(st.sets(st.sampled_from(SERVICES)).map(tuple) for _ in CLOUDS)))
 def test_views_tell_what_is_allowed_and_nothing_else(policy: Policy, offered: tuple[tuple[str, ...], ...]) -> None:
     clouds = dict(zip(CLOUDS, offered, strict=True))
     members = registry(clouds, ROBOTS)
-    views = Views(members, Permits(policy), ToldRobots())
+    views = Views(members, Permits(policy), KnownPeers())
     allowed = {
         (robot, service, cloud)
         for robot in ROBOTS

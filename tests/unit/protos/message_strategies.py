@@ -258,7 +258,15 @@ def peer_sets(draw: st.DrawFn) -> PeerSet:
     gone = draw(_tuples(st.builds(RemovedPeer, node_names, st.sampled_from(RemovalReason)), by="name"))
     names = {peer.name for peer in present}
     removed = tuple(peer for peer in gone if peer.name not in names)
-    return PeerSet(draw(versions), draw(uint64), present, removed, draw(uint64))
+    return PeerSet(
+        draw(versions),
+        draw(uint64),
+        present,
+        removed,
+        draw(uint64),
+        draw(versions),
+        draw(st.sampled_from((True, False))),
+    )
 
 
 revocation_sets = st.builds(

@@ -11,6 +11,7 @@ import pytest
 from protos.errors import DecodeError
 from protos.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
+    MAX_PEERS,
     NO_POLICY,
     POLICY_PENDING,
     CallPermit,
@@ -29,7 +30,7 @@ from protos.model import (
     Version,
 )
 from sidecar.core.link_events import PeerRestarted
-from sidecar.core.peers import MAX_PEERS, RESTART_GAP_S, Peers
+from sidecar.core.peers import RESTART_GAP_S, Peers
 from sidecar.core.session import OwnSession
 from tests.sessions import credential_of, private_key, session_of, with_credential
 from tests.unit.sidecar.core.builders import ECHO, A, B, peer

@@ -18,6 +18,7 @@ from protos.errors import DecodeError
 from protos.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
     ALL_CALLS,
+    MAX_PEERS,
     Candidate,
     CandidateKind,
     InterfaceId,
@@ -43,7 +44,6 @@ from sidecar.core.events import (
 )
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
-from sidecar.core.peers import MAX_PEERS
 from sidecar.core.rules import ServiceRule
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread

@@ -1,0 +1,42 @@
+"""Changes of a set of peers: put upon the set that they are for, and put together while neither is on its way.
+
+Changes upon version B that lead to version V: `PeerSet(version=V, base=B, peers=new or different, removed=gone)`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from protos.model import POLICY_PENDING, Version
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from protos.model import NodeName, Peer, PeerSet
+
+
+def put_upon(held: Mapping[NodeName, Peer], changes: PeerSet) -> PeerSet:
+    """Return the whole set that these changes make of the peers of their base version; its notices are theirs."""
+    peers = dict(held)
+    _change(peers, changes)
+    return replace(changes, peers=tuple(peers.values()), base=Version(0), more=False)
+
+
+def put_together(first: PeerSet, then: PeerSet) -> PeerSet:
+    """Return one set that does what two do in turn; the base of the second is the version of the first, or 0."""
+    if not then.base:
+        return then
+    peers = {peer.name: peer for peer in first.peers}
+    _change(peers, then)
+    gone = {removed.name: removed for removed in (*first.removed, *then.removed) if removed.name not in peers}
+    # What was judged by one policy stays judged by it while the next one is not to be judged by.
+    policy = first.policy if then.policy == POLICY_PENDING else then.policy
+    return replace(then, base=first.base, peers=tuple(peers.values()), removed=tuple(gone.values()), policy=policy)
+
+
+def _change(peers: dict[NodeName, Peer], changes: PeerSet) -> None:
+    for removed in changes.removed:
+        peers.pop(removed.name, None)
+    for peer in changes.peers:
+        peers[peer.name] = peer
