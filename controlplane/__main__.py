@@ -21,14 +21,13 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from controlplane import version
 from controlplane.certificates import load_own_files
 from controlplane.config import load_config, refuse_exposed
-from protos import interpreter
+from protos import extras, interpreter
 from protos.certificate_term import term_problem
 from protos.errors import ConfigError
 from protos.log_lines import line_formatter
-from protos.notifier import Notifier
+from protos.version_option import ShowVersion, describe
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -47,6 +46,10 @@ log = logging.getLogger("controlplane")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     arguments = _parser().parse_args(argv)
+    lacking = extras.missing("controlplane", extras.CONTROL_PLANE)
+    if lacking is not None:
+        sys.stderr.write(f"plr-controlplane: {lacking}\n")
+        return EXIT_USAGE
     try:
         config = load_config(arguments.config)
         if not arguments.insecure_i_know:
@@ -102,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="allow insecure: true on an address that other machines reach: anybody there may read and change all",
     )
-    parser.add_argument("--version", action="version", version=version.describe("plr-controlplane"))
+    parser.add_argument("--version", action=ShowVersion)
     return parser
 
 
@@ -127,6 +130,7 @@ def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
 async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> None:
     from controlplane.policy_reload import PolicyReload
     from controlplane.server import serve
+    from protos.notifier import Notifier
 
     interpreter.share()
     stop = asyncio.Event()
@@ -140,7 +144,7 @@ async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None)
     def ready(addresses: Addresses) -> None:
         log.info(
             "%s listens: gRPC %s, STUN %s, metrics %s",
-            version.describe("plr-controlplane"),
+            describe("plr-controlplane"),
             addresses.grpc,
             ", ".join(addresses.stun) or "off",
             addresses.metrics or "off",

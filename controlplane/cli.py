@@ -37,7 +37,6 @@ from controlplane import (
     plan_command,
     policy_command,
     status_table,
-    version,
 )
 from controlplane.admin_client import AskError, add_options, ask
 from controlplane.ca import commands as ca_commands
@@ -50,6 +49,7 @@ from protos.convert import (
     status_from_proto,
 )
 from protos.plr.v1 import admin_pb2
+from protos.version_option import ShowVersion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=version.describe("plr"))
+    parser.add_argument("--version", action=ShowVersion)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     status = commands.add_parser("status", help="who is connected, how far each follows, and who is gone")

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from controlplane.planning import plan_text
 from controlplane.planning.plot import PlotError, draw
 from controlplane.planning.prospects import least_set
-from controlplane.planning.recorded import RecordedService, RecordingError, read_recording
-from controlplane.planning.replay import Compute, ReplayedTraces, Workload
 from controlplane.planning.traces import TraceError, read_trace
+from controlplane.planning.workload import DEFAULT, Compute, Workload
+from protos import extras
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -29,9 +29,6 @@ EXIT_USAGE = 2
 
 MAX_REQUESTS = 5_000_000
 """Requests sent through traces in one run: some minutes."""
-
-DEFAULT = Workload(request_bytes=10_000, answer_bytes=1000, rate_hz=10.0, compute=Compute(0.02, 0.04))
-"""What is sent through traces unless said otherwise; what was recorded live has its own."""
 
 _EPILOG = """\
 The LSC theorem says that one server behind one path can not be latency-reliable on commodity infrastructure: it misses
@@ -126,6 +123,13 @@ def _given(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _plan(arguments: argparse.Namespace) -> int:
+    lacking = extras.missing("controlplane", extras.PLAN)
+    if lacking is not None:
+        sys.stderr.write(f"plr plan: {lacking}\n")
+        return EXIT_USAGE
+    # With numpy, which an operator who only asks does without.
+    from controlplane.planning.recorded import RecordingError
+
     try:
         source, deadline_s = _recorded(arguments) if arguments.recorded is not None else _replayed(arguments)
         prospects = source.prospects(deadline_s)
@@ -152,6 +156,8 @@ def _plan(arguments: argparse.Namespace) -> int:
 
 
 def _recorded(arguments: argparse.Namespace) -> tuple[Source, float]:
+    from controlplane.planning.recorded import RecordedService, read_recording
+
     if _given(arguments):
         raise _UsageError("sizes, rate and computing times go with --traces: what was recorded is as it was")
     source = RecordedService(read_recording(arguments.recorded))
@@ -160,6 +166,8 @@ def _recorded(arguments: argparse.Namespace) -> tuple[Source, float]:
 
 
 def _replayed(arguments: argparse.Namespace) -> tuple[Source, float]:
+    from controlplane.planning.replay import ReplayedTraces
+
     if arguments.deadline_ms is None:
         raise _UsageError("--traces needs --deadline-ms")
     workload = replace(DEFAULT, **_given(arguments))

@@ -16,7 +16,7 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from controlplane import admin, service, version
+from controlplane import admin, service
 from controlplane.access import AccessGuard
 from controlplane.certificates import CertificateKeeper
 from controlplane.core.registry import MAX_SIDECARS
@@ -30,6 +30,7 @@ from protos.clock_floor import ClockFloor
 from protos.config_fields import split_host_port
 from protos.fleet_events import EventKind
 from protos.plr.v1 import admin_pb2_grpc
+from protos.version_option import describe
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -132,7 +133,7 @@ async def serve(
                 await health_service.set(name, health_pb2.HealthCheckResponse.SERVING)
             ready(Addresses(grpc_address, stun, metrics_address))
             events.announce()
-            events.record(EventKind.STARTED, text=version.describe("plr-controlplane"))
+            events.record(EventKind.STARTED, text=describe("plr-controlplane"))
             await stop.wait()
             stopping()
             events.record(EventKind.STOPPED)

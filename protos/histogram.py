@@ -11,23 +11,26 @@ Layout 1::
 A value reported at the geometric middle of its bucket is off by less than 2 %. Histograms of the same layout
 merge by adding counts, which is exact and independent of the order; an earlier state of a histogram that only grew is
 subtracted as exactly. Old samples fade in `controlplane.core.fading`, where there is a clock to fade by.
+
+A sidecar has no numpy of its own, and an operator's `plr` none at all: only what the control plane computes with
+imports it, at its first use.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from array import array
 from bisect import bisect_right
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from protos.errors import DecodeError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
+    import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
 LAYOUT = 1
@@ -61,8 +64,6 @@ MIDS: tuple[float, ...] = (
 )
 """The value that stands for a bucket, seconds: its geometric middle; for overflow its lower edge."""
 
-_EDGES = np.array(EDGES)
-_MIDS = np.array(MIDS)
 _EMPTY = bytes(8 * BUCKETS)
 
 MAX_COUNT = 1 << 40
@@ -92,10 +93,12 @@ class Histogram:
 
     def record_many(self, seconds: ArrayLike) -> None:
         """Count many answered requests, as `record` counts one; if one of them is NaN, none is."""
+        import numpy as np
+
         values = np.asarray(seconds, dtype=np.float64).ravel()
         if np.isnan(values).any():
             raise ValueError("a latency is not NaN")
-        self.counts[:] += np.bincount(np.searchsorted(_EDGES, values, side="right"), minlength=BUCKETS)
+        self.counts[:] += np.bincount(np.searchsorted(_edges(), values, side="right"), minlength=BUCKETS)
 
     def record_lost(self, n: int = 1) -> None:
         """Count `n` requests that were never answered."""
@@ -105,7 +108,9 @@ class Histogram:
 
     def merge(self, other: Histogram) -> None:
         """Add the counts of `other` to this one."""
-        self.counts[:] += other.counts
+        counts, added = self._counts, other._counts
+        for index in other._used():
+            counts[index] += added[index]
         self._lost += other._lost
 
     def subtract(self, earlier: Histogram) -> None:
@@ -114,10 +119,11 @@ class Histogram:
         Raises ValueError, and leaves all as it was, if `earlier` counts more anywhere: then it is not this histogram's
         past.
         """
-        left = self.counts - earlier.counts
-        if self._lost < earlier._lost or (left < 0).any():
+        counts, taken = self._counts, earlier._counts
+        if self._lost < earlier._lost or any(counts[index] < taken[index] for index in earlier._used()):
             raise ValueError("the histogram to subtract counts what this one does not")
-        self.counts[:] = left
+        for index in earlier._used():
+            counts[index] -= taken[index]
         self._lost -= earlier._lost
 
     def copy(self) -> Histogram:
@@ -142,6 +148,8 @@ class Histogram:
     @property
     def counts(self) -> NDArray[np.int64]:
         """Count of each bucket, `BUCKETS` of them: a view, which later records change."""
+        import numpy as np
+
         return np.frombuffer(self._counts, dtype=np.int64)
 
     @property
@@ -189,19 +197,27 @@ class Histogram:
         if not total:
             return math.nan
         rank = max(1, math.ceil(q * total))
-        index = int(np.searchsorted(self.counts.cumsum(), rank))
-        return MIDS[index] if index < BUCKETS else math.inf
+        for index, up_to in enumerate(itertools.accumulate(self._counts)):
+            if up_to >= rank:
+                return MIDS[index]
+        return math.inf
 
     def mean(self) -> float:
         """Mean latency of the answered requests, within 2 %; NaN if there are none."""
         answered = self.answered
-        return float(self.counts @ _MIDS) / answered if answered else math.nan
+        return self.sum_s() / answered if answered else math.nan
+
+    def sum_s(self) -> float:
+        """Seconds of all answered requests together, within 2 %."""
+        return sum(self._counts[index] * MIDS[index] for index in self._used())
 
     def to_sparse(self) -> tuple[list[int], list[int], int]:
         """Indices of the buckets in use, ascending, their counts, and the lost."""
-        counts = self.counts
-        used = np.flatnonzero(counts)
-        return used.tolist(), counts[used].tolist(), self._lost
+        used = list(self._used())
+        return used, [self._counts[index] for index in used], self._lost
+
+    def _used(self) -> Iterator[int]:
+        return itertools.compress(range(BUCKETS), self._counts)
 
     @classmethod
     def from_sparse(
@@ -238,3 +254,10 @@ class Histogram:
             f"Histogram(total={self.total}, lost={self._lost}, "
             f"p50={self.quantile(0.5):.4g} s, p99={self.quantile(0.99):.4g} s)"
         )
+
+
+@functools.cache
+def _edges() -> NDArray[np.float64]:
+    import numpy as np
+
+    return np.array(EDGES)

@@ -12,13 +12,14 @@ import signal
 import sys
 import threading
 import time
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from protos import commit, extras
 from protos.certificate_term import term_problem
 from protos.errors import ConfigError, StartError
 from protos.tls_files import load_tls_files
+from protos.version_option import ShowVersion
 from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
 from sidecar.logging_setup import Logging
 from sidecar.ros import environment
@@ -67,6 +68,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_OK
     if options.config is None:
         _parser().error("expected --config FILE")
+    lacking = extras.missing("sidecar", extras.SIDECAR)
+    if lacking is not None:
+        sys.stderr.write(f"{PROGRAM}: {lacking}\n")
+        return EXIT_BAD_CONFIG
     try:
         config = load_config(options.config, lambda folder: load_tls_files(folder).identity)
         if not options.insecure_i_know:
@@ -101,16 +106,8 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="allow insecure: true with a control plane on another machine: anybody between may read and change all",
     )
-    parser.add_argument("--version", action="version", version=f"{PROGRAM} {software_version()}")
+    parser.add_argument("--version", action=ShowVersion)
     return parser
-
-
-def software_version() -> str:
-    """Return the version of the installed distribution, or 0 when run from a bare checkout."""
-    try:
-        return version("fogros2-plr")
-    except PackageNotFoundError:
-        return "0"
 
 
 def _warn_of_missing_interfaces(config: SidecarConfig) -> None:
@@ -159,7 +156,7 @@ def _run(config: SidecarConfig) -> int:
             # and a signal is heeded meanwhile.
             from sidecar.runtime import run
 
-            code = run(config, software_version(), stop)
+            code = run(config, commit.version(), stop)
         except ConfigError:
             raise
         except Exception:

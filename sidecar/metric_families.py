@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import functools
+from bisect import bisect_left
+from itertools import accumulate
 from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from protos.histogram import MIDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from numpy.typing import NDArray
 
     from protos.histogram import Histogram
 
@@ -50,12 +48,13 @@ def by_one(values: Mapping[S, float]) -> dict[tuple[str, ...], float]:
 
 def cumulative(histogram: Histogram) -> tuple[list[tuple[str, float]], float]:
     """Return (upper bound, count up to it) and the sum of seconds, each bucket counted whole by its middle (2 %)."""
-    inside = np.bincount(_bucket_positions(), weights=histogram.counts, minlength=len(DURATION_BOUNDS_S) + 1)
+    inside = [0] * (len(DURATION_BOUNDS_S) + 1)
+    indices, counts, _ = histogram.to_sparse()
+    for index, count in zip(indices, counts, strict=True):
+        inside[_POSITIONS[index]] += count
     names = (*map(str, DURATION_BOUNDS_S), "+Inf")
-    return list(zip(names, inside.cumsum().tolist(), strict=True)), float(histogram.counts @ np.array(MIDS))
+    return list(zip(names, map(float, accumulate(inside)), strict=True)), histogram.sum_s()
 
 
-@functools.cache
-def _bucket_positions() -> NDArray[np.intp]:
-    """For each bucket of the histogram, which exported bucket it belongs to; the overflow to +Inf."""
-    return np.array([*np.searchsorted(DURATION_BOUNDS_S, MIDS[:-1]), len(DURATION_BOUNDS_S)])
+_POSITIONS = (*(bisect_left(DURATION_BOUNDS_S, middle) for middle in MIDS[:-1]), len(DURATION_BOUNDS_S))
+"""For each bucket of the histogram, which exported bucket it belongs to; the overflow to +Inf."""

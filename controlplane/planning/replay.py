@@ -6,7 +6,6 @@ import math
 import random
 import zlib
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,32 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.planning.traces import RecordedPaths
+    from controlplane.planning.workload import Workload
 
     Latencies = NDArray[np.float64]
-
-_P99 = NormalDist().inv_cdf(0.99)
-
-
-@dataclass(frozen=True, slots=True)
-class Compute:
-    """How long a server works on a request: log-normal, by its median and its 99th percentile, in seconds."""
-
-    median_s: float
-    p99_s: float
-
-    def draw(self, rng: random.Random) -> float:
-        """One request's time."""
-        return self.median_s * rng.lognormvariate(0.0, math.log(self.p99_s / self.median_s) / _P99)
-
-
-@dataclass(frozen=True, slots=True)
-class Workload:
-    """Requests of one size at a steady rate."""
-
-    request_bytes: int
-    answer_bytes: int
-    rate_hz: float
-    compute: Compute
 
 
 @dataclass(frozen=True, slots=True)

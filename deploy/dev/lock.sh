@@ -15,10 +15,17 @@ compile() {
 }
 
 compile --all-extras pyproject.toml --output-file requirements/dev.txt "$@"
-# The runtime alone, for a deployment whose rclpy comes from the system; the same versions as above.
-compile --constraint requirements/dev.txt pyproject.toml --output-file requirements/runtime.txt "$@"
-# The same with a ROS of its own.
-compile --constraint requirements/dev.txt --extra ros pyproject.toml --output-file requirements/runtime-ros.txt "$@"
+# One for each thing that is deployed, the same versions as above: the operator's `plr`, a robot or cloud whose rclpy
+# comes from apt, the same with a ROS of its own, the control plane.
+deployed() {
+  local name=$1
+  shift
+  compile --constraint requirements/dev.txt pyproject.toml --output-file "requirements/runtime$name.txt" "$@"
+}
+deployed "" "$@"
+deployed -sidecar --extra sidecar "$@"
+deployed -ros --extra sidecar --extra ros "$@"
+deployed -controlplane --extra controlplane "$@"
 # What installs the above: the installer, for pip to fetch, and what builds the packages that have no wheel.
 {
   grep '^uv==' requirements/constraints.txt

@@ -120,7 +120,7 @@ def test_help_and_version() -> None:
     assert shown.returncode == 0
     assert "examples:" in shown.stdout
     assert "exit codes:" in shown.stdout
-    assert re.fullmatch(r"plr-sidecar \S+\n", run("--version").stdout)
+    assert re.fullmatch(r"plr-sidecar \S+ \(protocol 3\)\n", run("--version").stdout)
 
 
 def test_the_schema_is_json() -> None:

@@ -15,8 +15,9 @@ from google.protobuf import json_format
 from controlplane.cli import main
 from controlplane.planning.prospects import Prospect, least_set, paths_needed
 from controlplane.planning.recorded import RecordedService
-from controlplane.planning.replay import Compute, ReplayedTraces, Workload, replay
+from controlplane.planning.replay import ReplayedTraces, replay
 from controlplane.planning.traces import COLUMNS, RecordedPaths, parse_trace
+from controlplane.planning.workload import Compute, Workload
 from protos.convert import explanation_to_proto
 from protos.explanation import SAMPLE, Belief, Correlation, Explanation, JointExplanation, PairExplanation
 from protos.histogram import Histogram

@@ -1,0 +1,29 @@
+"""`--version`, of all programs alike."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from protos import commit
+from protos.model import PROTOCOL_VERSION
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def describe(program: str) -> str:
+    """Return one line: the program, its version, the commit if that is known, and the protocol's version."""
+    return f"{program} {commit.version()} (protocol {PROTOCOL_VERSION})"
+
+
+class ShowVersion(argparse.Action):
+    """Prints the version and ends the program; asks for it only then."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str) -> None:
+        text = "show the version, the commit and the protocol, then exit"
+        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, default=argparse.SUPPRESS, help=text)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
+        """End the program."""
+        parser.exit(message=f"{describe(parser.prog)}\n")
