@@ -331,6 +331,12 @@ class ControlLoop:
         """Count a connection or call that was refused or ended, by one of metrics.REFUSAL_REASONS."""
         self._metrics.refused_connection(reason)
 
+    def unknown_message(self, peer: str, problem: str, *, again: bool) -> None:
+        """Count a message that was left out; `again`: not the first of its stream, whose line stands in the log."""
+        self._metrics.unknown_messages.inc()
+        if not again and self._ended_lines.take(self._loop.time()):
+            log.info("stream of %s: left out %s", peer, problem)
+
     def stream_ended(self, peer: str, code: str, details: str) -> None:
         """A stream was ended by us; `peer` is where it came from."""
         self._metrics.streams_ended.labels(code).inc()

@@ -92,6 +92,11 @@ class Metrics:
             ["code"],
             registry=self.registry,
         )
+        self.unknown_messages = prometheus_client.Counter(
+            "plr_unknown_messages_total",
+            "Messages of sidecars left out since only a newer control plane knows their kind.",
+            registry=self.registry,
+        )
         self._refused_connections = prometheus_client.Counter(
             "plr_refused_connections_total",
             "Connections and calls refused or ended because of who makes them or how, by reason.",

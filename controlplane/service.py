@@ -14,9 +14,10 @@ from controlplane.core.registry import Refusal
 from controlplane.limits import MAX_STREAMS_PER_NAME, TOO_FAST, TOO_MANY_STREAMS, StreamCount, StreamRate
 from controlplane.stream_encoder import StreamEncoder
 from protos.convert import parse_sidecar_message
-from protos.errors import DecodeError
-from protos.model import PROTOCOL_VERSION, Registration
+from protos.errors import DecodeError, UnknownKindError
+from protos.model import Heartbeat, Registration
 from protos.plr.v1 import control_pb2
+from protos.protocol_versions import Spoken, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -159,14 +160,20 @@ class ControlPlaneService:
         return data
 
     async def _read(self, stream: StreamId, context: Context) -> NoReturn:
+        told = False
         rate = StreamRate(report_interval_s=self._report_interval_s, now=time.monotonic())
         while True:
             data = await self._receive(context)
             if not rate.take(len(data), time.monotonic()):
                 self._loop.refused(TOO_FAST)
                 raise _StreamEndError(grpc.StatusCode.RESOURCE_EXHAUSTED, "messages come too fast")
-            message = _parse(data)
             try:
+                message: SidecarMessage = Heartbeat()
+                try:
+                    message = parse_sidecar_message(data)
+                except UnknownKindError as error:
+                    self._loop.unknown_message(context.peer(), str(error), again=told)
+                    told = True
                 self._loop.receive(stream, message)
             except DecodeError as error:
                 raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, str(error)) from error
@@ -197,9 +204,9 @@ def _check_protocol_version(data: bytes) -> None:
         message = control_pb2.SidecarMessage.FromString(data)
     except ProtobufDecodeError:
         return
-    version = message.register.protocol_version
-    if message.HasField("register") and version != PROTOCOL_VERSION:
-        raise _StreamEndError(
-            grpc.StatusCode.FAILED_PRECONDITION,
-            f"protocol version {version} is not {PROTOCOL_VERSION}, which this control plane speaks",
-        )
+    if not message.HasField("register"):
+        return
+    oldest = message.register.protocol_version
+    problem = refusal(Spoken(oldest, message.register.newest_protocol_version or oldest))
+    if problem is not None:
+        raise _StreamEndError(grpc.StatusCode.FAILED_PRECONDITION, problem)

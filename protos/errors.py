@@ -7,6 +7,10 @@ class DecodeError(ValueError):
     """Bytes or messages from the network break their format; the text tells which rule of it."""
 
 
+class UnknownKindError(DecodeError):
+    """A message of a kind that only a newer program knows: to be left out, and no reason to end anything."""
+
+
 class ConfigError(ValueError):
     """A configuration is refused; the text is one line that names the file, the key and what was expected."""
 

@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from protos.preferences import InterfaceLabel
 
 PROTOCOL_VERSION = 3
+"""The newest that is spoken here."""
+
+OLDEST_PROTOCOL_VERSION = 3
+"""The oldest: the one before the newest. Nothing that spoke 2 was ever let out."""
+
 """Version of the control stream and of the datagram layout; peers of another version are refused."""
 
 NodeName = NewType("NodeName", str)
@@ -262,6 +267,7 @@ class Registration:
     """What a sidecar says of itself first on its stream."""
 
     protocol_version: int
+    """The oldest that it speaks."""
     name: NodeName
     role: Role
     session: SessionId
@@ -276,6 +282,8 @@ class Registration:
     """Of a cloud: where it stands; clouds with the same one fail together. Empty: not known."""
     incremental: bool = False
     """It takes changes of its peers, and sets in several messages."""
+    newest_protocol_version: int = 0
+    """0: it speaks one alone."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ import grpc
 
 from protos import tls_advice
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
-from protos.errors import DecodeError
+from protos.errors import DecodeError, UnknownKindError
 from protos.model import PeerSet, Report, ResourceKind, ServiceSet, Welcome
 from protos.names import clean_text
 from protos.plr.v1 import control_pb2_grpc
@@ -333,6 +333,10 @@ class ControlClient:
     def _on_message(self, message: control_pb2.ControlMessage) -> None:
         try:
             value = control_message_from_proto(message)
+        except UnknownKindError as error:
+            if self._session.unknown() == 1:
+                log.info("left out %s", error)
+            return
         except DecodeError as error:
             resource, nonce = _what_it_was(message)
             self._refusals.refused(resource, "a message of the control plane", str(error))

@@ -15,6 +15,7 @@ from protos.config_fields import split_host_port
 from protos.errors import StartError
 from protos.model import (
     MAX_UNMET,
+    OLDEST_PROTOCOL_VERSION,
     PROTOCOL_VERSION,
     CandidateKind,
     Registration,
@@ -124,7 +125,8 @@ class Sidecar:
         last = self._store.last_good
         self._control_session = ControlSession(
             Registration(
-                protocol_version=PROTOCOL_VERSION,
+                protocol_version=OLDEST_PROTOCOL_VERSION,
+                newest_protocol_version=PROTOCOL_VERSION,
                 name=config.node_name,
                 role=config.role,
                 session=own.credential.session,

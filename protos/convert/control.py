@@ -38,7 +38,7 @@ from protos.convert.types import (
     use_from_proto,
     use_to_proto,
 )
-from protos.errors import DecodeError
+from protos.errors import DecodeError, UnknownKindError
 from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import (
     MAX_PEERS,
@@ -136,7 +136,14 @@ def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMe
         case "revocations":
             return revocations_from_proto(message.revocations)
         case _:
-            raise DecodeError("sidecar message of no known kind")
+            raise _of_no_kind(message)
+
+
+def _of_no_kind(message: control_pb2.SidecarMessage | control_pb2.ControlMessage) -> DecodeError:
+    # protobuf keeps the bytes of fields that it does not know.
+    if message.ByteSize():
+        return UnknownKindError("a message of no known kind: its sender is newer")
+    return DecodeError("a message of no known kind: empty")
 
 
 def revocations_from_proto(message: control_pb2.Revocations) -> RevocationSet:
@@ -205,7 +212,7 @@ def control_message_from_proto(message: control_pb2.ControlMessage) -> ControlMe
         case "mapping":
             return mapping_set_from_proto(message.mapping)
         case _:
-            raise DecodeError("control message of no known kind")
+            raise _of_no_kind(message)
 
 
 def control_message_to_proto(value: ControlMessage) -> control_pb2.ControlMessage:
@@ -263,6 +270,7 @@ def _registration_from_proto(message: control_pb2.Register) -> Registration:
         credential=credential_from_proto(message.credential),
         region=domain_label(message.region, "region"),
         incremental=message.incremental,
+        newest_protocol_version=message.newest_protocol_version,
     )
 
 
@@ -280,6 +288,7 @@ def _registration_to_proto(value: Registration) -> control_pb2.Register:
         credential=value.credential,
         region=value.region,
         incremental=value.incremental,
+        newest_protocol_version=value.newest_protocol_version,
     )
 
 
@@ -336,5 +345,6 @@ def peer_set_header_to_proto(value: PeerSet) -> control_pb2.PeerSet:
 def _removed_from_proto(message: control_pb2.RemovedPeer) -> RemovedPeer:
     return RemovedPeer(
         name=node_name(message.name, "removed peer"),
-        reason=known(message.reason, _REASONS, "removal reason"),
+        # One that only a newer control plane knows may be as grave as any: the peer goes, whatever its paths prove.
+        reason=_REASONS.get(message.reason, RemovalReason.FORBIDDEN),
     )

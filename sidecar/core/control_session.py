@@ -307,6 +307,11 @@ class ControlSession:
         if resource is not None:
             self._nack(resource, nonce, error)
 
+    def unknown(self) -> int:
+        """A message was left out that only a newer sidecar knows; returns how many were."""
+        self.stats.ignored["unknown_kind"] += 1
+        return self.stats.ignored["unknown_kind"]
+
     def _ack(self, resource: ResourceKind, nonce: int) -> None:
         self.stats.acks[resource] += 1
         self._answers[resource] = Ack(resource, self._in_force[resource], nonce)

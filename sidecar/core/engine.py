@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from protos.errors import DecodeError
+from protos.errors import DecodeError, UnknownKindError
 from protos.model import MAX_PEERS, MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.attention import Attention
 from sidecar.core.backlog import SLICE, Backlog, Step, rest
@@ -420,6 +420,9 @@ class Engine:
     def _on_message(self, path: PathId, content: memoryview, ends_at: float, now: float) -> None:
         try:
             message = decode_message(content)
+        except UnknownKindError:
+            self.stats.dropped["unknown_message"] += 1
+            return
         except DecodeError:
             self.stats.dropped["malformed_message"] += 1
             return

@@ -51,7 +51,7 @@ import struct
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
-from protos.model import PROTOCOL_VERSION, InterfaceId, SessionId
+from protos.model import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, InterfaceId, SessionId
 from sidecar.core import pmtu
 from sidecar.core.aead import NONCE_BYTES, TAG_BYTES
 
@@ -59,6 +59,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 FIRST_BYTE = 0xD0 | PROTOCOL_VERSION
+FIRST_BYTES = frozenset(0xD0 | version for version in range(OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION + 1))
+"""Of the versions that are understood: they have one layout."""
 SEALED_FLAG, PHASE_FLAG, INTRODUCTION_FLAG = 1, 2, 4
 _KNOWN_FLAGS = frozenset({SEALED_FLAG, SEALED_FLAG | PHASE_FLAG, SEALED_FLAG | INTRODUCTION_FLAG})
 HEADER = struct.Struct(">BBBBQQ")
@@ -225,7 +227,7 @@ def decode_header(data: bytes | memoryview) -> Header:
     if len(data) < HEADER_BYTES:
         raise DecodeError("short datagram")
     first, flags, sender, receiver, session, packet_number = HEADER.unpack_from(data)
-    if first != FIRST_BYTE:
+    if first not in FIRST_BYTES:
         if first & 0xF0 == FIRST_BYTE & 0xF0:
             raise VersionError(f"protocol version {first & 0x0F}, ours is {PROTOCOL_VERSION}")
         raise DecodeError("not one of our datagrams")

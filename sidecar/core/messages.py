@@ -26,7 +26,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.errors import DecodeError
+from protos.errors import DecodeError, UnknownKindError
 from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import ServiceName
 from protos.names import clean_text
@@ -177,7 +177,8 @@ def decode_message(view: memoryview) -> Message:
     """Parse a reassembled message; payloads view the buffer.
 
     Raises:
-        DecodeError: the bytes are not a message that we know.
+        UnknownKindError: a message that only a newer sidecar knows.
+        DecodeError: anything else that is not a message.
     """
     if len(view) and view[0] in _ABOUT_REVOCATIONS:
         return _decode_about_revocations(view)
@@ -185,7 +186,7 @@ def decode_message(view: memoryview) -> Message:
         kind, request_id, copy = _HEAD.unpack_from(view)
         decode = _DECODERS.get(kind)
         if decode is None:
-            raise DecodeError(f"unknown message kind {kind}")
+            raise UnknownKindError(f"a message of no known kind, {kind}: its sender is newer")
         return decode(RequestId(request_id), copy, view, _HEAD.size)
     except struct.error:
         raise DecodeError("truncated message") from None
@@ -216,7 +217,8 @@ def _decode_rejection(request_id: RequestId, copy: int, view: memoryview, positi
     try:
         reason = RejectReason(view[position])
     except ValueError:
-        raise DecodeError("unknown reason of a rejection") from None
+        # Of a newer server: it may have run, and so no other may.
+        reason = RejectReason.SERVER_LOST
     text, position = _decode_text(view, position + 1, MAX_TEXT_BYTES, errors="replace")
     return RejectionMessage(request_id, copy, reason, clean_text(text))
 

@@ -234,6 +234,21 @@ def test_a_malformed_push_is_nacked_by_its_nonce(server: ScriptedControlPlane, r
     assert rig.client.stats.ignored["undecodable"] == 2
 
 
+@pytest.mark.audit("ops-10")
+def test_what_a_newer_control_plane_says_is_left_out(
+    server: ScriptedControlPlane, rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    rig.client.start()
+    rig.hooks.expect_connection(True)
+    for _ in range(2):
+        server.say_raw(control_pb2.ControlMessage.FromString(b"\xaa\x06\x02hi"))  # field 101
+    server.say(PeerSet(Version(41), nonce=9))
+    assert server.expect(Ack) == Ack(ResourceKind.PEERS, Version(41), 9)
+    assert rig.client.stats.ignored == {"unknown_kind": 2}
+    assert sum("left out" in message for message in caplog.messages) == 1
+
+
 def test_sends_reports_while_there_is_something_to_report(server: ScriptedControlPlane, rig: Rig) -> None:
     rig.hooks.report = Report(outcomes=(OutcomeReport(ServiceName("/plan"), ok=3),))
     rig.client.start()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import grpc
 import pytest
@@ -36,11 +37,15 @@ def raw_register(**changes: object) -> control_pb2.SidecarMessage:
     ("message", "code", "details"),
     [
         (
-            raw_register(protocol_version=1),
+            raw_register(protocol_version=1, newest_protocol_version=0),
             grpc.StatusCode.FAILED_PRECONDITION,
-            f"protocol version 1 is not {PROTOCOL_VERSION}",
+            f"the sidecar speaks protocol version 1, this control plane {PROTOCOL_VERSION}: upgrade the sidecar",
         ),
-        (raw_register(protocol_version=99, name="\x00"), grpc.StatusCode.FAILED_PRECONDITION, "protocol version 99"),
+        (
+            raw_register(protocol_version=98, newest_protocol_version=99, name="\x00"),
+            grpc.StatusCode.FAILED_PRECONDITION,
+            "protocol version 98 to 99, this control plane 3: upgrade the control plane",
+        ),
         (raw_register(name="no spaces, please"), grpc.StatusCode.INVALID_ARGUMENT, "name 'no spaces, please' is not"),
         (raw_register(name="../../etc"), grpc.StatusCode.INVALID_ARGUMENT, "name"),
         (raw_register(token=b"short"), grpc.StatusCode.INVALID_ARGUMENT, "token has 5 bytes, not 16"),
@@ -88,6 +93,20 @@ def test_bytes_that_are_no_message_get_a_clear_status(plane: ControlPlaneProcess
             with pytest.raises(grpc.RpcError):
                 list(call)
             assert call.code() is grpc.StatusCode.INVALID_ARGUMENT
+
+
+@pytest.mark.audit("ops-10")
+def test_what_a_newer_sidecar_says_ends_no_stream(plane: ControlPlaneProcess) -> None:
+    newer = registration("newer")
+    newer = replace(newer, newest_protocol_version=PROTOCOL_VERSION + 1)
+    with Sidecar(plane.address, newer) as sidecar:
+        sidecar.expect(Welcome)
+        before = len(plane.lines)
+        for _ in range(3):
+            sidecar.send_raw(control_pb2.SidecarMessage.FromString(b"\xaa\x06\x02hi"))  # field 101
+        plane.wait_for_line("left out a message of no known kind", after=before)
+        assert plane.status()["newer"].connected
+        assert sum("left out" in line for line in plane.lines[before:]) == 1
 
 
 def test_a_stream_that_ends_before_it_registers_is_no_error(plane: ControlPlaneProcess) -> None:

@@ -152,7 +152,9 @@ class Register(_message.Message):
     CREDENTIAL_FIELD_NUMBER: _builtins.int
     REGION_FIELD_NUMBER: _builtins.int
     INCREMENTAL_FIELD_NUMBER: _builtins.int
+    NEWEST_PROTOCOL_VERSION_FIELD_NUMBER: _builtins.int
     protocol_version: _builtins.int
+    """The oldest version that the sidecar speaks: an older control plane looks at this one alone."""
     name: _builtins.str
     role: _types_pb2.Role.ValueType
     session: _builtins.int
@@ -169,6 +171,8 @@ class Register(_message.Message):
     """Of a cloud: where it stands; clouds with the same one fail together. Empty: not known."""
     incremental: _builtins.bool
     """It takes changes (PeerSet.base_version) and sets in several messages (PeerSet.more)."""
+    newest_protocol_version: _builtins.int
+    """The newest that it speaks; 0: only the one above."""
     def __init__(
         self,
         *,
@@ -184,10 +188,11 @@ class Register(_message.Message):
         credential: _builtins.bytes = ...,
         region: _builtins.str = ...,
         incremental: _builtins.bool = ...,
+        newest_protocol_version: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["credential", b"credential", "incarnation", b"incarnation", "incremental", b"incremental", "mapping_version", b"mapping_version", "name", b"name", "peers_version", b"peers_version", "protocol_version", b"protocol_version", "region", b"region", "role", b"role", "session", b"session", "software_version", b"software_version", "token", b"token"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["credential", b"credential", "incarnation", b"incarnation", "incremental", b"incremental", "mapping_version", b"mapping_version", "name", b"name", "newest_protocol_version", b"newest_protocol_version", "peers_version", b"peers_version", "protocol_version", b"protocol_version", "region", b"region", "role", b"role", "session", b"session", "software_version", b"software_version", "token", b"token"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -32,6 +32,7 @@ class ControlPlaneStub:
     whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
     takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
     sent again every few seconds, whole and as a new version: the cause may have passed.
+    A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 
     def __init__(self, channel):
@@ -54,6 +55,7 @@ class ControlPlaneServicer:
     whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
     takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
     sent again every few seconds, whole and as a new version: the cause may have passed.
+    A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 
     def Connect(self, request_iterator, context):
@@ -85,6 +87,7 @@ class ControlPlane:
     whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
     takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
     sent again every few seconds, whole and as a new version: the cause may have passed.
+    A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 
     @staticmethod

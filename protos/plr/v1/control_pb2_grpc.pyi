@@ -33,6 +33,7 @@ class ControlPlaneStub:
     whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
     takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
     sent again every few seconds, whole and as a new version: the cause may have passed.
+    A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 
     @_typing.overload
@@ -49,6 +50,7 @@ class ControlPlaneAsyncStub(ControlPlaneStub):
     whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
     takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
     sent again every few seconds, whole and as a new version: the cause may have passed.
+    A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 
     def __init__(self, channel: _aio.Channel) -> None: ...
@@ -61,6 +63,7 @@ class ControlPlaneServicer(metaclass=_abc_1.ABCMeta):
     whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
     takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
     sent again every few seconds, whole and as a new version: the cause may have passed.
+    A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 
     @_abc_1.abstractmethod

@@ -30,7 +30,7 @@ from protos.convert import (
     status_to_proto,
 )
 from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_VERSION
-from protos.errors import DecodeError
+from protos.errors import DecodeError, UnknownKindError
 from protos.fleet_events import EventList
 from protos.model import (
     ALL_CALLS,
@@ -47,6 +47,8 @@ from protos.model import (
     Nack,
     NodeName,
     Peer,
+    PeerSet,
+    RemovalReason,
     ResourceKind,
     RevocationSet,
     Role,
@@ -319,6 +321,30 @@ def test_a_broken_rule_is_named(message: control_pb2.SidecarMessage, field: str)
 PAIR = control_pb2.Assignment(interface="w", server="a")
 
 
+@pytest.mark.audit("ops-10")
+def test_what_only_a_newer_program_knows_is_told_from_what_is_broken() -> None:
+    later = b"\xaa\x06\x02hi"  # field 101
+    for parse in (parse_sidecar_message, parse_control_message):
+        with pytest.raises(UnknownKindError, match="its sender is newer"):
+            parse(later)
+        with pytest.raises(DecodeError, match="empty") as broken:
+            parse(b"")
+        assert not isinstance(broken.value, UnknownKindError)
+    known = register()
+    more = control_pb2.Register.FromString(known.register.SerializeToString() + later)
+    said = sidecar_message_from_proto(control_pb2.SidecarMessage(register=more))
+    assert said == sidecar_message_from_proto(known), "a field that is not known is left out"
+
+
+@pytest.mark.audit("ops-10")
+def test_a_removal_for_a_reason_that_is_not_known_lets_no_path_go_on() -> None:
+    gone = control_pb2.RemovedPeer(name="a")
+    gone.MergeFromString(b"\x10\x63")  # reason 99
+    told = control_message_from_proto(control_pb2.ControlMessage(peers=control_pb2.PeerSet(removed=[gone])))
+    assert isinstance(told, PeerSet)
+    assert [removed.reason for removed in told.removed] == [RemovalReason.FORBIDDEN]
+
+
 def mapping(**changes: Any) -> control_pb2.ControlMessage:
     made = control_pb2.ServiceMapping(**({"service": "/plan"} | changes))
     return control_pb2.ControlMessage(mapping=control_pb2.MappingSet(version=1, services=[made]))
@@ -336,10 +362,6 @@ def mapping(**changes: Any) -> control_pb2.ControlMessage:
         (mapping(assignments=[PAIR] * 2), "assignments"),
         (mapping(assignments=[PAIR], explore=PAIR), "assignments and explore"),
         (mapping(explore=control_pb2.Assignment(interface="w")), "server"),
-        (
-            control_pb2.ControlMessage(peers=control_pb2.PeerSet(removed=[control_pb2.RemovedPeer(name="a")])),
-            "removal reason",
-        ),
         (
             control_pb2.ControlMessage(
                 peers=control_pb2.PeerSet(removed=[control_pb2.RemovedPeer(name="a", reason=LEFT)] * 2)

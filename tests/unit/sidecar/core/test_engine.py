@@ -187,7 +187,7 @@ def test_messages_of_the_wrong_direction_or_broken_ones_are_dropped_and_counted(
         (robot(), request(), "request_to_a_robot"),
         (robot(), CancelMessage(request_id(1)), "cancel_to_a_robot"),
         (cloud(), ResponseMessage(request_id(1), 0, 0.0, b""), "response_to_a_cloud"),
-        (cloud(), b"\xff" * 40, "malformed_message"),
+        (cloud(), b"\xff" * 40, "unknown_message"),
         (robot(), b"", "malformed_message"),
     ):
         sidecar.receive(message)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.errors import DecodeError
+from protos.errors import DecodeError, UnknownKindError
 from protos.model import ServiceName
 from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.messages import (
@@ -61,17 +61,24 @@ def test_a_message_cut_within_its_head_is_refused(kind: str) -> None:
 
 def test_other_kinds_reasons_and_text_are_refused() -> None:
     for bad in (
-        "08" + ID.hex() + "00",
         "05" + "11" + 17 * 16 * "00",
         "05" + "01" + 15 * "00",
         "06" + "01" + 17 * "00",
         "05",
-        "03" + ID.hex() + "00 ff 0000",
         "01" + ID.hex() + "00 00 00000000 00000000 0001 ff 0000",
         "01" + ID.hex() + "00 03 00000000 00000000 0001 61 0000",
     ):
         with pytest.raises(DecodeError):
             decode_message(memoryview(bytes.fromhex(bad)))
+
+
+@pytest.mark.audit("ops-10")
+def test_what_only_a_newer_sidecar_knows_is_told_from_what_is_broken() -> None:
+    with pytest.raises(UnknownKindError, match="kind, 8: its sender is newer"):
+        decode_message(memoryview(bytes.fromhex("08" + ID.hex() + "00")))
+    refused = decode_message(memoryview(bytes.fromhex("03" + ID.hex() + "00 ff 0000")))
+    assert isinstance(refused, RejectionMessage)
+    assert not refused.reason.certainly_not_run, "it may have run there, and must not run elsewhere"
 
 
 def test_a_payload_over_the_limit_is_refused() -> None:
