@@ -26,7 +26,9 @@ deployed "" "$@"
 deployed -sidecar --extra sidecar "$@"
 deployed -ros --extra sidecar --extra ros "$@"
 deployed -controlplane --extra controlplane "$@"
-# What installs the above: the installer, for pip to fetch, and what builds the packages that have no wheel.
+# What builds the packages that have no wheel, and ours.
+echo setuptools | compile --constraint requirements/dev.txt - --output-file requirements/build.txt "$@"
+# The same with the installer of a checkout, for pip to fetch.
 {
   grep '^uv==' requirements/constraints.txt
   echo setuptools

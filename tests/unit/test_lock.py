@@ -13,7 +13,13 @@ from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-LOCKS = ("dev.txt", "runtime.txt", "runtime-ros.txt", "bootstrap.txt")
+RUNTIMES = {
+    "runtime.txt": [],
+    "runtime-sidecar.txt": ["sidecar"],
+    "runtime-ros.txt": ["sidecar", "ros"],
+    "runtime-controlplane.txt": ["controlplane"],
+}
+LOCKS = ("dev.txt", *RUNTIMES, "build.txt", "bootstrap.txt")
 PIN = re.compile(r"^([A-Za-z0-9._-]+)(?:\[[^]]*\])?==(\S+)(?: ; (.*?))? \\$", re.MULTILINE)
 
 Pins = dict[str, set[Version]]
@@ -44,18 +50,23 @@ def test_everything_asked_for_is_locked() -> None:
     assert not unmet(asked, pins("dev.txt")), "run: make lock"
 
 
-def test_the_runtime_is_locked_at_the_same_versions() -> None:
-    runtime, everything = pins("runtime.txt"), pins("dev.txt")
-    assert not unmet(PROJECT["dependencies"], runtime), "run: make lock"
-    assert all(everything[package] == versions for package, versions in runtime.items())
-    assert not any(package.startswith("ros-") for package in runtime)
-
-
-def test_the_runtime_with_ros_is_locked_at_the_same_versions() -> None:
-    asked = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["ros"]]
-    runtime, everything = pins("runtime-ros.txt"), pins("dev.txt")
+@pytest.mark.parametrize("lock", RUNTIMES)
+def test_each_runtime_is_locked_at_the_same_versions(lock: str) -> None:
+    asked = [*PROJECT["dependencies"]]
+    for extra in RUNTIMES[lock]:
+        asked += PROJECT["optional-dependencies"][extra]
+    runtime, everything = pins(lock), pins("dev.txt")
     assert not unmet(asked, runtime), "run: make lock"
     assert all(everything[package] == versions for package, versions in runtime.items())
+
+
+@pytest.mark.audit("ops-9")
+def test_a_robot_installs_no_solver_and_beside_a_ros_of_its_own_nothing_of_ros() -> None:
+    for lock in ("runtime-sidecar.txt", "runtime-ros.txt"):
+        assert not {"ortools", "pandas"} & pins(lock).keys()
+    own = pins("runtime-sidecar.txt")
+    assert "numpy" not in own, "it would hide the one that apt's ROS was built with"
+    assert not any(package.startswith("ros-") for package in own)
 
 
 def test_what_is_not_locked_is_noticed() -> None:
