@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-DISTRIBUTION = "fogros2-plr"
 SIDECAR = ("prometheus_client", "pyroute2", "sdnotify", "zfec")
 CONTROL_PLANE = ("grpc_health", "grpc_reflection", "numpy", "ortools", "prometheus_client", "sdnotify")
 PLAN = ("numpy",)
@@ -19,4 +18,4 @@ def missing(extra: str, modules: Sequence[str]) -> str | None:
     absent = [module for module in modules if importlib.util.find_spec(module) is None]
     if not absent:
         return None
-    return f"{', '.join(absent)} not installed; run: pip install '{DISTRIBUTION}[{extra}]'"
+    return f"{', '.join(absent)} not installed: needs the extra {extra}; in the checkout: pip install '.[{extra}]'"
