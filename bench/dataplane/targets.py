@@ -32,7 +32,7 @@ TARGETS = (
     Target("proxied_over_direct_150k", "the same with 150 kB", at_most=7),
     Target("blackhole_lost", "requests lost after one of two paths went silent", at_most=0),
     Target("blackhole_p99_ms", "P99 of the requests after it", at_most=3),
-    Target("blackhole_mptcp_worst_over_ours", "worst of the kernel's multipath TCP over our P99", at_least=20),
+    Target("blackhole_mptcp_worst_over_ours", "worst of the kernel's multipath TCP over our worst", at_least=20),
     Target("fec_p99_over_lossfree_2pct", "2 % loss, FEC auto: P99 over that without loss", at_most=1.15),
     Target(
         "arq_p99_minus_lossfree_ms_2pct",

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING
 from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, table_of
-from bench.dataplane.statistics import Calls, Row, interval, median, p99, ratio, worst
+from bench.dataplane.statistics import Calls, Row, interval, median, median_ratio, p99, ratio, worst
 from bench.dataplane.steady import awake, realtime
 from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, SilentCut, allow_multipath, cables
 from bench.netlab import Lab
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
 
     from bench.dataplane.section import Context
     from bench.netlab import Host
@@ -87,15 +87,19 @@ def measure(context: Context) -> Findings:
     rows = {key: [calls.between(cut).row(NAMES[key]) for calls, cut in repeats] for key, repeats in runs.items()}
     figures = _figures(rows)
     ours = [value for calls, cut in runs.get("blackhole", []) for value in calls.between(cut).answered_ms()]
-    theirs = [row.max_ms for row in rows.get("mptcp", []) if row.max_ms is not None]
+    theirs = [value for calls, cut in runs.get("mptcp", []) for value in calls.between(cut).answered_ms()]
+    our_worsts, their_worsts = (
+        [row.max_ms for row in rows.get(key, []) if row.max_ms is not None] for key in ("blackhole", "mptcp")
+    )
     figures["blackhole_p99_ms"] = p99(ours)
-    figures["blackhole_mptcp_worst_over_ours"] = _median_over_p99(theirs, ours)
+    figures["blackhole_mptcp_p99_over_ours"] = ratio(p99(theirs), p99(ours))
+    figures["blackhole_mptcp_worst_over_ours"] = median_ratio(their_worsts, our_worsts)
     lines = {NAMES[key]: repeats[-1][0].line(repeats[-1][1]) for key, repeats in runs.items()}
     return Findings(
         figures=figures,
         intervals={
             "blackhole_p99_ms": interval(p99, ours),
-            "blackhole_mptcp_worst_over_ours": interval(_median_over_p99, theirs, ours),
+            "blackhole_mptcp_worst_over_ours": interval(median_ratio, their_worsts, our_worsts),
         },
         tables=[table_of("requests after the cut", [Row.of_repeats(repeats) for repeats in rows.values()])],
         plots=[Plot("last repeat", "seconds after the cut", "latency, ms", lines=lines, log_y=True)],
@@ -113,14 +117,10 @@ def _figures(rows: dict[str, list[Row]]) -> dict[str, Figure]:
     figures["mptcp_worst_ms"] = figures.pop("mptcp_max_ms")
     figures["blackhole_p99_ms_of_repeats"] = figures["blackhole_p99_ms"]
     figures["blackhole_mptcp_worst_over_ours_of_repeats"] = median(
-        ratio(theirs.max_ms, ours.p99_ms)
+        ratio(theirs.max_ms, ours.max_ms)
         for theirs, ours in zip(rows.get("mptcp", []), rows.get("blackhole", []), strict=False)
     )
     return figures
-
-
-def _median_over_p99(worsts: Sequence[float], ours: Sequence[float]) -> float | None:
-    return ratio(median(worsts), p99(ours))
 
 
 def _run(world: World, client: Remote) -> tuple[Calls, float]:
