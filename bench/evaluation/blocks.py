@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from bench.evaluation import repeats
-from bench.evaluation.comparison import DIRECT
-from bench.evaluation.others import BETTER_DIRECT, OTHERS, PLR
+from bench.evaluation.comparison import DIRECT, IDEAL, SUREST
+from bench.evaluation.ideal import ORACLE
+from bench.evaluation.others import BETTER_DIRECT, OTHERS
 from bench.evaluation.outcome import UNANSWERED_S
 from bench.evaluation.repeats import Repeat, Repeats
 from bench.evaluation.studies import CASES
@@ -27,7 +28,8 @@ LIKE = {
     "mptcp": "`mptcp`: the kernel's multipath TCP",
     "zenoh": "`zenoh` over both, first reply",
     "zenoh-drop": "`zenoh-drop`: the same, dropping what finds its queue full",
-    "ideal": "`ideal`: the faster of two first-in-first-out paths for each request",
+    "oracle": "`oracle`: knows the trace, shares each request out over both paths",
+    "ideal": "`ideal`, no bound: the faster of two first-in-first-out paths for each request",
 }
 _NOTHING: Content = {}
 
@@ -38,37 +40,104 @@ def all_blocks(content: Content) -> dict[str, str]:
 
 
 def _drives(content: Content) -> str:
-    study = content.get("studies", _NOTHING).get(DRIVES, _NOTHING)
-    if not study.get("windows"):
+    found = content.get("everywhere")
+    return _same_drives(content, found[0]) if found else NOTHING
+
+
+def _modes_drives(content: Content) -> str:
+    found = content.get("everywhere")
+    if not found:
         return NOTHING
-    names = (BETTER_DIRECT, *OTHERS, *PLR, "ideal")
-    found = {name: study["contenders"][name] for name in names if name in study["contenders"]}
-    columns = ("", "missed", "mean", "P99, median drive", "kB a request")
-    rows = tuple((_label(name), *_figures(one, one["median_p99_ms"])) for name, one in found.items())
-    drives, requests = len(study["windows"]), next(iter(found.values()))["requests"]
-    text = f"{drives} drives, {requests} requests each. {_UNANSWERED}\n\n{table_as_markdown(Table('', columns, rows))}"
-    gains = [_number(content.get(key)) for key in ("mean_gain", "p99_gain")]
-    if NOT_MEASURED not in gains:
-        counted = content["from"]["mean_gain"]
-        text += (
-            f"\nThe mean of `plr-replicate` is {gains[0]} times lower than that of the better direct run, its P99 "
-            f"{gains[1]} times (medians of the {counted})."
+    return _same_drives(content, found[1]) if len(found) > 1 else "Every mode ran in every window, or none did."
+
+
+def _same_drives(content: Content, one: Mapping[str, Any]) -> str:
+    found: Mapping[str, Mapping[str, Any]] = one["contenders"]
+    windows, hard = one["windows"], one["hard_windows"]
+    requests = next(iter(found.values()))["requests"]
+    if windows == content["everywhere"][0]["windows"]:
+        about = f"All {len(windows)} windows of recorded drives, {requests} requests each{_distinct(content)}."
+    else:
+        about = f"The {len(windows)} windows in which every mode ran; a direct run misses something in {hard} of them."
+    columns = ("", "missed", "each drive alike", "never answered", "mean", "P50", "P99", "P99, median window", "kB")
+    rows = tuple(
+        (
+            _label(name),
+            _percent(figures["miss_ratio"]),
+            "-" if figures["distinct_miss_ratio"] is None else _percent(figures["distinct_miss_ratio"]),
+            _percent(figures["unanswered_ratio"]),
+            *(_time(figures[key]) for key in ("mean_ms", "p50_ms", "p99_ms", "median_p99_ms")),
+            _kilobytes(figures),
         )
-    return text
+        for name, figures in found.items()
+        if name != ORACLE
+    )
+    gains = [_number(one[key]) for key in ("median_mean_gain", "median_p99_gain")]
+    return (
+        f"{about} {_UNANSWERED}\n\n{table_as_markdown(Table('', columns, rows))}"
+        f"\nHow many times lower than that of the better direct run of the same window, median of the {len(windows)}: "
+        f"`{SUREST}`'s mean {gains[0]}, its P99 {gains[1]}.{_beside_oracle(found)}"
+    )
+
+
+def _beside_oracle(found: Mapping[str, Mapping[str, Any]]) -> str:
+    if ORACLE not in found:
+        return ""
+    ours, least = (found[name]["miss_ratio"] for name in (SUREST, ORACLE))
+    times = f", {least / ours * 100:.0f} % of what `{SUREST}` misses" if ours else ""
+    return (
+        f"\nAn oracle that knows what each path will bear, and shares every request out over both, misses "
+        f"{_percent(least)}{times}."
+    )
+
+
+def _oracle(content: Content) -> str:
+    everywhere = content.get("everywhere")
+    if not everywhere or ORACLE not in everywhere[0]["contenders"]:
+        return NOTHING
+    found = everywhere[0]["contenders"]
+    rows = tuple(
+        (_label(name), round(found[name]["miss_ratio"] * found[name]["requests"]), _percent(found[name]["miss_ratio"]))
+        for name in (IDEAL, SUREST, ORACLE)
+    )
+    columns = (f"all {len(everywhere[0]['windows'])} recorded drives", f"missed of {found[SUREST]['requests']}", "")
+    return table_as_markdown(Table("", columns, rows))
+
+
+def _distinct_drives(content: Content) -> str:
+    drives = content.get("drives")
+    if drives is None:
+        return "Not looked at: `python -m bench report --traces FOLDER`."
+    rows = tuple(
+        (number, ", ".join(f"`{name}`" for name in names)) for number, names in enumerate(drives["distinct"], 1)
+    )
+    windows = sum(map(len, drives["distinct"]))
+    about = f"{windows} windows, {len(rows)} drives, {drives['recordings']} recordings"
+    return f"{about}:\n\n{table_as_markdown(Table('', ('drive', 'windows that share half or more of it'), rows))}"
+
+
+def _distinct(content: Content) -> str:
+    drives = content.get("drives")
+    if drives is None:
+        return "; which of them are one drive was not looked at"
+    count, recordings = len(drives["distinct"]), drives["recordings"]
+    return (
+        f"; only {count} of them are distinct drives, from {recordings} recordings (the others replay the same seconds)"
+    )
 
 
 def _cases(content: Content) -> str:
     studies = {name: one for name, one in content.get("studies", _NOTHING).items() if name != DRIVES and one["windows"]}
     if not studies:
         return NOTHING
-    columns = ("", "windows", "", "missed", "mean", "P99", "kB a request")
+    columns = ("", "windows", "", "missed", "never answered", "mean", "P50", "P99", "kB a request")
     rows = []
     for study, one in studies.items():
         case, _, stem = study.partition("-")
         shown = [name for name in one["contenders"] if name not in DIRECT]
         for number, name in enumerate(shown):
             about = (f"{case.upper()}: {CASES[case.upper()]}, {stem}", len(one["windows"])) if number == 0 else ("", "")
-            rows.append((*about, _label(name), *_figures(one["contenders"][name])))
+            rows.append((*about, _label(name), *_all_figures(one["contenders"][name])))
     return f"{_UNANSWERED} P99 is of all requests.\n\n{table_as_markdown(Table('', columns, tuple(rows)))}"
 
 
@@ -76,25 +145,45 @@ def _others(content: Content) -> str:
     found = content.get("others")
     if not found:
         return NOTHING
-    columns = ("", "drives", "missed", "mean", "P99", "kB", "`plr-replicate`: missed", "mean", "P99", "kB")
-    rows = []
+    columns = ("", "windows", "missed", "never answered", "mean", "P50", "P99", "kB")
+    ours_label = f"`{SUREST}` in the same windows"
+    rows: list[tuple[str | int, ...]] = []
     for name in (BETTER_DIRECT, *OTHERS):
         if name in found:
             one = found[name]
-            both = (cell for who in ("theirs", "ours") for cell in _figures(one[who]["figures"]))
-            rows.append((_label(name), one["windows"], *both))
-    return f"{_UNANSWERED} P99 is of all requests.\n\n{table_as_markdown(Table('', columns, tuple(rows)))}"
+            theirs, ours = ((one["windows"], *_all_figures(one[who]["figures"])) for who in ("theirs", "ours"))
+            rows = [row for row in rows if row != (ours_label, *ours)]
+            rows += [(_label(name), *theirs), (ours_label, *ours)]
+    told = {"miss_ratio": "missed", "unanswered_ratio": "never answered", "mean_ms": "mean", "p50_ms": "P50"}
+    told |= {"p99_ms": "P99", "bytes_per_request": "bytes"}
+    counts = tuple(
+        (_label(name), *(f"{theirs} : {ours}" for theirs, ours in (found[name]["lower"][key] for key in told)))
+        for name in (BETTER_DIRECT, *OTHERS)
+        if name in found
+    )
+    return (
+        f"{_UNANSWERED} P99 is of all requests.\n\n{table_as_markdown(Table('', columns, tuple(rows)))}"
+        f"\nIn how many windows theirs is the lower figure, and in how many `{SUREST}`'s; in the rest both are alike:"
+        f"\n\n{table_as_markdown(Table('', ('', *told.values()), counts))}"
+    )
 
 
 def _measured(content: Content) -> str:
     runs = content.get("runs")
     if not runs:
         return NOTHING
-    counted = sum(map(len, runs.values()))
+    measured, machine = content["measured"], dict(content.get("machine", _NOTHING))
+    recorded = sum(map(len, runs.values()))
     void = sum(bool(run["void"]) for window in runs.values() for run in window.values())
-    on = "".join(f", {key.replace('_', ' ')}: {value}" for key, value in content.get("machine", _NOTHING).items())
-    files = "[summary with charts](results/evaluation.md), [every figure](results/evaluation.json)"
-    return f"{counted} runs in {len(runs)} windows, {void} of them void{on}: {files}."
+    for key in ("measured_at", "commit"):
+        machine.pop(key, None)
+    on = "".join(f", {key}: {value}" for key, value in machine.items())
+    commits = ", ".join(measured["commits"]) or "not recorded"
+    files = "[Summary with charts](results/evaluation.md), [every figure](results/evaluation.json)"
+    runs_of = f"{measured['runs']} runs in {len(runs)} windows, {void} of them void"
+    computed = f"{recorded - measured['runs']} more that are computed from the traces"
+    when = f"Measured from {measured['from']} to {measured['to']}, the newest on{on.removeprefix(',')}"
+    return f"{runs_of}, and {computed}. {when}. Commit: {commits}. {files}."
 
 
 def _verdicts(content: Content) -> str:
@@ -174,6 +263,9 @@ def _fallback(content: Content) -> str:
 
 _BLOCKS: dict[str, Callable[[Content], str]] = {
     "drives": _drives,
+    "modes-drives": _modes_drives,
+    "oracle": _oracle,
+    "distinct": _distinct_drives,
     "others": _others,
     "measured": _measured,
     "verdicts": _verdicts,
@@ -191,11 +283,14 @@ def _label(name: str) -> str:
     return LIKE.get(name, f"`{name}`")
 
 
-def _figures(one: Mapping[str, Any], p99_ms: float | None = None) -> tuple[str, str, str, str]:
+def _all_figures(one: Mapping[str, Any]) -> tuple[str, ...]:
+    shares = (_percent(one[key]) for key in ("miss_ratio", "unanswered_ratio"))
+    return (*shares, *(_time(one[key]) for key in ("mean_ms", "p50_ms", "p99_ms")), _kilobytes(one))
+
+
+def _kilobytes(one: Mapping[str, Any]) -> str:
     sent = one["bytes_per_request"]
-    tail_ms = one["p99_ms"] if p99_ms is None else p99_ms
-    kilobytes = "computed" if sent is None else f"{sent / 1e3:.0f}"
-    return _percent(one["miss_ratio"]), _time(one["mean_ms"]), _time(tail_ms), kilobytes
+    return "computed" if sent is None else f"{sent / 1e3:.0f}"
 
 
 def _percent(share: float) -> str:

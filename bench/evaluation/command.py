@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from bench.evaluation import report_command
+from bench.evaluation import drives, ideal, oracle, report_command
 from bench.evaluation.contenders import CONTENDERS
-from bench.evaluation.ideal import IDEALS, compute
+from bench.evaluation.ideal import COMPUTED
 from bench.evaluation.outcome import figures_by_window
 from bench.evaluation.redundancy_costs import mode_costs
 from bench.evaluation.report import RUNS, modes_table, read_records, window_table
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 QUICK_SCENARIO = "drive-1"
 QUICK_SECONDS = 15.0
-USUAL = (*IDEALS, *(name for name, contender in CONTENDERS.items() if not contender.ablation))
+USUAL = (*COMPUTED, *(name for name, contender in CONTENDERS.items() if not contender.ablation))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m bench evaluate`."""
-    names = (*CONTENDERS, *IDEALS)
+    names = (*CONTENDERS, *COMPUTED)
     parser.add_argument("--scenario", action="append", metavar="GLOB", help="these only; `python -m bench scenarios`")
     parser.add_argument(
         "--contender",
@@ -123,7 +123,8 @@ def run(options: argparse.Namespace) -> int:
         console.print(rich_table(modes_table(costs)))
     # Last: drawing takes a processor from what is measured.
     if outcomes and not options.no_report:
-        report_command.write(options.out, outcomes, failed)
+        found = drives.find(read_scenarios(read_folder(options.traces))) if options.traces else None
+        report_command.write(options.out, outcomes, failed, drives=found)
     for text in failed:
         console.print(f"failed: {text}")
     return 1 if failed or (void and not options.quick) else 0
@@ -152,11 +153,14 @@ def _is_done(scenario: Scenario, contender: str, out: Path) -> bool:
 
 def _run(scenario: Scenario, contender: str, options: argparse.Namespace) -> Outcome:
     """Run it and keep its record, in a process of the pool."""
-    outcome = (
-        compute(scenario, contender) if contender in IDEALS else _run_in_lab(scenario, contender, options.keep_logs)
-    )
+    if contender == ideal.ORACLE:
+        outcome = oracle.compute(scenario)
+    elif contender in COMPUTED:
+        outcome = ideal.compute(scenario, contender)
+    else:
+        outcome = _run_in_lab(scenario, contender, options.keep_logs)
     outcome.conditions["runs_at_once"] = options.jobs
-    if contender not in IDEALS:
+    if contender not in COMPUTED:
         outcome.conditions["machine"] = machine()
     outcome.write(options.out / RUNS)
     return outcome

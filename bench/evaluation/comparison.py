@@ -7,7 +7,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from bench.dataplane.statistics import difference, geometric_mean, median, ratio
-from bench.evaluation.ideal import IDEALS
+from bench.evaluation.ideal import COMPUTED
 from bench.evaluation.outcome import figures_by_window
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def compare(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Comparison]]:
 
 def gains(windows: Windows) -> dict[str, Gains]:
     """Contender -> gains over its hard windows."""
-    names = dict.fromkeys(name for by_name in windows.values() for name in by_name if name not in (*IDEALS, *DIRECT))
+    names = dict.fromkeys(name for by_name in windows.values() for name in by_name if name not in (*COMPUTED, *DIRECT))
     found = {name: _gains(name, hard_windows(windows.values(), name)) for name in names}
     return {name: one for name, one in found.items() if one.windows}
 
@@ -100,7 +100,7 @@ def _gains(contender: str, windows: Sequence[Mapping[str, Figures]]) -> Gains:
 
 
 def _window(by_name: Mapping[str, Figures]) -> dict[str, Comparison]:
-    return {name: _one(of, by_name) for name, of in by_name.items() if name not in IDEALS}
+    return {name: _one(of, by_name) for name, of in by_name.items() if name not in COMPUTED}
 
 
 def _one(of: Figures, beside: Mapping[str, Figures]) -> Comparison:

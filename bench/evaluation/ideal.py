@@ -1,8 +1,8 @@
-"""What the networks would have allowed, computed from the trace: nothing is run.
+"""What two first-in-first-out paths would have given, computed from the trace: nothing is run.
 
 Each path is first in, first out in both directions (`controlplane.planning.fifo`) and carries every request; the ideal
-takes, for each request, the faster of the two. Nobody calls losers off here, so a system that does can be better than
-this where a queue builds up.
+takes, for each request, the faster of the two. Nobody calls losers off or shares a request out here, so it is no bound:
+a system that does can be better where a queue builds up. `bench.evaluation.oracle` is nearer to a bound.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 IDEALS = {"ideal": ("a", "b"), "ideal-a": ("a",), "ideal-b": ("b",)}
 """Both paths, and each alone."""
+ORACLE = "oracle"
+COMPUTED = (*IDEALS, ORACLE)
+"""Contenders that are not run; `bench.evaluation.oracle` has the last."""
 
 
 def compute(scenario: Scenario, contender: str) -> Outcome:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 BETTER_DIRECT = "better direct"
 """In each window the direct run that missed less: a choice that nobody can make beforehand."""
 OTHERS = ("mptcp", "zenoh", "zenoh-drop")
+COMPARED = ("miss_ratio", "unanswered_ratio", "mean_ms", "p50_ms", "p99_ms", "bytes_per_request")
+"""Figures of which it is counted who has the lower one."""
 PLR = ("plr-single", "plr-hedge", "plr-adaptive", SUREST)
 
 
@@ -36,6 +38,16 @@ class Beside:
     windows: int
     theirs: Pooled
     ours: Pooled
+    lower: dict[str, tuple[int, int]]
+    """Figure -> windows in which theirs is the lower one, and ours; in the others both are alike."""
+
+
+@dataclass(frozen=True, slots=True)
+class Everywhere:
+    """Contenders over the same windows."""
+
+    windows: tuple[str, ...]
+    contenders: dict[str, Pooled]
 
 
 def pooled(runs: Sequence[Outcome]) -> Pooled:
@@ -50,8 +62,30 @@ def beside(outcomes: Iterable[Outcome]) -> dict[str, Beside]:
     pairs = {BETTER_DIRECT: [(better_direct(runs), runs[SUREST]) for runs in windows]}
     for name in OTHERS:
         pairs[name] = [(runs[name], runs[SUREST]) for runs in windows if name in runs]
-    return {
-        name: Beside(len(both), pooled([theirs for theirs, _ in both]), pooled([ours for _, ours in both]))
-        for name, both in pairs.items()
-        if both
-    }
+    return {name: _beside(both) for name, both in pairs.items() if both}
+
+
+def everywhere(outcomes: Iterable[Outcome], names: Sequence[str]) -> Everywhere | None:
+    """Whoever of `names` ran in every recorded drive in which both direct runs and those of `names` that are `PLR` ran.
+
+    None: there is no such drive.
+    """
+    drives = by_window(one for one in outcomes if one.case == "A" and is_recorded(one.scenario))
+    needed = {*DIRECT, *(name for name in names if name in PLR)}
+    windows = {window: runs for window, runs in drives.items() if runs.keys() >= needed}
+    if not windows:
+        return None
+    found = {BETTER_DIRECT: pooled([better_direct(runs) for runs in windows.values()])}
+    for name in names:
+        if all(name in runs for runs in windows.values()):
+            found[name] = pooled([runs[name] for runs in windows.values()])
+    return Everywhere(tuple(windows), found)
+
+
+def _beside(both: Sequence[tuple[Outcome, Outcome]]) -> Beside:
+    lower = {}
+    for figure in COMPARED:
+        # Times are known to the microsecond: what differs by less is alike.
+        values = [tuple(round(getattr(run.figures(), figure) or 0.0, 6) for run in pair) for pair in both]
+        lower[figure] = (sum(one < other for one, other in values), sum(one > other for one, other in values))
+    return Beside(len(both), pooled([one for one, _ in both]), pooled([other for _, other in both]), lower)

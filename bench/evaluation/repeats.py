@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from bench.dataplane.statistics import geometric_mean
 from bench.evaluation.comparison import IDEAL, SUREST, gains, hard_windows, one_radio_gain, over_direct
-from bench.evaluation.ideal import IDEALS
+from bench.evaluation.ideal import COMPUTED
 from bench.evaluation.redundancy_costs import mode_costs
 from bench.evaluation.studies import is_recorded, study_of
 from bench.reporting.tables import Table
@@ -63,7 +63,7 @@ def compare(first: Measured, second: Measured) -> Repeats:
     before, after = {}, {}
     for scenario, names in runs.items():
         # Computed from the trace, not run: the same whenever it is done.
-        ideals = {name: of for by in (other, one) for name, of in by[scenario].items() if name in IDEALS}
+        ideals = {name: of for by in (other, one) for name, of in by[scenario].items() if name in COMPUTED}
         before[scenario] = ideals | {name: one[scenario][name] for name in names}
         after[scenario] = ideals | {name: other[scenario][name] for name in names}
     of_first, of_second = (_ratios(windows, first.cases) for windows in (before, after))
@@ -72,7 +72,7 @@ def compare(first: Measured, second: Measured) -> Repeats:
 
 
 def _measured(one: Mapping[str, Figures], other: Mapping[str, Figures]) -> list[str]:
-    return [name for name in one if name in other and name not in IDEALS]
+    return [name for name in one if name in other and name not in COMPUTED]
 
 
 def _ratios(windows: Windows, cases: Mapping[str, str]) -> dict[str, float]:
@@ -101,7 +101,7 @@ def _ratios(windows: Windows, cases: Mapping[str, str]) -> dict[str, float]:
 def _misses_over_ideal(windows: Iterable[Mapping[str, Figures]]) -> dict[str, float]:
     misses: dict[str, list[tuple[float, float]]] = {}
     for by_name in windows:
-        for name in by_name.keys() - set(IDEALS) if IDEAL in by_name else ():
+        for name in by_name.keys() - set(COMPUTED) if IDEAL in by_name else ():
             misses.setdefault(name, []).append((by_name[name].misses, by_name[IDEAL].misses))
     sums = {name: (sum(ours for ours, _ in both), sum(ideal for _, ideal in both)) for name, both in misses.items()}
     return {

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from bench.dataplane.statistics import median
 from bench.evaluation import charts, findings, others, paper, repeats
-from bench.evaluation.comparison import DIRECT, better_direct, compare, gains
+from bench.evaluation.comparison import DIRECT, IDEAL, SUREST, better_direct, compare, gains, over_direct
+from bench.evaluation.ideal import COMPUTED, ORACLE
 from bench.evaluation.measured import Measured
 from bench.evaluation.outcome import Outcome, by_window, figures_by_window
 from bench.evaluation.redundancy_costs import MODES, NEEDED, mode_costs
@@ -19,12 +21,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bench.evaluation.charts import Chart
+    from bench.evaluation.drives import Drives
     from bench.evaluation.findings import Evidence
-    from bench.evaluation.outcome import Figures
+    from bench.evaluation.outcome import Figures, Windows
     from bench.evaluation.redundancy_costs import ModeCost
 
 RUNS = "evaluation"
 """Folder of the records, within that of the reports."""
+_GAINS = ("mean", "p99")
 _COLUMNS = ("", "missed", "never answered", "mean ms", "P50 ms", "P99 ms", "kB/request")
 _MODE_COLUMNS = ("", "windows", "missed", "kB/request", "of replicate's avoided misses", "extra bytes over single")
 
@@ -81,8 +85,10 @@ def machine_of(outcomes: Iterable[Outcome]) -> dict[str, Any]:
     return max(known, key=lambda machine: str(machine.get("measured_at", "")), default={})
 
 
-def as_json(outcomes: Sequence[Outcome], failed: Sequence[str], again: Measured | None = None) -> dict[str, Any]:
-    """Every figure of the report."""
+def as_json(
+    outcomes: Sequence[Outcome], failed: Sequence[str], again: Measured | None = None, drives: Drives | None = None
+) -> dict[str, Any]:
+    """Every figure of the report; `drives`: which recorded windows are one drive, if that is known."""
     evidence = findings.gather(outcomes, again)
     found = studies(outcomes)
     runs: dict[str, dict[str, Any]] = {}
@@ -108,10 +114,13 @@ def as_json(outcomes: Sequence[Outcome], failed: Sequence[str], again: Measured 
         "gains": {name: asdict(gain) for name, gain in gains(windows).items()},
         "redundancy_modes": {name: asdict(cost) for name, cost in mode_costs(windows).items()},
         "others": {name: asdict(one) for name, one in others.beside(outcomes).items()},
+        "drives": None if drives is None else asdict(drives),
+        "everywhere": _everywhere_as_json(outcomes, drives),
         "reproduced": _repeats_as_json(outcomes, again),
         "runs": runs,
         "failed": list(failed),
         "machine": machine_of(outcomes),
+        "measured": _measured_as_json(outcomes),
     }
 
 
@@ -213,6 +222,61 @@ def _pooled_as_json(study: Study) -> dict[str, Any]:
         pools = {others.BETTER_DIRECT: others.pooled(better), **pools}
     contenders = {name: {**asdict(one.figures), "median_p99_ms": one.median_p99_ms} for name, one in pools.items()}
     return {"windows": list(shared.windows), "contenders": contenders}
+
+
+def _everywhere_as_json(outcomes: Sequence[Outcome], drives: Drives | None) -> list[dict[str, Any]]:
+    """All drives, then those in which every mode ran: what each did there."""
+    found: list[dict[str, Any]] = []
+    windows = figures_by_window(outcomes)
+    for names in ((*others.OTHERS, SUREST, IDEAL, ORACLE), (*others.OTHERS, *others.PLR, IDEAL, ORACLE)):
+        one = others.everywhere(outcomes, names)
+        if one is None:
+            continue
+        if found and len(one.windows) == len(found[0]["windows"]):
+            found.clear()  # the modes ran in all of them: one table has everybody
+        kept = {name: windows[name] for name in one.windows}
+        contenders = {
+            name: {
+                **asdict(pooled.figures),
+                "median_p99_ms": pooled.median_p99_ms,
+                "distinct_miss_ratio": _alike(kept, name, drives),
+            }
+            for name, pooled in one.contenders.items()
+        }
+        gains = {f"median_{told}_gain": median(over_direct(kept.values(), SUREST, f"{told}_ms")) for told in _GAINS}
+        hard = sum(any(by_name[direct].miss_ratio for direct in DIRECT) for by_name in kept.values())
+        found.append({"windows": list(kept), "hard_windows": hard, "contenders": contenders, **gains})
+    return found
+
+
+def _alike(windows: Windows, contender: str, drives: Drives | None) -> float | None:
+    """Its miss ratio if each distinct drive weighs the same, however many windows replay it; None: not known."""
+    if drives is None:
+        return None
+    of_drives = [
+        [_miss_ratio(windows[name], contender) for name in names if name in windows] for names in drives.distinct
+    ]
+    means = [sum(ratios) / len(ratios) for ratios in of_drives if ratios]
+    return sum(means) / len(means) if means else None
+
+
+def _miss_ratio(by_name: Mapping[str, Figures], contender: str) -> float:
+    if contender == others.BETTER_DIRECT:
+        return min(by_name[direct].miss_ratio for direct in DIRECT)
+    return by_name[contender].miss_ratio
+
+
+def _measured_as_json(outcomes: Iterable[Outcome]) -> dict[str, Any]:
+    """How many were run, when, and of which commits; runs before commits were recorded have none."""
+    kept = [one for one in outcomes if one.contender not in COMPUTED]
+    known: list[dict[str, Any]] = [one.conditions["machine"] for one in kept if "machine" in one.conditions]
+    times = sorted(str(one["measured_at"]) for one in known if "measured_at" in one)
+    return {
+        "runs": len(kept),
+        "from": times[0] if times else None,
+        "to": times[-1] if times else None,
+        "commits": sorted({str(one["commit"]) for one in known if "commit" in one}),
+    }
 
 
 def _repeats_as_json(outcomes: Sequence[Outcome], again: Measured | None) -> dict[str, Any] | None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from bench.evaluation import archive, page, publish, report, summary
+from bench.evaluation import archive, drives, page, publish, report, summary
+from bench.evaluation.drives import Drives
 from bench.evaluation.measured import Measured
+from bench.evaluation.scenario import read_scenarios
 from bench.evaluation.targets import TARGETS
+from bench.netlab import LabConfigError
+from bench.netlab.trace_folder import read_folder
 from bench.reporting.terminal import show_verdicts
 
 if TYPE_CHECKING:
@@ -39,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{publish.RESULTS / DATA}): how far do the ratios differ?",
     )
     parser.add_argument(
+        "--traces",
+        type=Path,
+        metavar="FOLDER",
+        help="the recorded traces that were replayed: which windows are one drive? (default: as the last report says)",
+    )
+    parser.add_argument(
         "--publish",
         type=Path,
         nargs="?",
@@ -57,8 +67,9 @@ def run(options: argparse.Namespace) -> int:
             raise _no_records(options.out)
         again = _again(options.again, options.out) if options.again else None
         failed = _failed_before(options.out / DATA)
-        write(options.out, outcomes, failed, again, options.publish)
-    except ValueError as error:
+        found = drives.find(read_scenarios(read_folder(options.traces))) if options.traces else None
+        write(options.out, outcomes, failed, again, options.publish, drives=found)
+    except (ValueError, LabConfigError) as error:
         print(error, file=sys.stderr)
         return 2
     return 0
@@ -70,13 +81,15 @@ def write(
     failed: Sequence[str],
     again: Measured | None = None,
     checkout: Path | None = None,
+    *,
+    drives: Drives | None = None,
 ) -> None:
     """Write the reports of at least one run to the folder, and to the checkout if one is given; show the verdicts.
 
     Raises ValueError: the checkout has no places for the figures.
     """
     whole = report.gather(outcomes, again)
-    content = report.as_json(outcomes, failed, again)
+    content = report.as_json(outcomes, failed, again, drives or _drives_before(folder / DATA))
     text = summary.render(whole)
     drawn = {f"{summary.CHARTS}/{chart.name}.svg": chart.svg for section in whole.sections for chart in section.charts}
     (folder / DATA).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -117,10 +130,25 @@ def _no_records(folder: Path) -> ValueError:
 
 def _failed_before(file: Path) -> list[str]:
     """What the file says of runs that failed, which no record does."""
+    return list(_before(file).get("failed", []))
+
+
+def _drives_before(file: Path) -> Drives | None:
+    """What the file says of which windows are one drive, which takes the traces to find."""
+    found = _before(file).get("drives")
+    if not isinstance(found, dict):
+        return None
+    try:
+        return Drives(tuple(tuple(map(str, names)) for names in found["distinct"]), int(found["recordings"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: expected a report, remove it: {error!r}") from None
+
+
+def _before(file: Path) -> dict[str, Any]:
     if not file.exists():
-        return []
+        return {}
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{file}: expected a report, remove it: {error}") from None
-    return list(content.get("failed", [])) if isinstance(content, dict) else []
+    return content if isinstance(content, dict) else {}

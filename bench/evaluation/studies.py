@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from bench.evaluation.comparison import DIRECT, IDEAL, SUREST
 from bench.evaluation.contenders import CONTENDERS
-from bench.evaluation.ideal import IDEALS
+from bench.evaluation.ideal import COMPUTED
 from bench.evaluation.outcome import Outcome, by_window, together
 
 if TYPE_CHECKING:
@@ -131,5 +131,5 @@ def pool(
 
 def ranked(names: Iterable[str]) -> list[str]:
     """Contenders in the order in which tables and charts have them."""
-    order = (*CONTENDERS, *IDEALS)
+    order = (*CONTENDERS, *COMPUTED)
     return sorted(names, key=lambda name: order.index(name) if name in order else len(order))

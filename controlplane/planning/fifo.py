@@ -74,11 +74,12 @@ class FifoLink:
     def _step(self, at: float) -> int:
         return max(0, bisect_right(self._starts, at) - 1)
 
-    def _capacity_by(self, at: float) -> float:
+    def capacity_by(self, at: float) -> float:
+        """Bytes that could have left by then, since the trace's start."""
         step = self._step(at)
         return self._capacity[step] + self._rates[step] * (at - self._starts[step])
 
-    def _time_of(self, capacity: float) -> float:
+    def time_of(self, capacity: float) -> float:
         """When so many bytes could have left; inf if the trace ends before."""
         step = bisect_left(self._capacity, capacity) - 1
         if step < 0:
@@ -86,20 +87,24 @@ class FifoLink:
         rate = self._rates[step]
         return self._starts[step] + (capacity - self._capacity[step]) / rate if rate else math.inf
 
+    def delay_at(self, at: float) -> float:
+        """Seconds of propagation of what leaves then."""
+        return self._delays[self._step(at)]
+
     def send(self, at: float, size: int, rng: random.Random) -> float:
         """When a message of `size` bytes offered `at` has arrived; inf when the queue has no room for it.
 
         Each packet is lost with the step's probability. What is lost is sent once more, a round trip after it was
         missed; lost again, the message is lost.
         """
-        used = max(self._work, self._capacity_by(at))
-        if used - self._capacity_by(at) + size > self._queue_bytes:
+        used = max(self._work, self.capacity_by(at))
+        if used - self.capacity_by(at) + size > self._queue_bytes:
             return math.inf
         self._work = used + size
-        left = self._time_of(self._work)
+        left = self.time_of(self._work)
         if math.isinf(left):
             return math.inf
-        delay = self._delays[self._step(left)]
+        delay = self.delay_at(left)
         arrived = left + delay
         packets = -(-size // PACKET_BYTES)
         lost = self._lost(at, packets, rng)
@@ -107,7 +112,7 @@ class FifoLink:
             again = left + 2.0 * delay
             if self._lost(again, lost, rng):
                 return math.inf
-            arrived = again + self._delays[self._step(again)]
+            arrived = again + self.delay_at(again)
         self._last_arrival = max(self._last_arrival, arrived)
         return self._last_arrival
 

@@ -13,6 +13,7 @@ import pytest
 from bench.evaluation import publish
 from bench.evaluation.archive import pack
 from bench.evaluation.blocks import NOTHING, all_blocks
+from bench.evaluation.drives import Drives
 from bench.evaluation.measured import Measured
 from bench.evaluation.report import RUNS, as_json, read_records
 from tests.unit.bench.evaluation_records import drive, run
@@ -80,12 +81,16 @@ def test_blocks_show_the_figures_of_the_data() -> None:
     again = [run("plr-replicate", late=2) if one.contender == "plr-replicate" else one for one in evaluation()]
     blocks = all_blocks(content(*evaluation(), again=again))
     drives = blocks["drives"]
-    assert "1 drives, 100 requests each" in drives
-    assert "| ROS 2 over the better path of each window, chosen afterwards | 20.0 % | 480 ms | 2.0 s |" in drives
-    assert "| `plr-replicate` | 1.0 % | 119 ms | 100 ms | 200 |" in drives
-    assert "is 4.03 times lower than that of the better direct run, its P99 20 times" in drives
+    assert (
+        "All 1 windows of recorded drives, 100 requests each; which of them are one drive was not looked at" in drives
+    )
+    alone = "| ROS 2 over the better path of each window, chosen afterwards"
+    assert f"{alone} | 20.0 % | - | 0.0 % | 480 ms | 100 ms | 2.0 s |" in drives
+    assert "| `plr-replicate` | 1.0 % | - | 0.0 % | 119 ms | 100 ms | 100 ms | 100 ms | 200 |" in drives
+    assert "median of the 1: `plr-replicate`'s mean 4.03, its P99 20." in drives
     assert "zenoh" not in drives, "who did not run has no row"
-    assert "multipath TCP | 1 | 3.0 % | 157 ms | 2.0 s | 150 | 1.0 % | 119 ms | 100 ms | 200 |" in blocks["others"]
+    assert "multipath TCP | 1 | 3.0 % | 0.0 % | 157 ms | 100 ms | 2.0 s | 150 |" in blocks["others"]
+    assert "multipath TCP | 0 : 1 | 0 : 0 | 0 : 1 | 0 : 0 | 0 : 1 | 1 : 0 |" in blocks["others"]
     assert "| `adaptive` | 1 | 3.0 % | 89 % | 20 % |" in blocks["modes"]
     assert "| `mean_gain` | 4.03 | ≥ 1.9 | met |" in blocks["verdicts"]
     assert "| `fallback_late` | not measured | ≤ 0 | not measured |" in blocks["verdicts"]
@@ -94,12 +99,62 @@ def test_blocks_show_the_figures_of_the_data() -> None:
     assert blocks["budgets"] == blocks["fallback"] == NOTHING
 
 
+@pytest.mark.audit("ops-21")
+def test_all_drives_are_shown_with_how_many_are_distinct_and_what_an_oracle_misses() -> None:
+    """Not only those on which a direct run misses; whoever never answers has that share beside the tail."""
+    hard, easy = (drive(number, direct=direct, ours=late) for number, direct, late in ((1, 20, 4), (2, 0, 0)))
+    scenarios = [hard[0].scenario, easy[0].scenario]
+    oracles = [run("oracle", scenario=name, late=late) for name, late in zip(scenarios, (1, 0), strict=True)]
+    lost = run("mptcp", scenario=scenarios[0], late=5, late_s=20.0)
+    found = as_json(
+        [*hard, *easy, *oracles, lost, run("mptcp", scenario=scenarios[1])],
+        [],
+        drives=Drives((tuple(scenarios),), 1),
+    )
+    drives = all_blocks(found)["drives"]
+    assert "All 2 windows of recorded drives, 200 requests each; only 1 of them are distinct drives" in drives
+    assert "multipath TCP | 2.5 % | 2.5 % | 2.5 % | 347 ms | 100 ms | no answer |" in drives
+    assert "| `plr-replicate` | 2.0 % | 2.0 % | 0.0 % |" in drives
+    assert "misses 0.5 %, 25 % of what `plr-replicate` misses" in drives
+    assert "of all 2: " in all_blocks(found)["verdicts"], (
+        "the gain over all drives stands beside that over the hard ones"
+    )
+
+
+@pytest.mark.audit("ops-21")
+def test_each_distinct_drive_weighs_the_same() -> None:
+    runs = [one for number, late in ((1, 30), (2, 30), (3, 0)) for one in drive(number, ours=late)]
+    names = list(dict.fromkeys(one.scenario for one in runs))
+    found = as_json(runs, [], drives=Drives(((names[0], names[1]), (names[2],)), 2))
+    ours = found["everywhere"][0]["contenders"]["plr-replicate"]
+    assert (ours["miss_ratio"], ours["distinct_miss_ratio"]) == (pytest.approx(0.2), pytest.approx(0.15))
+
+
+def test_modes_that_ran_in_fewer_drives_have_a_table_of_these() -> None:
+    modes = ("plr-single", "plr-hedge", "plr-adaptive")
+    runs = [*drive(1), *drive(2), *(run(name, scenario=drive(1)[0].scenario) for name in modes)]
+    blocks = all_blocks(as_json(runs, []))
+    assert "All 2 windows" in blocks["drives"]
+    assert "`plr-hedge`" not in blocks["drives"]
+    assert "The 1 windows in which every mode ran; a direct run misses something in 1 of them" in blocks["modes-drives"]
+    assert "| `plr-hedge` |" in blocks["modes-drives"]
+
+
+@pytest.mark.audit("ops-21")
+def test_the_commits_that_were_measured_are_told() -> None:
+    at = {"measured_at": "2026-01-02T03:04:05Z", "cpu": "one"}
+    runs = drive(1, machine={**at, "commit": "abc"})
+    assert "Commit: abc." in all_blocks(as_json(runs, []))["measured"]
+    assert "Commit: not recorded." in all_blocks(as_json(drive(1, machine=at), []))["measured"]
+
+
 def test_other_cases_have_a_table_of_their_own() -> None:
     late = {"direct-a": 60, "direct-b": 40, "plr-replicate": 2, "ideal": 1}
     wifi = [run(name, scenario=f"two-wifi-{n}", case="C", late=count) for n in (1, 2) for name, count in late.items()]
     table = all_blocks(content(*evaluation(), *wifi))["cases"]
     assert (
-        "| C: two Wi-Fi, two-wifi | 2 | ROS 2 over the better path of each window, chosen afterwards | 40.0 %" in table
+        "| C: two Wi-Fi, two-wifi | 2 | ROS 2 over the better path of each window, chosen afterwards | 40.0 % | 0.0 % |"
+        in table
     )
     assert "|  |  | `plr-replicate` | 2.0 % |" in table
     assert "direct-a" not in table
