@@ -174,13 +174,20 @@ class ControlClient:
         self._running.set()
         judging = asyncio.create_task(self._look_at_credentials())
         self._dialer.start(self._network_changed)
-        with contextlib.suppress(asyncio.CancelledError):
+        try:
             while not self._stopping:
                 await self._wait_for_turn()
                 if not self._stopping:
-                    await self._one_stream()
-        self._dialer.close()
-        judging.cancel()
+                    # In a task of its own: a TaskGroup that ends with an error leaves a cancellation counted in its
+                    # task, and up to Python 3.11.2, Debian 12's, that turns the next asyncio.timeout into the task's
+                    # cancellation.
+                    await asyncio.create_task(self._one_stream())
+        except asyncio.CancelledError:
+            if not self._stopping:
+                raise  # ends the program, which is started again: without this thread nothing ever connects
+        finally:
+            self._dialer.close()
+            judging.cancel()
 
     def _network_changed(self) -> None:
         self._session.network_changed(time.monotonic())

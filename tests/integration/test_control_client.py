@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import queue
@@ -290,6 +291,29 @@ from tests.integration.scripted_control_plane import ScriptedControlPlane
 with ScriptedControlPlane(int(sys.argv[1]), welcome=Welcome(lease_s=3.0, report_interval_s=0.5)) as server:
     sys.stdin.read()
 """
+
+
+@pytest.mark.audit("ops-1")
+def test_comes_back_with_the_python_of_debian_12(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until 3.11.3 `asyncio.timeout` took every cancellation counted in its task for one that is wanted now."""
+    entered = asyncio.Timeout.__aenter__
+
+    async def enter(timeout: asyncio.Timeout) -> asyncio.Timeout:
+        await entered(timeout)
+        vars(timeout)["_cancelling"] = 0  # as 3.11.2 compares: with nothing, not with what was counted before
+        return timeout
+
+    monkeypatch.setattr(asyncio.Timeout, "__aenter__", enter)
+    port = free_port()
+    rig = Rig(f"127.0.0.1:{port}")
+    rig.client.start()
+    deadline = time.monotonic() + WAIT_S
+    while rig.client.stats.attempts < 3:
+        assert time.monotonic() < deadline, "no attempt follows the first that failed"
+        time.sleep(0.01)
+    with ScriptedControlPlane(port, welcome=WELCOME):
+        rig.hooks.expect_connection(True)
+    rig.client.stop()
 
 
 def test_notices_a_killed_control_plane_and_finds_its_successor() -> None:
