@@ -44,6 +44,8 @@ KEY_FORBIDDEN = stat.S_IRWXO | stat.S_IWGRP
 FORBIDDEN = stat.S_IWOTH
 """Permissions that everything else must not have."""
 
+_OWNER = "; give it to the account that runs this (chown plr)"
+
 _READABLE = stat.S_IRGRP | stat.S_IROTH
 
 _log = logging.getLogger(__name__)
@@ -71,7 +73,8 @@ def load_tls_files(directory: Path) -> TlsFiles:
     except OSError as error:
         # A folder that may not be entered, or is replaced while it is looked at.
         path = str(error.filename or directory)
-        raise ConfigError(path, "", f"cannot be read: {error.strerror or error}") from error
+        hint = _OWNER if isinstance(error, PermissionError) else ""
+        raise ConfigError(path, "", f"cannot be read: {error.strerror or error}{hint}") from error
 
 
 def _load(directory: Path) -> TlsFiles:
@@ -79,8 +82,8 @@ def _load(directory: Path) -> TlsFiles:
         raise ConfigError(str(directory), "", "expected a folder with cert.pem, key.pem and ca.pem; see: plr ca issue")
     _refuse_permissions(directory, directory.stat(), FORBIDDEN)
     ca_path, crl_path = directory / CA_FILE, directory / CRL_FILE
-    ca_pem = read_guarded(ca_path, FORBIDDEN)
-    crl_pem = read_guarded(crl_path, FORBIDDEN) if crl_path.exists() else None
+    ca_pem = _read(ca_path, FORBIDDEN)
+    crl_pem = _read(crl_path, FORBIDDEN) if crl_path.exists() else None
     try:
         trust = Trust(ca_pem)
     except CertificateError as error:
@@ -95,7 +98,7 @@ def _load(directory: Path) -> TlsFiles:
 
 def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -> TlsFiles:
     path = directory / CERTIFICATE_FILE
-    certificate_pem = read_guarded(path, FORBIDDEN)
+    certificate_pem = _read(path, FORBIDDEN)
     try:
         (certificate,) = x509.load_pem_x509_certificates(certificate_pem)
     except Exception as error:
@@ -107,7 +110,7 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
     except CertificateError as error:
         raise ConfigError(str(path), "", f"{error}; issue one with the CA of {CA_FILE}: plr ca issue") from error
     key_path = directory / KEY_FILE
-    key_pem = read_guarded(key_path, KEY_FORBIDDEN)
+    key_pem = _read(key_path, KEY_FORBIDDEN)
     key = load_private_key(key_pem, None, key_path)
     if key.public_key() != certificate.public_key():
         raise ConfigError(str(key_path), "", f"expected the key of {CERTIFICATE_FILE}; copy those that belong together")
@@ -122,6 +125,18 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
         identity=identity,
         trust=trust,
     )
+
+
+def _read(path: Path, forbidden: int) -> bytes:
+    """`read_guarded`, with what to do about a file that is not there or not for us."""
+    try:
+        return read_guarded(path, forbidden)
+    except ConfigError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            raise ConfigError(error.source, "", "there is no such file; copy what plr ca issue wrote there") from error
+        if isinstance(error.__cause__, PermissionError):
+            raise ConfigError(error.source, "", f"{error.problem}{_OWNER}") from error
+        raise
 
 
 def read_guarded(path: Path, forbidden: int, *, most: int = MAX_FILE_BYTES) -> bytes:

@@ -56,7 +56,7 @@ def other_ca() -> Authority:
 
 Breakage = tuple[str, "Callable[[Path], object]", str]
 BREAKAGES: list[Breakage] = [
-    ("key.pem", lambda path: path.unlink(), "cannot be read: No such file or directory"),
+    ("key.pem", lambda path: path.unlink(), "there is no such file; copy what plr ca issue wrote there"),
     ("key.pem", lambda path: path.chmod(0o604), "others may read or change it; do: chmod 600 "),
     ("key.pem", lambda path: path.chmod(0o641), "others may read or change it; do: chmod 640 "),
     ("key.pem", lambda path: path.chmod(0o602), "others may read or change it; do: chmod 600 "),
@@ -73,7 +73,7 @@ BREAKAGES: list[Breakage] = [
         "expected the key of cert.pem",
     ),
     ("cert.pem", lambda path: path.chmod(0o646), "everybody may change it; do: chmod 644 "),
-    ("cert.pem", lambda path: path.unlink(), "cannot be read"),
+    ("cert.pem", lambda path: path.unlink(), "there is no such file"),
     ("cert.pem", lambda path: path.write_bytes(b""), "expected one certificate in PEM"),
     ("cert.pem", lambda path: path.write_bytes(path.read_bytes() * 2), "expected one certificate in PEM"),
     ("cert.pem", lambda path: path.write_bytes(bytes(MAX_FILE_BYTES + 1)), "expected at most"),
@@ -82,7 +82,7 @@ BREAKAGES: list[Breakage] = [
         lambda path: path.write_bytes(other_ca().issue("robot-1", IdentityRole.ROBOT).certificate_pem),
         "of another CA; issue one with the CA of ca.pem",
     ),
-    ("ca.pem", lambda path: path.unlink(), "cannot be read"),
+    ("ca.pem", lambda path: path.unlink(), "there is no such file"),
     ("ca.pem", lambda path: path.chmod(0o666), "everybody may change it"),
     ("ca.pem", lambda path: path.write_bytes(b""), "copy the ca.pem of the CA's folder there"),
     ("crl.pem", lambda path: path.chmod(0o666), "everybody may change it"),
