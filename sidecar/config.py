@@ -28,6 +28,7 @@ from sidecar.config_fields import (
     ControlPlaneAddresses,
     DomainLabel,
     InterfacePattern,
+    LocalSocket,
     Section,
     SidecarName,
     converted,
@@ -125,6 +126,9 @@ class SidecarConfig(Section):
     """Seconds after which the keys that seal datagrams are changed; their volume changes them as well."""
     metrics_listen: ListenAddress | None = "127.0.0.1:9464"
     """address:port of the Prometheus metrics; null for none."""
+    local_socket: LocalSocket | None = "auto"
+    """Absolute path of the unix socket of plr doctor and plr ping; auto: sidecar.sock in the unit's runtime folder, or
+    in state_dir without systemd; null for none."""
     log_level: Annotated[LogLevel, converted] = LogLevel.INFO
     """debug, info, warning or error."""
 
@@ -142,6 +146,13 @@ class SidecarConfig(Section):
     def max_revocation_age(self) -> float:
         """`max_revocation_age_s`; infinite: a list does not age."""
         return math.inf if self.max_revocation_age_s is None else float(self.max_revocation_age_s)
+
+    def local_socket_path(self, runtime_directory: str | None) -> Path | None:
+        """Where the local socket is; `runtime_directory` is what systemd tells the unit (RUNTIME_DIRECTORY)."""
+        if self.local_socket != "auto":
+            return None if self.local_socket is None else Path(self.local_socket)
+        folder = (runtime_directory or "").partition(":")[0]
+        return (Path(folder) if folder else self.state_dir) / "sidecar.sock"
 
     def service_rules(self) -> tuple[ServiceRule, ...]:
         """The services as the cores want them, in order."""

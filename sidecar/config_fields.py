@@ -21,7 +21,15 @@ _GLOB_CHARACTERS = frozenset("*?[")
 _MAX_SERVICE_CHARACTERS = 255
 MAX_CONTROL_PLANES = 8
 """Addresses of the control plane; each is tried over every interface."""
+_MAX_SOCKET_BYTES = 107
+"""Of a unix socket's path (unix(7))."""
 _COPIES_WORDS = {"each": EVERY_INTERFACE, "at_most": AT_MOST_EVERY_INTERFACE}
+
+
+def _check_local_socket(text: str) -> str:
+    if text != "auto" and not (text.startswith("/") and len(text.encode()) <= _MAX_SOCKET_BYTES):
+        raise ValueError(f"expected auto, null or an absolute path of at most {_MAX_SOCKET_BYTES} bytes, got {text!r}")
+    return text
 
 
 def is_glob(pattern: str) -> bool:
@@ -128,6 +136,7 @@ ControlPlaneAddresses = Annotated[
 ]
 DomainLabel = Annotated[str, Field(min_length=1), AfterValidator(_check_domain_label)]
 """Name of a region or a carrier."""
+LocalSocket = Annotated[str, AfterValidator(_check_local_socket)]
 CopiesWanted = Annotated[
     Copies,
     PlainValidator(_check_copies),

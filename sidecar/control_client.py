@@ -14,7 +14,7 @@ import contextlib
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import grpc
 
@@ -67,6 +67,22 @@ class _StreamEndedError(Exception):
         self.moved = moved
 
 
+class ControlView(NamedTuple):
+    """How the control stream is at one moment; times are monotonic seconds."""
+
+    names: tuple[str, ...]
+    """As configured."""
+    connected: bool
+    since: float
+    """When that became so, or the start."""
+    way: str | None
+    """Address and interface of the connection, in words."""
+    interface: str | None
+    last_failure: str | None
+    """Why the last attempt or stream ended."""
+    retry_at: float
+
+
 class ControlClient:
     """Keeps one sidecar connected to the control plane that `dialer` reaches until `stop`.
 
@@ -84,6 +100,7 @@ class ControlClient:
         self._connected = False
         self.last_failure: str | None = None
         """Why the last attempt or stream ended; None before that, or when we ended it."""
+        self._changed_at = time.monotonic()
         self._stopping = False
         self._outage = OutageLog(log, ", ".join(dialer.names))
         self._refusals = RefusalLog(log)
@@ -105,6 +122,20 @@ class ControlClient:
     def stats(self) -> ControlStats:
         """Counters, to be read only."""
         return self._session.stats
+
+    def view(self) -> ControlView:
+        """Return how the stream is, for people."""
+        line = self._line
+        way = None if line is None else line.way
+        return ControlView(
+            self._dialer.names,
+            self._connected,
+            self._changed_at,
+            None if way is None else str(way),
+            None if way is None or way.interface is None else str(way.interface),
+            self.last_failure,
+            self._session.retry_at,
+        )
 
     def start(self) -> None:
         """Connect in the background; call once."""
@@ -401,7 +432,7 @@ class ControlClient:
     def _note_connection(self, connected: bool, reason: str) -> None:
         if connected == self._connected:
             return
-        self._connected = connected
+        self._connected, self._changed_at = connected, time.monotonic()
         try:
             self._hooks.connection_changed(connected, reason)
         except Exception:

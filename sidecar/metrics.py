@@ -21,6 +21,7 @@ from protos.revocation_views import revocation_gauges
 from sidecar.core.control_watch import LEAVE_CAUSES
 from sidecar.core.control_ways import DIAL_DROPS
 from sidecar.core.revocation_exchange import EXCHANGES
+from sidecar.local.server import REFUSALS
 from sidecar.metric_families import by_one, counter, cumulative, gauge
 from sidecar.state_store import FAILURES
 
@@ -63,6 +64,8 @@ class MetricSources:
     """Whose certificate is in use; None in insecure mode."""
     revocations: Callable[[], RevocationState | None]
     """The revocation lists in use; None in insecure mode."""
+    local_refused: Callable[[], Mapping[str, int]]
+    """What the local socket refused."""
 
 
 class SidecarCollector(Collector):
@@ -96,6 +99,12 @@ class SidecarCollector(Collector):
         )
         yield from _certificate(sources.certificate())
         yield from _revocations(sources.revocations(), sources.engine())
+        yield counter(
+            "plr_local_refused",
+            "Connections and requests that the local socket refused.",
+            ("reason",),
+            by_one(dict.fromkeys(REFUSALS, 0) | dict(sources.local_refused())),
+        )
         yield counter(
             "plr_state_failures",
             "Files of the state folder that could not be read or written.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import random
 import threading
 import time
@@ -31,6 +32,8 @@ from sidecar.control_client import ControlClient
 from sidecar.core.control_session import Apply, ControlSession
 from sidecar.core.control_ways import ControlInterface
 from sidecar.core.engine import EngineConfig
+from sidecar.local.server import LocalServer, LocalSocketError
+from sidecar.local.state import LocalState, MappingOrigin
 from sidecar.metrics import MetricSources, serve_metrics
 from sidecar.net.control_dialer import ControlDialer
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
@@ -58,6 +61,7 @@ if TYPE_CHECKING:
     from protos.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
     from sidecar.core.path_id import PathState
+    from sidecar.core.pinging import Pong
     from sidecar.core.stun_events import StunEvent
     from sidecar.stop_request import StopRequest
 
@@ -109,6 +113,7 @@ class Sidecar:
                 self._on_paths_changed,
                 self._on_revocations,
                 lambda: self._control.report_at_once(),
+                self._on_pong,
             ),
         )
         self._revocations = (
@@ -159,6 +164,8 @@ class Sidecar:
         )
         self._unmet = UnmetServices([rule.pattern for rule in rules], time.monotonic())
         self._metrics: MetricsServer | None = None
+        self._mapping_origin: MappingOrigin | None = None
+        self._local = self._make_local(version)
         self._logged_mappings: dict[ServiceName, tuple[Assignment, ...]] = {}
         self._version = version
 
@@ -170,6 +177,11 @@ class Sidecar:
         """
         interpreter.share()
         self._open_metrics()
+        if self._local is not None:
+            try:
+                self._local.open()
+            except LocalSocketError as error:
+                log.warning("%s: no local socket, plr doctor sees only the configuration: %s", self._local.path, error)
         self._data_plane.start()
         last = self._store.last_good
         if self._revocations is not None:
@@ -182,7 +194,10 @@ class Sidecar:
         if last.peers is not None:
             self._restore(Apply(ResourceKind.PEERS, last.peers), self._data_plane.apply_peers(last.peers))
         if last.mapping is not None:
-            self._restore(Apply(ResourceKind.MAPPING, last.mapping), self._data_plane.apply_mapping(last.mapping))
+            problem = self._data_plane.apply_mapping(last.mapping)
+            self._restore(Apply(ResourceKind.MAPPING, last.mapping), problem)
+            if problem is None:
+                self._mapping_origin = MappingOrigin("disk", time.monotonic())
         self._bridge.start(self._data_plane)
         self._control.start()
         self._control.try_again()  # an interface may have come before it was noted that the mapping lacks it
@@ -227,9 +242,31 @@ class Sidecar:
         self._data_plane.stop()
         self._interfaces.stop()
         self._store.close()
+        if self._local is not None:
+            self._local.close()
         if self._metrics is not None:
             self._metrics.close()
         interpreter.clear()
+
+    def _make_local(self, version: str) -> LocalServer | None:
+        path = self._config.local_socket_path(os.environ.get("RUNTIME_DIRECTORY"))
+        if path is None:
+            return None
+        state = LocalState(
+            config=self._config,
+            version=version,
+            data_plane=self._data_plane,
+            interfaces=self._interfaces.views,
+            idle=self._interfaces.in_use,
+            control=self._control.view,
+            bridge=lambda: self._bridge.stats,
+            unmet=lambda: self._unmet.unmet,
+            origin=lambda: self._mapping_origin,
+            tls=self._tls,
+            clock=self._clock,
+            started_at=time.monotonic(),
+        )
+        return LocalServer(path, state)
 
     def _open_metrics(self) -> None:
         listen = self._config.metrics_listen
@@ -249,6 +286,7 @@ class Sidecar:
             state_failures=lambda: self._store.failures,
             certificate=lambda: self._tls.current.identity if self._tls is not None else None,
             revocations=lambda: None if self._revocations is None else self._revocations.state,
+            local_refused=lambda: {} if self._local is None else self._local.refused,
         )
         try:
             self._metrics = serve_metrics(listen, sources)
@@ -283,6 +321,10 @@ class Sidecar:
         self._dialer.set_interfaces(
             [ControlInterface(name, frozenset(addresses), self._config.price(name)) for name, addresses in own.items()]
         )
+
+    def _on_pong(self, pong: Pong) -> None:
+        if self._local is not None:
+            self._local.on_pong(pong)
 
     def _on_services_changed(self) -> None:
         unmet = sorted(self._unmet.unmet)[:MAX_UNMET]
@@ -319,6 +361,7 @@ class Sidecar:
         """Put the mapping in force; returns why not, or None."""
         error = self._data_plane.apply_mapping(mapping)
         if error is None:
+            self._mapping_origin = MappingOrigin("control plane", time.monotonic())
             self._store.remember(mapping)
             self._log_changes(mapping)
         return error

@@ -144,6 +144,8 @@ class DatagramBuilder:
             self._add_probe(path, burst, now)
         if probing and path.mtu_probe_at is not None and path.mtu_probe_at <= now:
             self._add_mtu_probe(path, burst, now)
+        if path.pings:
+            self._add_pings(path, burst, now)
         complete = self._add_fragments(path, burst, now)
         if path.control_at <= now:
             self._add_control(path, path.take_control(now), burst, now)
@@ -334,6 +336,18 @@ class DatagramBuilder:
         padding = frame.encode_padding(size - HEADER_BYTES - len(probe) - TAG_BYTES)
         datagram = self._sealed(path, path.recovery.take_numbers(), now, probe, padding)
         self._add_alone(path, path.remote, datagram, burst)
+
+    def _add_pings(self, path: Path, burst: Burst, now: float) -> None:
+        """Add the pings that wait, as `_add_mtu_probe` does; those of a path that has just gone down are forgotten."""
+        pings, path.pings = path.pings, []
+        if path.state is PathState.DOWN or path.remote is None:
+            return
+        for ping in pings:
+            ping.sent_at = now
+            probe = frame.encode_probe(frame.Probe(ping.id))
+            padding = frame.encode_padding(max(0, ping.size - HEADER_BYTES - len(probe) - TAG_BYTES))
+            datagram = self._sealed(path, path.recovery.take_numbers(), now, probe, padding)
+            self._add_alone(path, path.remote, datagram, burst)
 
     def _add_alone(self, path: Path, address: Address, datagram: bytes, burst: Burst) -> None:
         burst.add(address, datagram, len(datagram))

@@ -20,6 +20,7 @@ from sidecar.core.link_events import (
     LinkEvent,
     PathChanged,
     PathMtuChanged,
+    Ping,
     Rebind,
     Resend,
     ResetPaths,
@@ -41,18 +42,22 @@ from sidecar.core.link_reader import LinkReader
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.path_table import PathTable
+from sidecar.core.path_view import view_of
 from sidecar.core.stats import PathStats
 from sidecar.core.timers import NEVER, Timers
 
 if TYPE_CHECKING:
     import random
-    from collections.abc import Callable, Iterable
+    from collections import deque
+    from collections.abc import Callable, Iterable, Iterator
 
     from protos.model import Address, NodeName
     from sidecar.core.datagrams import LinkIdentity
     from sidecar.core.link_events import LinkPeer
     from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.path_view import PathView
     from sidecar.core.paths import Path
+    from sidecar.core.pinging import Pong
 
 MAX_FINISHED_DELAY_S = 0.003
 """How long FINISHED of a small request waits for its answer, and the acknowledgement with it: less than
@@ -157,6 +162,10 @@ class Link:
                 for path in self._paths_to(peers):
                     path.needed(now)
                     self._dirty[path.id] = path
+            case Ping():
+                path = self._paths.get((command.path.peer, command.path.remote)) if self._may_probe else None
+                if self._table.pings.ask(path, command, now) and path is not None:
+                    self._dirty[path.id] = path
             case SetMtu(mtu):
                 self._mtu.set_interface(mtu, self._paths.values(), now)
                 self._dirty.update((path.id, path) for path in self._paths.values())
@@ -198,6 +207,23 @@ class Link:
     def next_event(self) -> LinkEvent | None:
         """Return the oldest event not taken yet."""
         return self._events.popleft() if self._events else None
+
+    @property
+    def pongs(self) -> deque[Pong]:
+        """What became of pings, the oldest first; the driver takes them out."""
+        return self._table.pings.done
+
+    def paths_to(self, peer: str) -> list[PathId]:
+        """Return the paths to a peer; any thread may ask."""
+        return [path.id for (name, _), path in self._paths.copy().items() if name == peer]
+
+    def views(self, now: float) -> Iterator[PathView]:
+        """Yield how each path is now. Any thread may ask: it reads what this link's thread writes.
+
+        Each view costs that thread nothing but its turn of the interpreter; who has many may pause between them.
+        """
+        for path in list(self._paths.values()):
+            yield view_of(path, now)
 
     def living(self) -> list[PathId]:
         """The paths that are not down."""

@@ -104,6 +104,17 @@ class SetMtu:
 
 
 @dataclass(frozen=True, slots=True)
+class Ping:
+    """Somebody on this host wants to know how long a path takes; what comes of it is in `Link.pongs`."""
+
+    path: PathId
+    number: int
+    """Whose it is; the link only repeats it."""
+    size: int
+    """Of the datagram: bytes of UDP payload, more where a probe does not fit."""
+
+
+@dataclass(frozen=True, slots=True)
 class Send:
     """Send a whole message over this path."""
 
@@ -164,6 +175,7 @@ LinkCommand = (
     | CheckPaths
     | Attend
     | SetMtu
+    | Ping
     | PathCommand
     | SendClose
 )

@@ -233,7 +233,7 @@ class LinkReader:
             self._stats.dropped["bad_keys"] += 1
 
     def _receive_reply(self, path: Path, probe_id: int, now: float) -> None:
-        if self._mtu.answered(path, probe_id, now):
+        if self._mtu.answered(path, probe_id, now) or self._table.pings.answered(path, probe_id, now):
             return
         sent_at = path.answered_probe(probe_id, now)
         if sent_at is None:

@@ -13,6 +13,7 @@ from sidecar.core.link_memory import LinkMemory
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keys import make_path_keys
 from sidecar.core.paths import Path
+from sidecar.core.pinging import Pings
 from sidecar.core.stats import LinkStats
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class PathTable:
 
     __slots__ = (
         "_by_peer", "_exchanges", "_limits", "_memory", "_new_paths", "_rng", "_unproven", "by_hello", "by_session",
-        "closing", "dirty", "events", "identity", "paths", "stats",
+        "closing", "dirty", "events", "identity", "paths", "pings", "stats",
     )  # fmt: skip
 
     def __init__(self, identity: LinkIdentity, memory: LinkMemory, limits: KeyLimits, rng: random.Random) -> None:
@@ -74,6 +75,7 @@ class PathTable:
         self._by_peer: dict[NodeName, list[Path]] = {}
         self.dirty: dict[PathId, Path] = {}
         """Paths that may have something to send, or another timer than before."""
+        self.pings = Pings()
         self.closing = False
 
     @property

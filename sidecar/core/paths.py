@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from protos.token_bucket import TokenBucket
     from sidecar.core.frame import KeyAnswer, KeyOffer
     from sidecar.core.path_keys import PathKeys
+    from sidecar.core.pinging import SentPing
 
 DOWN_FACTOR = 4.0
 """An unstable path is down after this many times the silence that made it unstable, or the longest that anybody waits
@@ -61,6 +62,7 @@ class Path:
         "opening",
         "pending",
         "pending_by",
+        "pings",
         "probing",
         "queue",
         "received",
@@ -124,6 +126,8 @@ class Path:
         """... and messages to be reported FINISHED in it ..."""
         self.pending_by = NEVER
         """... which leaves at this moment (s) at the latest; NEVER when none waits."""
+        self.pings: list[SentPing] = []
+        """Pings that wait to leave."""
         self.probing = Probing(now, rng, leads=leads)
         self.rtts: list[float] = []
         self.bytes_sent = 0

@@ -85,6 +85,22 @@ class Probing:
         self._back: dict[int, Probe] = {}
         """What was asked of introductions. Apart, since whoever repeats those makes us ask as often."""
 
+    # -- looking at it -----------------------------------------------------------------------------------------------
+
+    @property
+    def proven_at(self) -> float:
+        """When the path last proved that it lives, or when it was made (s)."""
+        return self._proven_at
+
+    @property
+    def used_at(self) -> float:
+        """When something other than probes last travelled, or when it was made (s)."""
+        return self._used_at
+
+    def pause(self, now: float) -> float:
+        """Return how far apart probes are while the path is up, about (s)."""
+        return self._pause(now)
+
     # -- asking and being answered --------------------------------------------------------------------------------
 
     def take_id(self) -> int:

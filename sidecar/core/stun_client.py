@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from ipaddress import ip_address
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
 from protos.stun import MessageClass, decode, is_stun
@@ -26,6 +26,21 @@ if TYPE_CHECKING:
 
 MAX_SERVERS_PER_FAMILY = 4
 """Servers used of those a control plane names; the others are ignored and counted."""
+
+
+class StunView(NamedTuple):
+    """What is known of one family at one moment."""
+
+    family: int
+    mapping: Address | None
+    server: Address | None
+    """Which answered last."""
+    answered_at: float | None
+    """When (monotonic, s)."""
+    changes: int
+    """How often the mapping became another."""
+    problem: str
+    """Why the last round failed; empty: it did not."""
 
 
 class StunClient:
@@ -88,6 +103,13 @@ class StunClient:
         """The mapping last learnt for family 4 or 6."""
         client = self._families.get(family)
         return client.mapping if client else None
+
+    def views(self) -> list[StunView]:
+        """Return what is known of each family; any thread may ask."""
+        return [
+            StunView(family, one.mapping, one.preferred, one.answered_at, one.changes, one.problem)
+            for family, one in list(self._families.items())
+        ]
 
     def receive_datagram(self, data: bytes | memoryview, addr: Address, now: float) -> bool:
         """Take a datagram of the socket; True if it was STUN, believed or counted."""

@@ -86,6 +86,12 @@ class StunFamilyClient:
     ) -> None:
         self.servers = servers
         self.mapping: Address | None = None
+        self.answered_at: float | None = None
+        """When a server last answered (s)."""
+        self.changes = 0
+        """How often the mapping became another."""
+        self.problem = ""
+        """Why the last round failed; empty: it did not."""
         self._family = family
         self._outbox = outbox
         self._rng = rng
@@ -105,6 +111,11 @@ class StunFamilyClient:
         self._failed_rounds = 0
         self._announced = False
         self._start_round(now)
+
+    @property
+    def preferred(self) -> Address | None:
+        """The server that answered last."""
+        return self._preferred
 
     def find(self, transaction_id: bytes) -> StunTransaction | None:
         """The transaction under way that has this id."""
@@ -154,7 +165,9 @@ class StunFamilyClient:
 
     def _learn(self, address: Address, server: Address, now: float) -> None:
         previous, self.mapping = self.mapping, address
+        self.answered_at, self.problem = now, ""
         if previous is not None and previous != address:
+            self.changes += 1
             self._outbox.emit(MappingChanged(self._family, address, previous, server))
         elif not self._announced:
             self._outbox.emit(Mapped(self._family, address, server))
@@ -187,6 +200,7 @@ class StunFamilyClient:
         if self._waiting:
             self._ask_next_server(now)
         elif not self._transactions:
+            self.problem = self._reason
             self._outbox.emit(Failed(self._family, self._reason, self.mapping))
             self._announced = False
             wait_s = min(self._config.retry_s * 2.0**self._failed_rounds, self._config.max_retry_s)

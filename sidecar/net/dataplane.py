@@ -13,17 +13,19 @@ import logging
 import threading
 import time
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link_events import CheckPaths, ResetPaths, SendClose, SetCredential
+from sidecar.core.link_events import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
+from sidecar.core.pinging import Pong
 from sidecar.net.decoder import Decoder
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from protos.credential import SessionCredential
     from protos.model import (
@@ -42,7 +44,9 @@ if TYPE_CHECKING:
     from sidecar.core.decoding import Decoding
     from sidecar.core.events import ExecutionId, RejectReason, RequestId
     from sidecar.core.link_events import LinkEvent
-    from sidecar.core.path_id import PathState
+    from sidecar.core.path_history import Change
+    from sidecar.core.path_id import PathId, PathState
+    from sidecar.core.path_view import PathView
     from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
@@ -78,6 +82,8 @@ class DataPlaneHooks:
     """A peer sent revocation lists (PEM), which nobody has judged; called with the engine's lock held."""
     report_urgent: Callable[[], None] = lambda: None
     """Something happened that the next report should tell at once; called with the engine's lock held."""
+    pong: Callable[[Pong], None] = lambda _: None
+    """What became of a ping; called on an interface's thread, which must not wait there."""
 
 
 class ThreadedDataPlane:
@@ -336,6 +342,33 @@ class ThreadedDataPlane:
             link.post(CheckPaths())
             link.wake()
 
+    # -- what people ask of one node ------------------------------------------------------------------------------
+
+    def ping(self, path: PathId, number: int, size: int) -> None:
+        """Send a ping of `size` bytes over this path; `DataPlaneHooks.pong` is told what became of it, if anything."""
+        link = self._links.get(path.interface)
+        if link is None:
+            self._hooks.pong(Pong(number, path, problem="there is no such interface"))
+            return
+        link.post(Ping(path, number, size))
+        link.wake()
+
+    def paths_to(self, peer: str) -> list[PathId]:
+        """Return the paths to a peer that links have, whatever their state; takes no lock."""
+        return [path for link in list(self._links.values()) for path in link.link.paths_to(peer)]
+
+    def refused_peers(self, at_most: int) -> list[tuple[NodeName, str]]:
+        """Return who is not talked to, and why."""
+        with self._lock:
+            refused = list(islice(self._engine.peers.refused.values(), at_most))
+        return [(refusal.peer.name, refusal.why) for refusal in refused]
+
+    def path_views(self, now: float) -> Iterator[tuple[PathView, Change | None]]:
+        """Yield how each path is, and its last change; takes no lock, and may be paused between two."""
+        for link in list(self._links.values()):
+            for view in link.link.views(now):
+                yield view, link.history.last(view.id)
+
     # -- what metrics and status read -----------------------------------------------------------------------------
 
     @property
@@ -374,6 +407,10 @@ class ThreadedDataPlane:
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
         """Take what STUN found."""
         self._hooks.stun(interface, event)
+
+    def on_pong(self, pong: Pong) -> None:
+        """Take what became of a ping."""
+        self._hooks.pong(pong)
 
     # -- DecodingOwner --------------------------------------------------------------------------------------------
 

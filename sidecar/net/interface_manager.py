@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from sidecar.config import SidecarConfig
     from sidecar.core.link_memory import LinkMemory
     from sidecar.core.session import OwnSession
+    from sidecar.core.stun_client import StunView
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane
     from sidecar.net.interface_thread import InterfaceThread
@@ -44,6 +45,23 @@ ERROR_PAUSE_S = 0.1
 """After an error, which may repeat itself at every turn."""
 COALESCE_S = 0.005
 """Between two readings of a flood of announcements: each costs a turn of the interpreter, which all threads share."""
+
+
+@dataclass(frozen=True, slots=True)
+class InterfaceView:
+    """One interface in use at one moment, for people."""
+
+    name: InterfaceName
+    suspended: bool
+    """It can carry nothing now."""
+    addresses: tuple[str, ...]
+    families: frozenset[int]
+    port: int
+    mtu: int
+    bound_to: str
+    hangs: int
+    """Times that its driver did not return for long."""
+    stun: tuple[StunView, ...]
 
 
 @dataclass(slots=True)
@@ -126,6 +144,25 @@ class InterfaceManager:
         """Return the interfaces that are wanted, and whether each can carry something; from any thread."""
         states = dict.fromkeys(self._idle, False)
         return states | {name: not managed.suspended for name, managed in list(self._managed.items())}
+
+    def views(self) -> list[InterfaceView]:
+        """Return how the interfaces in use are; from any thread."""
+        with self._lock:
+            managed = [(one, one.interface) for one in self._managed.values()]
+        return [
+            InterfaceView(
+                one.name,
+                one.suspended,
+                interface.addresses,
+                interface.families,
+                one.thread.port,
+                interface.mtu,
+                str(one.bound_to),
+                one.thread.link.stats.hangs,
+                () if one.thread.stun is None else tuple(one.thread.stun.views()),
+            )
+            for one, interface in managed
+        ]
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
         """Take what STUN found; called on the interface's thread."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 from sidecar.core.datagrams import Batch
 from sidecar.core.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
 from sidecar.core.link_events import PathChanged, Rebind
+from sidecar.core.path_history import PathHistory
 from sidecar.core.path_id import PathState
 from sidecar.net.batch_socket import RECEIVE_CALLS, BatchSocket
 from sidecar.net.path_log import PathLog
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from protos.model import Address, InterfaceName
     from sidecar.core.link import Link
     from sidecar.core.link_events import LinkCommand, LinkEvent
+    from sidecar.core.pinging import Pong
     from sidecar.core.stun_client import StunClient
     from sidecar.core.stun_events import StunEvent
 
@@ -56,6 +58,9 @@ class LinkOwner(Protocol):
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
         """Take what STUN found; called on the link's thread."""
 
+    def on_pong(self, pong: Pong) -> None:
+        """Take what became of a ping; called on the link's thread, which must not wait there."""
+
 
 class InterfaceThread:
     """One interface's thread."""
@@ -82,10 +87,16 @@ class InterfaceThread:
         """One burst at most: no more is asked for before it has left."""
         self._more = False
         self._path_log = PathLog()
+        self.history = PathHistory(link.stats.dropped)
         self._stopping = False
         self._abandoned = False
         self._turn_began: float | None = None
         self._thread = threading.Thread(target=self._run, name=f"plr-{link.identity.interface}", daemon=True)
+
+    @property
+    def stun(self) -> StunClient | None:
+        """Its STUN client, to be read only; None: STUN is off."""
+        return self._stun
 
     @property
     def interface(self) -> InterfaceName:
@@ -219,6 +230,8 @@ class InterfaceThread:
             if events:
                 self._owner.on_link_events(events)
                 self._note_paths(events)
+            while link.pongs:
+                self._owner.on_pong(link.pongs.popleft())
             if not self._inbox and not events:
                 return
             self._execute()
@@ -228,6 +241,7 @@ class InterfaceThread:
         for event in events:
             if isinstance(event, PathChanged):
                 self._path_log.note(event)
+                self.history.note(event, self._clock())
                 down = down or event.state is PathState.DOWN
                 if event.state is PathState.UP:
                     self.link.note_source(event.path, self._sources.towards)

@@ -240,6 +240,7 @@ def exported_metrics() -> dict[str, set[str]]:
             state_failures=dict,
             certificate=lambda: identity,
             revocations=lambda: RevocationState(LISTS, frozenset(), 86_400.0),
+            local_refused=lambda: {},
         )
     )
     control = Metrics()

@@ -131,6 +131,7 @@ def _sidecar_metrics() -> Iterator[Metric]:
         state_failures=dict,
         certificate=lambda: Identity(NodeName("robot"), IdentityRole.ROBOT, 1, 0.0, 1.0),
         revocations=lambda: RevocationState(LISTS, frozenset(), 86_400.0),
+        local_refused=lambda: {},
     )
     yield from SidecarCollector(sources).collect()
 

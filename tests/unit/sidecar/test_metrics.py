@@ -66,6 +66,7 @@ class Counters:
             state_failures=lambda: self.state_failures,
             certificate=lambda: None,
             revocations=lambda: None,
+            local_refused=lambda: {},
         )
 
 

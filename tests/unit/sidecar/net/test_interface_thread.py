@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pytest
 
     from sidecar.core.link_events import LinkEvent
+    from sidecar.core.pinging import Pong
     from sidecar.core.stun_events import StunEvent
 
 PATIENCE_S = 20.0
@@ -28,6 +29,9 @@ class Owner:
         pass
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
+        pass
+
+    def on_pong(self, pong: Pong) -> None:
         pass
 
 

@@ -1,0 +1,38 @@
+"""plr: hands each command over to whoever has it, and loads nothing else.
+
+The operator's commands are the control plane's, those about the node that one sits at the sidecar's. The planes do not
+import each other, and a robot need not have what the control plane needs: each tells in its entry points
+(`plr.commands` in pyproject.toml) what it has.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+GROUP = "plr.commands"
+OPERATOR = "operator"
+"""The entry point of all commands that have none of their own."""
+EXIT_FAILURE = 1
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns its exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    commands = {one.name: one for one in entry_points(group=GROUP)}
+    name = given[0] if given and given[0] in commands and given[0] != OPERATOR else OPERATOR
+    try:
+        run = commands[name].load()
+    except KeyError:
+        sys.stderr.write("plr: it is not installed as it should be: pip install --force-reinstall fogros2-plr\n")
+        return EXIT_FAILURE
+    except ModuleNotFoundError as error:
+        extra = "controlplane" if name == OPERATOR else "sidecar"
+        sys.stderr.write(f"plr: {error.name} is missing: pip install 'fogros2-plr[{extra}]'\n")
+        return EXIT_FAILURE
+    code: int = run(given if name == OPERATOR else given[1:])
+    return code

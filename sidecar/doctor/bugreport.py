@@ -1,0 +1,181 @@
+"""plr bugreport: collect what somebody else needs to find out what is wrong here, in one tar file, without secrets.
+
+examples:
+  plr bugreport                                writes plr-bugreport-NAME-TIME.tar.gz here
+  plr bugreport --output /tmp/report.tar.gz
+  plr bugreport --config try/robot.yaml
+
+In it: the configuration, what plr doctor finds, versions, the last journal lines, addresses and routes, sysctls, the
+metrics. Never in it: keys, certificates, the state folder, the environment beyond what ROS goes by. What looks like a
+secret is replaced by (left out). Names, addresses and services of your fleet are in it: look before you publish it.
+
+exit codes: 0 written, 1 it cannot be written, 2 bad usage
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tarfile
+import time
+import urllib.request
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import yaml
+
+from protos.config_file import parse_yaml, read_text
+from protos.errors import ConfigError
+from sidecar.doctor.command import as_json, as_text
+from sidecar.doctor.examination import examine
+from sidecar.doctor.options import parser_of, where_of
+from sidecar.doctor.scrub import scrubbed, scrubbed_value
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from sidecar.doctor.examination import Examination, Where
+
+EXIT_OK = 0
+EXIT_FAILURE = 1
+MAX_PART_BYTES = 8 << 20
+"""Of each file; a longer one loses its middle."""
+COMMAND_S = 15.0
+METRICS_S = 5.0
+JOURNAL_LINES = 2000
+PACKAGES = (
+    "fogros2-plr", "cryptography", "grpcio", "numpy", "prometheus-client", "protobuf", "pydantic", "pyroute2", "pyyaml",
+    "zfec", "ros-jazzy-rclpy",
+)  # fmt: skip
+COMMANDS = {
+    "ip-address.txt": ("ip", "-d", "-s", "address"),
+    "ip-route.txt": ("ip", "route", "show", "table", "all"),
+    "ip-6-route.txt": ("ip", "-6", "route", "show", "table", "all"),
+    "ip-rule.txt": ("ip", "rule"),
+    "sockets.txt": ("ss", "-uapnmi"),
+    "clock.txt": ("timedatectl", "show"),
+    "unit.txt": ("systemctl", "status", "plr-sidecar", "--no-pager", "--lines=0"),
+    "journal.txt": (
+        "journalctl", "--unit=plr-sidecar", "--no-pager", "--output=short-iso-precise", f"--lines={JOURNAL_LINES}"
+    ),
+}  # fmt: skip
+SYSCTLS = ("net/ipv4/conf/*/rp_filter", "net/ipv4/conf/*/arp_ignore", "net/core/[rw]mem_*", "net/ipv4/ip_forward")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `plr bugreport`; returns its exit code."""
+    parser = parser_of("plr bugreport", __doc__)
+    parser.add_argument("--output", type=Path, metavar="FILE", help="default: plr-bugreport-NAME-TIME.tar.gz here")
+    options = parser.parse_args(arguments)
+    where = where_of(options)
+    seen = examine(where)
+    name = "unknown" if seen.config is None else seen.config.name
+    stem = f"plr-bugreport-{name}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+    output = options.output or Path(f"{stem}.tar.gz")
+    try:
+        write(output, stem, seen, where)
+    except OSError as error:
+        sys.stderr.write(f"plr bugreport: {output} cannot be written: {error.strerror or error}\n")
+        return EXIT_FAILURE
+    sys.stdout.write(f"{output}: look through it before you publish it: tar tzf {output}\n")
+    return EXIT_OK
+
+
+def write(output: Path, stem: str, seen: Examination, where: Where) -> None:
+    """Write the tar, for nobody but this user to read; raises OSError."""
+    descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    with open(descriptor, "wb") as file, tarfile.open(fileobj=file, mode="w:gz") as tar:
+        for name, text in parts(seen, where):
+            data = _shortened(scrubbed(text)).encode(errors="replace")
+            info = tarfile.TarInfo(f"{stem}/{name}")
+            info.size, info.mtime, info.mode = len(data), int(time.time()), 0o600
+            tar.addfile(info, io.BytesIO(data))
+
+
+def parts(seen: Examination, where: Where) -> Iterator[tuple[str, str]]:
+    """Yield name and text of each file; what cannot be had says why."""
+    yield "doctor.txt", as_text(seen.findings)
+    yield "doctor.json", json.dumps(scrubbed_value(json.loads(as_json(seen))), indent=2)
+    yield "configuration.yaml", _configuration(where.config)
+    yield "versions.txt", _versions()
+    for name, command in COMMANDS.items():
+        yield name, _output(command)
+    yield "sysctl.txt", _sysctls()
+    yield "metrics.txt", _metrics(seen)
+
+
+def _shortened(text: str) -> str:
+    if len(text) <= MAX_PART_BYTES:
+        return text
+    half = MAX_PART_BYTES // 2
+    return f"{text[:half]}\n... {len(text) - 2 * half} characters left out ...\n{text[-half:]}"
+
+
+def _configuration(path: Path) -> str:
+    """The configuration as it was read: comments, which may hold anything, are not in it."""
+    try:
+        return yaml.safe_dump(scrubbed_value(parse_yaml(read_text(path), str(path))), sort_keys=False)
+    except ConfigError as error:
+        return f"{error}\n"
+
+
+def _versions() -> str:
+    lines = [f"python {platform.python_version()} ({sys.executable})", f"kernel {platform.release()}"]
+    lines += [f"machine {platform.machine()}, {os.cpu_count()} processors"]
+    try:
+        lines += [f"system {platform.freedesktop_os_release().get('PRETTY_NAME', 'unknown')}"]
+    except OSError:
+        lines += ["system unknown"]
+    for package in PACKAGES:
+        try:
+            lines.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            lines.append(f"{package} not installed here")
+    return "\n".join(lines) + "\n"
+
+
+def _output(command: tuple[str, ...]) -> str:
+    program = shutil.which(command[0])
+    if program is None:
+        return f"{command[0]} is not there\n"
+    try:
+        done = subprocess.run(  # noqa: S603  (commands of ours, no shell)
+            (program, *command[1:]),
+            capture_output=True,
+            timeout=COMMAND_S,
+            check=False,
+            env={**os.environ, "LC_ALL": "C"},
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{' '.join(command)}: {error}\n"
+    return done.stdout.decode(errors="replace") + done.stderr.decode(errors="replace")
+
+
+def _sysctls() -> str:
+    root = Path("/proc/sys")
+    lines = []
+    for pattern in SYSCTLS:
+        for path in sorted(root.glob(pattern)):
+            try:
+                lines.append(f"{path.relative_to(root)} = {path.read_text().strip()}")
+            except OSError as error:
+                lines.append(f"{path.relative_to(root)}: {error.strerror}")
+    return "\n".join(lines) + "\n"
+
+
+def _metrics(seen: Examination) -> str:
+    listen = None if seen.config is None else seen.config.metrics_listen
+    if listen is None:
+        return "no metrics are served\n"
+    try:
+        with urllib.request.urlopen(f"http://{listen}/metrics", timeout=METRICS_S) as answer:
+            data: bytes = answer.read(MAX_PART_BYTES)
+            return data.decode(errors="replace")
+    except (OSError, ValueError) as error:
+        return f"http://{listen}/metrics: {error}\n"

@@ -1,0 +1,304 @@
+"""Looks at a node: reads what the checks judge, asks the running sidecar, pings its paths."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from protos.errors import ConfigError, DecodeError
+from protos.identity import Identity, IdentityRole
+from protos.model import NodeName, ServiceName
+from protos.tls_files import load_tls_files
+from sidecar.config import load_config
+from sidecar.core.rules import Rules
+from sidecar.doctor import host, node_checks, running_checks
+from sidecar.doctor.finding import fail, ok, warn
+from sidecar.doctor.running_checks import Pinged
+from sidecar.local.client import LocalClient, LocalError
+from sidecar.net.interfaces import choose, list_interfaces
+from sidecar.ros import environment
+from sidecar.ros.errors import RosBridgeError
+from sidecar.state_file import MAX_FILE_BYTES, decode_clock_floor, decode_last_good
+from sidecar.state_store import CLOCK_FILE, LAST_GOOD_FILE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from typing import TypeVar
+
+    from protos.tls_files import TlsFiles
+    from sidecar.config import SidecarConfig
+    from sidecar.doctor.finding import Finding
+    from sidecar.doctor.running_checks import PathKey
+
+    T = TypeVar("T")
+
+DEFAULT_CONFIG = Path("/etc/plr/sidecar.yaml")
+RUNTIME_SOCKET = Path("/run/plr/sidecar.sock")
+PINGS = 3
+PING_EVERY_S = 0.2
+PING_BYTES = 64
+PING_PATIENCE_S = 2.0
+MAX_PATHS_OF_AN_INTERFACE = 12
+"""Pinged: three times as many pings at once as an interface lets through."""
+
+
+@dataclass(slots=True)
+class Examination:
+    """What was found, and what it was found from."""
+
+    findings: list[Finding] = field(default_factory=list)
+    state: dict[str, Any] | None = None
+    """Of the running sidecar; None: it does not answer."""
+    config: SidecarConfig | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Which sidecar is meant."""
+
+    config: Path = DEFAULT_CONFIG
+    socket: Path | None = None
+    """None: as the configuration says."""
+
+
+def sockets(where: Where, config: SidecarConfig | None) -> list[Path]:
+    """Return where the sidecar's socket may be, the likelier first."""
+    if where.socket is not None:
+        return [where.socket]
+    if config is None:
+        return [RUNTIME_SOCKET]
+    if config.local_socket != "auto":
+        return [] if config.local_socket is None else [Path(config.local_socket)]
+    return [config.state_dir / "sidecar.sock", RUNTIME_SOCKET]
+
+
+def connect(where: Where, config: SidecarConfig | None) -> LocalClient:
+    """Return a connection to the running sidecar; raises LocalError, which says why there is none."""
+    said = []
+    for path in sockets(where, config):
+        try:
+            return LocalClient(path)
+        except LocalError as error:
+            said.append(str(error))
+    raise LocalError(" and ".join(said) or "local_socket is null in the configuration")
+
+
+def read_config(where: Where, told: Mapping[str, Any] | None = None) -> SidecarConfig:
+    """Read the configuration; raises ConfigError.
+
+    `told` is the running sidecar's part `node`: its name and role where the certificate is not for this user to read.
+    """
+
+    def identify(folder: Path) -> Identity:
+        try:
+            return load_tls_files(folder).identity
+        except ConfigError:
+            if not told:
+                raise
+        role = IdentityRole.ROBOT if told.get("role") == "robot" else IdentityRole.CLOUD
+        return Identity(NodeName(str(told.get("name"))), role, 0, 0.0, 0.0)
+
+    return load_config(where.config, identify)
+
+
+def examine(where: Where, *, pinging: bool = True) -> Examination:
+    """Look at everything; takes some seconds, most of them for pings."""
+    seen = Examination()
+    config, problem = _try_config(where, None)
+    client = None
+    try:
+        client = connect(where, config)
+        seen.state = client.state()
+    except LocalError as error:
+        seen.findings.append(_not_running(error, where))
+    if config is None and seen.state is not None:
+        config, problem = _try_config(where, seen.state.get("node"))
+    seen.config = config
+    if seen.state is not None:
+        expected = None if config is None else config.name
+        seen.findings += _judged(lambda state: running_checks.node(state, expected), seen.state)
+    if problem is not None:
+        remedy = "correct it, and try: plr-sidecar --config FILE --check-config"
+        seen.findings.append(fail("configuration", str(problem), remedy))
+    elif config is not None:
+        seen.findings.append(ok("configuration", f"{where.config} is right"))
+    now_wall = time.time()
+    seen.findings += _certificate_and_clock(config, seen.state, now_wall)
+    seen.findings += _ros(where, config, seen.state)
+    seen.findings += _interfaces(config)
+    if seen.state is not None and client is not None:
+        pings = _ping_all(client, seen.state) if pinging else {}
+        seen.findings += _running(config, seen.state, pings)
+    if client is not None:
+        client.close()
+    return seen
+
+
+def _try_config(where: Where, told: Mapping[str, Any] | None) -> tuple[SidecarConfig | None, ConfigError | None]:
+    try:
+        return read_config(where, told), None
+    except ConfigError as error:
+        return None, error
+
+
+def _not_running(error: LocalError, where: Where) -> Finding:
+    if "may not ask" in str(error):
+        return fail("sidecar", f"not asked: {error}", "sudo plr doctor; or: usermod -aG plr $USER, and log in again")
+    remedy = "systemctl start plr-sidecar, and see: journalctl -u plr-sidecar -n 20"
+    if where.config != DEFAULT_CONFIG:
+        remedy = f"plr-sidecar --config {where.config}"
+    return fail("sidecar", f"the sidecar is not running: {error}; what follows is seen without it", remedy)
+
+
+def _certificate_and_clock(
+    config: SidecarConfig | None, state: dict[str, Any] | None, now_wall: float
+) -> Iterator[Finding]:
+    used = None if state is None else state.get("certificate")
+    files: TlsFiles | None = None
+    if config is not None and config.tls_dir is not None:
+        try:
+            files = load_tls_files(config.tls_dir)
+        except ConfigError as error:
+            if used is None:
+                yield fail("certificate", str(error), "plr ca issue, or read it as root")
+    if files is not None:
+        yield from node_checks.certificate(files, now_wall, used)
+    elif used is not None:
+        yield from node_checks.certificate_in_use(used, now_wall)
+    floors = [float(((state or {}).get("clock") or {}).get("floor") or 0.0)]
+    if config is not None:
+        floors.append(_read_state(config.state_dir / CLOCK_FILE, decode_clock_floor) or 0.0)
+    if files is not None:
+        # As a sidecar does when it starts: what the CA has signed is no later than now.
+        floors.append(files.identity.not_before)
+        floors += [one.signed_at for one in files.trust.lists().values() if one is not None]
+    yield from node_checks.clock(now_wall, max(floors), host.clock_state())
+
+
+def _read_state(path: Path, decode: Callable[[bytes], T]) -> T | None:
+    """Return what a file of the state folder holds, if it is there, for this user to read, and good."""
+    try:
+        with path.open("rb") as file:
+            return decode(file.read(MAX_FILE_BYTES))
+    except (OSError, DecodeError):
+        return None
+
+
+def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | None) -> Iterator[Finding]:
+    shell = dict(os.environ)
+    if state is not None:
+        # It has started, so its rclpy works; this shell's may be another.
+        used = node_checks.running_environment(state.get("node") or {}, shell)
+        yield from node_checks.ros(used, shell, None)
+        told = state.get("services") or {}
+        yield from node_checks.types(told.get("carried") or {}, told.get("missing_types") or {})
+        return
+    used = host.unit_environment(where.config)
+    yield from node_checks.ros(used, shell, environment.problem(used, thorough=True))
+    if config is not None:
+        wanted = _types_last_offered(config)
+        yield from node_checks.types(wanted, {name: kind for name, kind in wanted.items() if not _is_installed(kind)})
+
+
+def _types_last_offered(config: SidecarConfig) -> dict[str, str]:
+    """Types of the configured services that the peers of the last run offered."""
+    last = _read_state(config.state_dir / LAST_GOOD_FILE, lambda data: decode_last_good(data, config.node_name))
+    if last is None or last.peers is None:
+        return {}
+    rules = Rules(config.service_rules())
+    offers = [offer for peer in last.peers.peers for offer in peer.offers]
+    return {offer.name: offer.type for offer in offers if rules.find(offer.name) is not None}
+
+
+def _is_installed(kind: str) -> bool:
+    try:
+        from sidecar.ros.types import load_service_type
+
+        load_service_type(kind)
+    except (ImportError, RosBridgeError):
+        return False
+    return True
+
+
+def _interfaces(config: SidecarConfig | None) -> Iterator[Finding]:
+    try:
+        choice = choose(list_interfaces(), None if config is None else config.interfaces)
+    except OSError as error:
+        yield warn("interface", f"cannot be listed: {error}", "is netlink allowed here")
+        return
+    yield from node_checks.interfaces(choice)
+    names = [one.name for one in choice.usable if one.kind != "loopback"]
+    yield from node_checks.reverse_path({name: host.reverse_path_filter(name) for name in names})
+
+
+def _running(config: SidecarConfig | None, state: dict[str, Any], pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
+    rules = None if config is None else Rules(config.service_rules())
+    targets = {} if config is None else {service.name: service.target_miss for service in config.services}
+
+    def target(service: str) -> float | None:
+        rule = None if rules is None else rules.find(ServiceName(service))
+        return None if rule is None else targets.get(rule.pattern)
+
+    yield from _judged(running_checks.devices, state)
+    yield from _judged(running_checks.stun, state)
+    yield from _judged(running_checks.mtu, state)
+    yield from _judged(lambda told: running_checks.paths(told, pings), state)
+    yield from _judged(running_checks.services, state)
+    yield from _judged(lambda told: running_checks.mapping(told, target), state)
+    yield from _judged(running_checks.control, state)
+
+
+def _judged(check: Callable[[dict[str, Any]], Iterator[Finding]], state: dict[str, Any]) -> list[Finding]:
+    try:
+        return list(check(state))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        text = f"what the sidecar tells is not understood ({type(error).__name__}: {error})"
+        return [warn("sidecar", text, "run the plr of the same version as the sidecar: plr --version")]
+
+
+def _ping_all(client: LocalClient, state: dict[str, Any]) -> dict[PathKey, Pinged]:
+    """Ping the paths that are not down, some times each; of very many, some."""
+    chosen: Counter[str] = Counter()
+    pings: dict[PathKey, Pinged] = {}
+    peers: dict[str, None] = {}
+    for path in state.get("paths") or ():
+        if path.get("state") != "down" and chosen[path["interface"]] < MAX_PATHS_OF_AN_INTERFACE:
+            chosen[path["interface"]] += 1
+            peers[path["peer"]] = None
+            pings[path["interface"], path["peer"], path["remote"]] = Pinged(sent=PINGS)
+    try:
+        asked: dict[int, str] = {}
+        for turn in range(PINGS):
+            for peer in peers:
+                asked[client.ping(peer, None, PING_BYTES)] = peer
+            last = turn == PINGS - 1
+            _listen(client, asked, pings, PING_PATIENCE_S if last else PING_EVERY_S, until_answered=last)
+    except LocalError:
+        pass  # what was answered until then is told
+    return pings
+
+
+def _listen(
+    client: LocalClient, asked: dict[int, str], pings: dict[PathKey, Pinged], patience_s: float, *, until_answered: bool
+) -> None:
+    end = time.monotonic() + patience_s
+    while asked if until_answered else True:
+        line = client.next_line(end - time.monotonic())
+        if line is None:
+            return
+        peer = asked.get(line.get("id") or 0)
+        if peer is None:
+            continue
+        if line.get("end") or "error" in line:
+            del asked[line["id"]]
+            continue
+        pong = line["value"]
+        pinged = pings.setdefault((pong["interface"], peer, pong["remote"]), Pinged())
+        if pong["problem"]:
+            pinged.problem = pong["problem"]
+        else:
+            pinged.rtts_s.append(pong["rtt_s"])

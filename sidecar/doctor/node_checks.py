@@ -1,0 +1,174 @@
+"""What can be judged of a node without its sidecar: certificate, clock, ROS, interfaces. Pure: all is given."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from protos.certificate_term import term_problem
+from protos.clock_floor import SLACK_S
+from sidecar.doctor.finding import duration, fail, ok, warn
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from protos.identity import Identity
+    from protos.tls_files import TlsFiles
+    from sidecar.doctor.finding import Finding
+    from sidecar.doctor.host import ClockState
+    from sidecar.net.interfaces import InterfaceChoice
+
+SECONDS_PER_DAY = 86_400.0
+STRICT = 1
+SEE_ROUTES = "see docs/install.md, More than one interface"
+
+
+def certificate(files: TlsFiles, now_wall: float, used: Mapping[str, Any] | None = None) -> Iterator[Finding]:
+    """Judge a node's certificate files at `now_wall` (s since 1970); `used`: what the running sidecar tells of its."""
+    identity = files.identity
+    problem = term_problem(files, now_wall)
+    if problem is not None:
+        text, _, remedy = problem.text.partition("; ")
+        yield (warn if problem.in_force else fail)("certificate", text, remedy or "see docs/certificates.md")
+    else:
+        lists = [one for one in files.trust.lists().values() if one is not None]
+        held = ", ".join(f"number {one.number}, signed {duration(now_wall - one.signed_at)} ago" for one in lists)
+        revoked = f"not revoked by the list held ({held})" if lists else "no revocation list is held"
+        yield ok("certificate", f"{_who(identity)}, {_left(identity, now_wall)}, {revoked}")
+    serial = f"{identity.serial:x}"
+    if used is not None and used.get("serial") not in (None, serial):
+        yield warn(
+            "certificate",
+            f"{files.directory} holds another certificate than the one that the sidecar uses",
+            "look in its log for why it does not take it: journalctl -u plr-sidecar",
+        )
+
+
+def certificate_in_use(used: Mapping[str, Any], now_wall: float) -> Iterator[Finding]:
+    """Judge the certificate that a running sidecar tells of, where its files are not for this user."""
+    problem = used.get("problem")
+    if problem:
+        text, _, remedy = str(problem.get("text")).partition("; ")
+        yield (warn if problem.get("in_force") else fail)("certificate", text, remedy or "see docs/certificates.md")
+        return
+    lists = used.get("revocation_lists") or ()
+    held = ", ".join(f"number {one['number']}, signed {duration(now_wall - one['signed_at'])} ago" for one in lists)
+    revoked = f"not revoked by the list held ({held})" if lists else "no revocation list is held"
+    days = (used["not_after"] - now_wall) / SECONDS_PER_DAY
+    yield ok("certificate", f"{used['name']}, {used['role']}, {days:.0f} days left, {revoked}")
+
+
+def _who(identity: Identity) -> str:
+    return f"{identity.name}, {identity.role.value}"
+
+
+def _left(identity: Identity, now_wall: float) -> str:
+    return f"{(identity.not_after - now_wall) / SECONDS_PER_DAY:.0f} days left"
+
+
+def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[Finding]:
+    """Judge the host's clock against the newest time that the CA has signed (`floor`; 0: none known) and by NTP."""
+    set_it = "set it: timedatectl set-ntp true, or date -s"
+    if now_wall < floor - SLACK_S:
+        yield fail("clock", f"behind what the CA has signed, by {duration(floor - now_wall)} at least", set_it)
+        return
+    if state is None:
+        yield ok("clock", "not before what the CA has signed; whether NTP keeps it is not known here")
+    elif not state.synchronised:
+        yield warn(
+            "clock",
+            "not before what the CA has signed, but nobody keeps it (the kernel calls it unsynchronised)",
+            "run an NTP client: timedatectl set-ntp true, or apt install chrony",
+        )
+    else:
+        yield ok("clock", f"kept by NTP, wrong by {state.error_s * 1000:.0f} ms at most")
+
+
+def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str | None) -> Iterator[Finding]:
+    """Judge ROS by the sidecar's `environment`; `problem` is what `sidecar.ros.environment` found."""
+    if problem is not None:
+        text, _, remedy = problem.partition(": ")
+        yield fail("ros", text if remedy else problem, remedy or "see docs/install.md, ROS on the host")
+    else:
+        yield ok(
+            "ros", f"rclpy works, with {environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp (the default)'}"
+        )
+    domain, here = (env.get("ROS_DOMAIN_ID") or "0" for env in (environment, shell))
+    note = "" if domain == here else f" (this shell: {here}; what is started in it does not see the sidecar)"
+    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
+    profile = environment.get("FASTRTPS_DEFAULT_PROFILES_FILE") or environment.get("FASTDDS_DEFAULT_PROFILES_FILE")
+    if reach in ("LOCALHOST", "OFF") or (profile and reach == "SYSTEM_DEFAULT"):
+        by = f", by {profile}" if reach == "SYSTEM_DEFAULT" else ""
+        yield ok("domain", f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}{by}")
+    else:
+        yield warn(
+            "domain",
+            f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}: ROS talks on every network, past the sidecar",
+            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, as the unit does in its way",
+        )
+
+
+def types(wanted: Mapping[str, str], missing: Mapping[str, str]) -> Iterator[Finding]:
+    """Judge the types of services, by name; `missing` are those that this environment does not have."""
+    for name, kind in sorted(missing.items()):
+        package = kind.partition("/")[0]
+        yield fail(
+            "types",
+            f"{name}: its type {kind} is not installed in the sidecar's environment",
+            f"apt install ros-jazzy-{package.replace('_', '-')}, or add its workspace to /etc/plr/sidecar.env",
+        )
+    there = [f"{name} ({kind})" for name, kind in sorted(wanted.items()) if name not in missing]
+    if there:
+        yield ok("types", f"installed: {', '.join(there)}")
+
+
+def interfaces(choice: InterfaceChoice) -> Iterator[Finding]:
+    """Judge what is configured against what is there."""
+    for one in choice.usable:
+        routed = sorted({family for family, _ in one.gateways})
+        routes = "default route over " + " and ".join(f"IPv{family}" for family in routed) if routed else ""
+        yield ok(
+            "interface",
+            f"{one.name}: carrier, {', '.join(one.addresses)}, MTU {one.mtu}, {routes or 'no default route'}",
+        )
+        if not routed and one.kind != "loopback" and len(choice.usable) > 1:
+            yield warn(
+                "interface",
+                f"{one.name}: no default route leaves by it, so that it reaches its own subnet only",
+                f"add one with a metric of its own; {SEE_ROUTES}",
+            )
+    cures = {
+        "down": "ip link set {} up",
+        "no carrier": "look at cable, SIM, access point: nmcli device, mmcli -m any",
+        "no address": "DHCP: nmcli device reapply {}, or networkctl renew {}",
+    }
+    for skipped in choice.skipped:
+        if skipped.wanted:
+            cure = cures.get(skipped.reason, "see docs/troubleshooting.md").replace("{}", skipped.name)
+            yield warn("interface", f"{skipped.name}: {skipped.reason}; it carries nothing now", cure)
+    for name in choice.missing:
+        yield warn("interface", f"{name}: configured, and not there", "plug it in, or correct `interfaces`: ip link")
+    if not choice.usable:
+        there = ", ".join(f"{skipped.name} ({skipped.reason})" for skipped in choice.skipped) or "none"
+        yield fail("interface", f"no interface can carry anything; there are: {there}", "bring one up, or name it")
+
+
+def reverse_path(filters: Mapping[str, int | None]) -> Iterator[Finding]:
+    """Judge `rp_filter` as it is in force on each interface that is used."""
+    strict = sorted(name for name, value in filters.items() if value == STRICT)
+    if strict and len(filters) > 1:
+        yield warn(
+            "rp_filter",
+            f"strict on {', '.join(strict)}: answers that come over an interface which is not the best way back are lost",
+            f"sysctl -w {' '.join(f'net.ipv4.conf.{name}.rp_filter=2' for name in ('all', *strict))}; {SEE_ROUTES}",
+        )
+        return
+    names = {None: "unknown", 0: "off", 1: "strict", 2: "loose"}
+    shown = ", ".join(f"{name} {names.get(value, value)}" for name, value in sorted(filters.items()))
+    if shown:
+        yield ok("rp_filter", shown + (" (harmless with one interface)" if strict else ""))
+
+
+def running_environment(node: Mapping[str, Any], shell: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment of the running sidecar, as far as it tells."""
+    told = node.get("environment")
+    return {str(key): str(value) for key, value in told.items()} if isinstance(told, dict) else dict(shell)

@@ -1,0 +1,198 @@
+"""plr ping: how long each path to a peer takes, over the data plane: sealed datagrams, answered by the peer's sidecar.
+
+examples:
+  plr ping cloud-1                      over each path, once a second, until Ctrl-C
+  plr ping cloud-1 -c 10 -i 0.2         ten times, five times a second
+  plr ping cloud-1 -I wwan0 -s 1200     over one interface, datagrams of 1200 bytes
+  plr ping robot-7 -c 3 --config /etc/plr/sidecar.yaml
+
+It works while a path rests, and changes nothing of what the sidecar believes of it. A path that is down is not pinged:
+the sidecar itself looks whether it comes back.
+
+exit codes: 0 something was answered, 1 nothing was, 2 bad usage
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from protos.errors import ConfigError
+from sidecar.core.pinging import LEAST_BYTES
+from sidecar.core.pmtu import MAX_BYTES
+from sidecar.doctor.examination import connect, read_config
+from sidecar.doctor.finding import share
+from sidecar.doctor.options import number, parser_of, where_of, whole
+from sidecar.local.client import LocalError
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable, Sequence
+
+    from sidecar.config import SidecarConfig
+    from sidecar.doctor.examination import Where
+    from sidecar.local.client import LocalClient
+
+EXIT_OK = 0
+EXIT_NO_ANSWER = 1
+LEAST_INTERVAL_S = 0.1
+"""The sidecar sends 20 pings a second over an interface, at most."""
+DEFAULT_BYTES = 64
+
+
+@dataclass(slots=True)
+class PathTally:
+    """What came of the pings over one path."""
+
+    sent: int = 0
+    rtts_s: list[float] = field(default_factory=list)
+    unsent: int = 0
+    """Of the sent: those that did not leave, for a reason that was told."""
+
+    def line(self) -> str:
+        """Return the statistics in one line."""
+        lost = 1.0 - len(self.rtts_s) / self.sent if self.sent else 0.0
+        text = f"{self.sent} sent, {len(self.rtts_s)} answered, {share(max(0.0, lost))} lost"
+        if self.rtts_s:
+            ordered = sorted(self.rtts_s)
+            figures = (ordered[0], sum(ordered) / len(ordered), quantile(ordered, 0.99), ordered[-1])
+            text += f", min/avg/P99/max {'/'.join(f'{one * 1000:.2f}' for one in figures)} ms"
+        return text
+
+
+def quantile(ordered: Sequence[float], part: float) -> float:
+    """Return the smallest value that at least this part of the values does not exceed; they are sorted, and some."""
+    return ordered[max(0, math.ceil(part * len(ordered)) - 1)]
+
+
+class Pinger:
+    """Sends rounds of pings to one peer, and says what comes."""
+
+    def __init__(
+        self, client: LocalClient, peer: str, interface: str | None, size: int, say: Callable[[str], None]
+    ) -> None:
+        self.tallies: dict[tuple[str, int], PathTally] = {}
+        """By interface and number of the peer's interface."""
+        self._client = client
+        self._peer = peer
+        self._interface = interface
+        self._size = size
+        self._say = say
+        self._rounds: dict[int, int] = {}
+        """Turn of each request that is out."""
+
+    def run(self, count: int | None, interval_s: float, wait_s: float) -> None:
+        """Ping `count` times (None: for ever); raises LocalError."""
+        turn = 0
+        next_at = time.monotonic()
+        while count is None or turn < count:
+            turn += 1
+            self._rounds[self._client.ping(self._peer, self._interface, self._size)] = turn
+            next_at += interval_s
+            self._listen(next_at, only_while_out=turn == count)
+        if self._rounds:
+            self._listen(time.monotonic() + wait_s, only_while_out=True)
+
+    def _listen(self, until: float, *, only_while_out: bool) -> None:
+        while self._rounds or not only_while_out:
+            line = self._client.next_line(until - time.monotonic())
+            if line is None:
+                return
+            self._take(line)
+
+    def _take(self, line: dict[str, Any]) -> None:
+        request = line.get("id") or 0
+        turn = self._rounds.get(request, 0)
+        if "error" in line:
+            self._rounds.pop(request, None)
+            if not self.tallies or not turn:
+                raise LocalError(str(line["error"]))
+            self._say(f"seq={turn}: {line['error']}")
+        elif line.get("end"):
+            self._rounds.pop(request, None)
+        elif line.get("part") == "pinged":
+            for one in line["value"]:
+                self.tallies.setdefault((one["interface"], one["remote"]), PathTally()).sent += 1
+        elif line.get("part") == "pong" and turn:
+            self._pong(turn, line["value"])
+
+    def _pong(self, turn: int, pong: dict[str, Any]) -> None:
+        key = pong["interface"], pong["remote"]
+        tally = self.tallies.setdefault(key, PathTally())
+        name = self.name(*key)
+        if pong["problem"]:
+            tally.unsent += 1
+            self._say(f"{name}: seq={turn} {pong['problem']}")
+        else:
+            tally.rtts_s.append(pong["rtt_s"])
+            self._say(f"{name}: seq={turn} time={pong['rtt_s'] * 1000:.2f} ms")
+
+    def name(self, interface: str, remote: int) -> str:
+        """Return what a path is called; the peer's interface is numbered where it has several."""
+        several = len({other for _, other in self.tallies}) > 1
+        return f"{interface} to {self._peer}" + (f" (its interface {remote})" if several else "")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `plr ping`; returns its exit code."""
+    parser = parser_of("plr ping", __doc__)
+    parser.add_argument("peer", metavar="PEER", help="a node's name, as plr doctor shows it")
+    parser.add_argument("-c", "--count", type=whole(1, 1_000_000), metavar="N", help="stop after so many")
+    parser.add_argument(
+        "-i", "--interval", type=number(LEAST_INTERVAL_S, 3600), default=1.0, metavar="S", help="seconds between two"
+    )
+    parser.add_argument(
+        "-s", "--size", type=whole(LEAST_BYTES, MAX_BYTES), default=DEFAULT_BYTES, metavar="BYTES", help="UDP payload"
+    )
+    parser.add_argument("-I", "--interface", metavar="NAME", help="over this interface only")
+    parser.add_argument(
+        "-W", "--wait", type=number(0.1, 10), default=2.0, metavar="S", help="seconds for the last answers"
+    )
+    parser.add_argument("--json", action="store_true", help="print the statistics as JSON, and nothing else")
+    options = parser.parse_args(arguments)
+    try:
+        with _connect(where_of(options)) as client:
+            return _ping(client, options)
+    except (LocalError, ConfigError) as error:
+        sys.stderr.write(f"plr ping: {error}\n")
+        return EXIT_USAGE if isinstance(error, ConfigError) else EXIT_NO_ANSWER
+
+
+def _connect(where: Where) -> LocalClient:
+    config: SidecarConfig | None = None
+    if where.socket is None:
+        try:
+            config = read_config(where)
+        except ConfigError:
+            # Not for this user to read, or changed since the start: the usual socket may do.
+            config = None
+    return connect(where, config)
+
+
+def _ping(client: LocalClient, options: argparse.Namespace) -> int:
+    def say(text: str) -> None:
+        if not options.json:
+            sys.stdout.write(text + "\n")
+            sys.stdout.flush()
+
+    pinger = Pinger(client, options.peer, options.interface, options.size, say)
+    try:
+        pinger.run(options.count, options.interval, options.wait)
+    except KeyboardInterrupt:
+        say("")
+    if options.json:
+        sys.stdout.write(json.dumps(_figures(pinger), indent=2) + "\n")
+    for key, tally in sorted(pinger.tallies.items()):
+        say(f"{pinger.name(*key)}: {tally.line()}")
+    return EXIT_OK if any(tally.rtts_s for tally in pinger.tallies.values()) else EXIT_NO_ANSWER
+
+
+def _figures(pinger: Pinger) -> list[dict[str, Any]]:
+    return [
+        {"interface": interface, "remote": remote, "sent": tally.sent, "unsent": tally.unsent, "rtts_s": tally.rtts_s}
+        for (interface, remote), tally in sorted(pinger.tallies.items())
+    ]

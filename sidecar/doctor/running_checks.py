@@ -1,0 +1,311 @@
+"""What a running sidecar's state says: STUN, MTU, paths, mapping, control stream. Pure.
+
+A state is what `LocalClient.state` returns. It may come from a sidecar of another version: what is missing is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from ipaddress import ip_address, ip_network
+from typing import TYPE_CHECKING, Any
+
+from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4, HEADERS_V6
+from sidecar.doctor.finding import duration, fail, milliseconds, ok, share, warn
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from sidecar.doctor.finding import Finding
+
+State = dict[str, Any]
+
+STUN_FRESH_S = 60.0
+"""A mapping is asked for every 15 s or so; older than this, several answers in a row are missing."""
+SEARCHED_S = 60.0
+"""After so long the search for a path's MTU is over."""
+LOSSY = 0.05
+"""Of datagrams; more is worth a line."""
+SHARED_ADDRESSES = ip_network("100.64.0.0/10")
+"""RFC 6598: behind a carrier's NAT."""
+
+
+@dataclass(slots=True)
+class Pinged:
+    """What came of the pings over one path."""
+
+    rtts_s: list[float] = field(default_factory=list)
+    sent: int = 0
+    problem: str = ""
+
+
+PathKey = tuple[str, str, int]
+"""Interface, peer, number of the peer's interface."""
+
+
+def node(state: State, expected: str | None) -> Iterator[Finding]:
+    """Say what runs; `expected` is the name in the configuration, if that could be read."""
+    told = state.get("node") or {}
+    name = told.get("name")
+    if expected is not None and name != expected:
+        yield fail(
+            "sidecar",
+            f"who answers is {name}, and the configuration is of {expected}",
+            "name the right one: --config FILE, --socket PATH",
+        )
+    else:
+        text = f"{name} ({told.get('role')}), version {told.get('version')}, up for {duration(told.get('up_s', 0.0))}"
+        yield ok("sidecar", text)
+    if told.get("insecure"):
+        yield warn("sidecar", "insecure: true: everybody is believed to be who they say", "use tls_dir: plr ca issue")
+    for refused in state.get("refused_peers") or ():
+        yield warn("peer", f"{refused['name']} is not talked to: {refused['why']}", "see docs/certificates.md")
+
+
+def stun(state: State) -> Iterator[Finding]:
+    """Judge what STUN found from each interface's data socket."""
+    if not (state.get("node") or {}).get("stun", True):
+        yield ok("stun", "off in the configuration")
+        return
+    for interface in state["interfaces"]:
+        if interface["suspended"]:
+            continue
+        answered = [one for one in interface["stun"] if _is_fresh(one)]
+        for one in answered:
+            yield ok("stun", _mapped(interface, one))
+        for one in interface["stun"]:
+            if one in answered:
+                continue
+            what = f"{interface['name']}: no answer over IPv{one['family']}"
+            why = one["problem"] or (
+                "asking" if one["answered_s"] is None else f"the last came {duration(one['answered_s'])} ago"
+            )
+            if answered:
+                yield ok("stun", f"{what} ({why}): harmless, as the other family is answered")
+            else:
+                remedy = "3478/udp of the control plane, a route over this interface, rp_filter"
+                yield warn("stun", f"{what}: {why}", f"look at {remedy}: docs/troubleshooting.md, STUN fails")
+        if not interface["stun"]:
+            yield warn("stun", f"{interface['name']}: no STUN server is known", "is the control plane's name resolved?")
+
+
+def _is_fresh(one: Mapping[str, Any]) -> bool:
+    return one["mapping"] is not None and one["answered_s"] is not None and one["answered_s"] <= STUN_FRESH_S
+
+
+def _mapped(interface: Mapping[str, Any], one: Mapping[str, Any]) -> str:
+    address, port = one["mapping"]
+    own = interface["addresses"]
+    if address in own:
+        nat = "no NAT" if port == interface["port"] else "the port is another than the socket's"
+    else:
+        nat = "a NAT that keeps the port" if port == interface["port"] else "a NAT that gives another port"
+        if any(":" not in addr and ip_address(addr) in SHARED_ADDRESSES for addr in own):
+            nat += ", a carrier's (100.64.0.0/10)"
+    if one["changes"]:
+        nat += f", another mapping {one['changes']} times"
+    return (
+        f"{interface['name']}: seen as {_shown(address, port)} ({nat}), "
+        f"answered {duration(one['answered_s'])} ago by {_shown(*one['server'])}"
+    )
+
+
+def _shown(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def devices(state: State) -> Iterator[Finding]:
+    """Say what is odd about the sockets and drivers of interfaces."""
+    for interface in state["interfaces"]:
+        if interface.get("bound_to") == "address":
+            yield warn(
+                "interface",
+                f"{interface['name']}: its socket is bound to an address, not to the device",
+                "let the unit have CAP_NET_RAW: docs/install.md, More than one interface",
+            )
+        if interface.get("hangs"):
+            times = interface["hangs"]
+            yield warn(
+                "interface", f"{interface['name']}: its driver hung {times} times", "look at dmesg, the firmware"
+            )
+
+
+def mtu(state: State) -> Iterator[Finding]:
+    """Compare what paths carry with what their interfaces take."""
+    takes = {interface["name"]: interface["mtu"] for interface in state["interfaces"]}
+    for name, paths in sorted(_by(state["paths"], lambda path: path["interface"]).items()):
+        carried: dict[int, int] = {}
+        for path in paths:
+            if path["state"] == "up" and path["address"] is not None:
+                headers = HEADERS_V6 if ":" in path["address"][0] else HEADERS_V4
+                carried[path["max_datagram"] + headers] = carried.get(path["max_datagram"] + headers, 0) + 1
+        stuck = [path for path in paths if _is_stuck(path) and takes.get(name, 0) >= 1400]
+        shown = ", ".join(f"{size} bytes ({count} paths)" for size, count in sorted(carried.items()))
+        if stuck:
+            yield warn(
+                "mtu",
+                f"{name}: takes {takes[name]} bytes, but to {_names(stuck)} only the least passes ({BASE_BYTES})",
+                "something drops long packets: a tunnel, or a firewall that drops fragments",
+            )
+        elif shown:
+            yield ok("mtu", f"{name}: takes {takes.get(name, '?')} bytes, paths carry {shown}")
+
+
+def _is_stuck(path: Mapping[str, Any]) -> bool:
+    return path["state"] == "up" and path["max_datagram"] <= BASE_BYTES and (path.get("since_s") or 0.0) > SEARCHED_S
+
+
+def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
+    """Judge each path; of what is down, say whom to blame: an interface, a peer, or the path itself."""
+    by_interface = _by(state["paths"], lambda path: path["interface"])
+    by_peer = _by(state["paths"], lambda path: path["peer"])
+    dark_interfaces = {name for name, ones in by_interface.items() if all(_is_down(one) for one in ones)}
+    dark_peers = {name for name, ones in by_peer.items() if all(_is_down(one) for one in ones)}
+    if not by_peer:
+        yield warn("path", "no peer is known", "is the control plane reached, does the policy let us: plr status")
+        return
+    if len(dark_peers) == len(by_peer):
+        yield fail(
+            "path",
+            f"nothing is reached, over none of {', '.join(sorted(by_interface))}: requests get no answer",
+            "look at the interfaces above, then at the peers' UDP port: docs/troubleshooting.md, A path is down",
+        )
+    else:
+        for name in sorted(dark_interfaces):
+            yield warn(
+                "path",
+                f"{name}: no peer is reached over it, while others are over other interfaces: {_why(by_interface[name])}",
+                f"the carrier or a firewall on it: ping -I {name} CLOUD; docs/troubleshooting.md, A path is down",
+            )
+        for name in sorted(dark_peers):
+            ones = [one for one in by_peer[name] if one["interface"] not in dark_interfaces]
+            yield warn(
+                "path",
+                f"{name}: not reached over {_over(ones or by_peer[name])}, while other peers are: {_why(by_peer[name])}",
+                f"look at {name}: is its host up, does its sidecar run, is its UDP port open",
+            )
+    told = {(path["interface"], path["peer"]) for path in state["paths"] if not _is_down(path)}
+    for path in sorted(state["paths"], key=lambda one: (one["peer"], one["interface"], one["remote"])):
+        blamed = path["interface"] in dark_interfaces or path["peer"] in dark_peers
+        # A peer's further interface that is not reached from here (IPv6 of its own, an inner network) is nothing odd.
+        if _is_down(path) and (blamed or (path["interface"], path["peer"]) in told):
+            continue
+        yield _path(path, pings.get((path["interface"], path["peer"], path["remote"])))
+
+
+def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
+    where = "" if path["address"] is None else f" ({_shown(*path['address'])})"
+    since = "" if path["since_s"] is None else f" for {duration(path['since_s'])}"
+    name = f"{path['interface']} to {path['peer']}{where}"
+    if _is_down(path):
+        why = f", {path['reason']}" if path["reason"] else ""
+        remedy = f"ping -I {path['interface']} {path['address'][0] if path['address'] else path['peer']}"
+        return warn("path", f"{name}: down{since}{why}", f"{remedy}; docs/troubleshooting.md, A path is down")
+    lost = path["lost"] / path["sent"] if path["sent"] else 0.0
+    measured = f"round trip {milliseconds(path['rtt_s'])}" if path["rtt_s"] else "round trip unknown"
+    text = f"{name}: {path['state']}{since}, {measured}, {share(lost)} lost"
+    if path["rests"]:
+        text += f", at rest (last heard {duration(path['proven_s'])} ago)"
+    if pinged is not None and pinged.sent:
+        if not pinged.rtts_s:
+            why = pinged.problem or "not answered"
+            return warn("path", f"{text}; {pinged.sent} pings: {why}", f"try again: plr ping {path['peer']}")
+        slowest, fastest = milliseconds(max(pinged.rtts_s)), milliseconds(min(pinged.rtts_s))
+        text += f"; ping {fastest} to {slowest}, {pinged.sent - len(pinged.rtts_s)} of {pinged.sent} lost"
+    if path["state"] != "up":
+        return warn("path", text, f"it may be about to die: plr ping {path['peer']} -I {path['interface']}")
+    if lost > LOSSY and path["sent"] >= 100:
+        return warn("path", text, "a weak signal or a full queue: look at the carrier")
+    return ok("path", text)
+
+
+def _is_down(path: Mapping[str, Any]) -> bool:
+    return bool(path["state"] == "down")
+
+
+def _why(ones: Sequence[Mapping[str, Any]]) -> str:
+    reasons = sorted({one["reason"] for one in ones if one["reason"]}) or ["never answered"]
+    known = [one["since_s"] for one in ones if one["since_s"] is not None]
+    return ", ".join(reasons) + (f" for {duration(min(known))}" if known else "")
+
+
+def _over(ones: Sequence[Mapping[str, Any]]) -> str:
+    return ", ".join(sorted({one["interface"] for one in ones}))
+
+
+def _names(ones: Sequence[Mapping[str, Any]]) -> str:
+    return ", ".join(sorted({one["peer"] for one in ones}))
+
+
+def _by(ones: Sequence[dict[str, Any]], key: Callable[[dict[str, Any]], str]) -> dict[str, list[dict[str, Any]]]:
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for one in ones:
+        groups.setdefault(key(one), []).append(one)
+    return groups
+
+
+def services(state: State) -> Iterator[Finding]:
+    """Judge what is carried."""
+    told = state.get("services") or {}
+    robot = (state.get("node") or {}).get("role") == "robot"
+    who = "a server that this robot knows of" if robot else "a node of this host's ROS domain"
+    for name in told.get("unmet") or ():
+        yield warn("service", f"{name}: configured, and not offered by {who}", "compare the names: plr status")
+    for name, nodes in sorted((told.get("left_alone") or {}).items()):
+        text = f"{name}: served by {', '.join(nodes)} on this robot, so that it is left alone"
+        yield warn("service", text, "stop that node, or rename its service")
+    carried = told.get("carried") or {}
+    if carried:
+        yield ok("service", f"offered {'here' if robot else 'to robots'}: {', '.join(sorted(carried))}")
+    else:
+        yield warn("service", "none is offered", "docs/troubleshooting.md, The service does not appear on the robot")
+
+
+def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Finding]:
+    """Judge what is mapped (robots); `targets` tells the largest share of misses that a service may have."""
+    if (state.get("node") or {}).get("role") != "robot":
+        return
+    told = state.get("mapping") or {}
+    if not told.get("version"):
+        carried = bool((state.get("services") or {}).get("carried"))
+        text = "none: this robot chooses by round trips" + ("" if carried else "; no service is offered yet")
+        yield warn("mapping", text, "is the control plane reached: see control")
+        return
+    where = f"version {told['version']} of the control plane, in force for {duration(told.get('age_s') or 0.0)}"
+    if told.get("source") == "disk":
+        where = f"version {told['version']}, kept on disk by an earlier run"
+        yield warn("mapping", f"{where}: the control plane has not told a newer one", "see control below")
+    else:
+        yield ok("mapping", where)
+    down = {(one["interface"], one["peer"]) for one in state["paths"]}
+    down -= {(one["interface"], one["peer"]) for one in state["paths"] if not _is_down(one)}
+    for one in state["mapped"]:
+        pairs = ", ".join(f"{pair['interface']} to {pair['server']}" for pair in one["pairs"]) or "nowhere"
+        miss = one["predicted_miss"]
+        text = f"{one['service']} goes {pairs}; predicted to miss {'unknown' if miss is None else share(miss)}"
+        target = targets(one["service"])
+        dead = [pair for pair in one["pairs"] if (pair["interface"], pair["server"]) in down]
+        if dead:
+            names = ", ".join(f"{pair['interface']} to {pair['server']}" for pair in dead)
+            yield warn("mapping", f"{text}, and {names} is down: others are taken", "see path above")
+        elif target is not None and miss is not None and miss > target:
+            yield warn("mapping", f"{text}, more than its target {share(target)}", "plr explain tells why")
+        else:
+            yield ok("mapping", text)
+
+
+def control(state: State) -> Iterator[Finding]:
+    """Judge the control stream."""
+    told = state.get("control") or {}
+    names = ", ".join(told.get("names") or ())
+    since = duration(told.get("since_s") or 0.0)
+    if told.get("connected"):
+        over = told.get("interface") or "the routing table's interface"
+        last = f"; before: {told['last_failure']}" if told.get("last_failure") else ""
+        yield ok("control", f"{names} reached for {since}, over {over}{last}")
+        return
+    why = told.get("last_failure") or "not connected yet"
+    yield warn(
+        "control",
+        f"{names} not reached for {since}: {why}; requests go on by the last mapping",
+        "docs/troubleshooting.md, The control plane is out of reach",
+    )

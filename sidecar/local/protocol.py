@@ -1,0 +1,108 @@
+"""What is said over a sidecar's local socket: a request is one line of JSON, its answer one or several. Pure. ::
+
+{"id": 1, "ask": "state"}                                        how everything is
+{"id": 2, "ask": "ping", "peer": "cloud-1", "interface": "wlan0", "size": 64}     a ping over each path to a peer
+
+{"id": 1, "part": "paths", "value": ...}      a piece of the answer; those called paths, interfaces come repeatedly
+{"id": 2, "part": "pinged", "value": [...]}   the paths over which it was to leave; then each that is answered:
+{"id": 2, "part": "pong", "value": {"interface": ..., "remote": ..., "rtt_s": ..., "problem": ...}}
+{"id": 1, "end": true}                        there is no more
+{"id": 1, "error": "..."}                     the request is refused
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from protos.errors import DecodeError
+from protos.names import node_name
+from sidecar.core.pmtu import MAX_BYTES
+
+VERSION = 1
+"""Told in the part `node`. A part or key that a client does not know is to be ignored."""
+MAX_REQUEST_BYTES = 1024
+"""Of one line, its end included."""
+MAX_ID = 1 << 32
+_MAX_INTERFACE_CHARACTERS = 15
+
+
+@dataclass(frozen=True, slots=True)
+class StateRequest:
+    """Asks how everything is."""
+
+    id: int
+
+
+@dataclass(frozen=True, slots=True)
+class PingRequest:
+    """Asks for one ping over each path to a peer."""
+
+    id: int
+    peer: str
+    interface: str | None
+    """Over this one alone."""
+    size: int
+    """Bytes of UDP payload, more where a probe does not fit."""
+
+
+def decode_request(line: bytes) -> StateRequest | PingRequest:
+    """Parse one line; raises DecodeError."""
+    if len(line) > MAX_REQUEST_BYTES:
+        raise DecodeError(f"a request has at most {MAX_REQUEST_BYTES} bytes")
+    try:
+        request = json.loads(line)
+    except (ValueError, RecursionError):
+        raise DecodeError("a request is one line of JSON") from None
+    if not isinstance(request, dict):
+        raise DecodeError("a request is an object")
+    request_id = _whole(request, "id", 0, MAX_ID)
+    match request.get("ask"):
+        case "state":
+            return StateRequest(request_id)
+        case "ping":
+            return PingRequest(request_id, _peer(request), _interface(request), _whole(request, "size", 0, MAX_BYTES))
+    raise DecodeError("ask is state or ping")
+
+
+def _whole(request: dict[str, Any], key: str, least: int, most: int) -> int:
+    value = request.get(key)
+    if type(value) is not int or not least <= value <= most:
+        raise DecodeError(f"{key} is a whole number from {least} to {most}")
+    return value
+
+
+def _peer(request: dict[str, Any]) -> str:
+    value = request.get("peer")
+    if not isinstance(value, str):
+        raise DecodeError("peer is a node's name")
+    return node_name(value, "peer")
+
+
+def _interface(request: dict[str, Any]) -> str | None:
+    value = request.get("interface")
+    if value is None:
+        return None
+    if not isinstance(value, str) or not 0 < len(value) <= _MAX_INTERFACE_CHARACTERS:
+        raise DecodeError("interface is an interface's name")
+    return value
+
+
+def encode_part(request_id: int, part: str, value: object) -> bytes:
+    """Return a line with a piece of an answer."""
+    return _line({"id": request_id, "part": part, "value": value})
+
+
+def encode_end(request_id: int) -> bytes:
+    """Return the line that ends an answer."""
+    return _line({"id": request_id, "end": True})
+
+
+def encode_error(request_id: int | None, text: str) -> bytes:
+    """Return the line that refuses a request; without id: whatever was asked."""
+    return _line({"id": request_id, "error": text})
+
+
+def _line(value: dict[str, object]) -> bytes:
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"

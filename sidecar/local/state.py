@@ -1,0 +1,231 @@
+"""How a running sidecar is, in parts for its local socket: what `plr doctor` judges.
+
+Built from what the threads leave behind, as metrics are. The engine's lock is held only to copy the few references of
+the mapping, of the services and of the peers that are refused.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import time
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from protos.certificate_term import term_problem
+from sidecar.core.path_id import PathState
+from sidecar.local.protocol import VERSION
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from protos.clock_floor import ClockFloor
+    from protos.model import InterfaceName
+    from protos.tls_files import TlsWatch
+    from sidecar.config import SidecarConfig
+    from sidecar.control_client import ControlView
+    from sidecar.core.path_id import PathId
+    from sidecar.net.dataplane import ThreadedDataPlane
+    from sidecar.net.interface_manager import InterfaceView
+    from sidecar.ros.stats import BridgeStats
+
+PATHS_A_PART = 16
+SERVICES_A_PART = 16
+MAX_REFUSED_PEERS = 64
+"""Shown of those that are not talked to."""
+ENVIRONMENT = (
+    "ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISTRO",
+    "RMW_IMPLEMENTATION", "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "CYCLONEDDS_URI",
+    "AMENT_PREFIX_PATH",
+)  # fmt: skip
+"""What is told of the environment: what ROS goes by, and nothing else."""
+
+
+@dataclass(frozen=True, slots=True)
+class MappingOrigin:
+    """Where the mapping in force comes from."""
+
+    source: str
+    """control plane, or disk."""
+    at: float
+    """When it was put in force (monotonic, s)."""
+
+
+@dataclass(frozen=True, slots=True)
+class LocalState:
+    """Asks the parts of a sidecar; every method may be called from any thread."""
+
+    config: SidecarConfig
+    version: str
+    data_plane: ThreadedDataPlane
+    interfaces: Callable[[], Iterable[InterfaceView]]
+    idle: Callable[[], Mapping[InterfaceName, bool]]
+    """Interfaces that are wanted, and whether each can carry something."""
+    control: Callable[[], ControlView]
+    bridge: Callable[[], BridgeStats]
+    unmet: Callable[[], Iterable[str]]
+    origin: Callable[[], MappingOrigin | None]
+    tls: TlsWatch | None
+    clock: ClockFloor
+    started_at: float
+    """Monotonic, s."""
+
+    def state(self) -> Iterator[tuple[str, Any]]:
+        """Yield the parts; ages are seconds, none is negative."""
+        now = time.monotonic()
+        yield "node", self._node(now)
+        yield "clock", {"floor": self.clock.floor}
+        if self.tls is not None:
+            yield "certificate", self._certificate()
+        for view in self.interfaces():
+            yield "interfaces", _interface(view, now)
+        yield "idle", [name for name, carries in self.idle().items() if not carries]
+        yield "control", self._control(now)
+        yield from self._services(now)
+        refused = self.data_plane.refused_peers(MAX_REFUSED_PEERS)
+        yield "refused_peers", [{"name": name, "why": why} for name, why in refused]
+        yield from self._paths(now)
+
+    def paths_to(self, peer: str, interface: str | None) -> list[PathId]:
+        """Return the paths to a peer; see `LocalSource`."""
+        return [path for path in self.data_plane.paths_to(peer) if interface in (None, path.interface)]
+
+    def ping(self, path: PathId, number: int, size: int) -> None:
+        """Send a ping; see `LocalSource`."""
+        self.data_plane.ping(path, number, size)
+
+    def _node(self, now: float) -> dict[str, Any]:
+        config = self.config
+        return {
+            "protocol": VERSION,
+            "name": config.name,
+            "role": config.role.value,
+            "version": self.version,
+            "python": platform.python_version(),
+            "pid": os.getpid(),
+            "up_s": now - self.started_at,
+            "insecure": config.insecure,
+            "stun": config.stun.enabled,
+            "environment": {name: os.environ[name] for name in ENVIRONMENT if name in os.environ},
+        }
+
+    def _certificate(self) -> dict[str, Any]:
+        assert self.tls is not None
+        files, judged_at = self.tls.current, self.clock.now()
+        problem = term_problem(files, judged_at)
+        lists = [one for one in files.trust.lists().values() if one is not None]
+        return {
+            "directory": str(files.directory),
+            "name": files.identity.name,
+            "role": files.identity.role.value,
+            "serial": f"{files.identity.serial:x}",
+            "not_before": files.identity.not_before,
+            "not_after": files.identity.not_after,
+            "judged_at": judged_at,
+            "problem": None if problem is None else {"in_force": problem.in_force, "text": problem.text},
+            "revocation_lists": [{"number": min(one.number, 1 << 53), "signed_at": one.signed_at} for one in lists],
+        }
+
+    def _control(self, now: float) -> dict[str, Any]:
+        view = self.control()
+        return {
+            "names": list(view.names),
+            "connected": view.connected,
+            "since_s": max(0.0, now - view.since),
+            "way": view.way,
+            "interface": view.interface,
+            "last_failure": view.last_failure,
+            "retry_in_s": None if view.connected else max(0.0, min(view.retry_at - now, 3600.0)),
+        }
+
+    def _services(self, now: float) -> Iterator[tuple[str, Any]]:
+        bridge = self.bridge()
+        offers, uses = self.data_plane.services()
+        types = {offer.name: offer.type for offer in offers} | {use.name: use.type for use in uses}
+        yield (
+            "services",
+            {
+                "carried": {name: types.get(name, "") for name in sorted(bridge.carried)},
+                "left_alone": {name: list(nodes) for name, nodes in bridge.left_alone.items()},
+                "missing_types": dict(bridge.missing_types),
+                "unmet": sorted(self.unmet()),
+                "configured": [service.name for service in self.config.services],
+            },
+        )
+        origin = self.origin()
+        mapped = self.data_plane.service_mappings
+        yield (
+            "mapping",
+            {
+                "version": self.data_plane.engine_stats.mapping_version,
+                "source": None if origin is None else origin.source,
+                "age_s": None if origin is None else max(0.0, now - origin.at),
+            },
+        )
+        deadlines = {use.name: use.deadline_s for use in uses}
+        rows = iter(mapped)
+        while part := list(islice(rows, SERVICES_A_PART)):
+            yield (
+                "mapped",
+                [
+                    {
+                        "service": one.service,
+                        "pairs": [{"interface": pair.interface, "server": pair.server} for pair in one.assignments],
+                        "predicted_miss": one.predicted_miss if math.isfinite(one.predicted_miss) else None,
+                        "reason": one.reason,
+                        "deadline_s": deadlines.get(one.service),
+                    }
+                    for one in part
+                ],
+            )
+
+    def _paths(self, now: float) -> Iterator[tuple[str, Any]]:
+        views = self.data_plane.path_views(now)
+        while part := list(islice(views, PATHS_A_PART)):
+            yield (
+                "paths",
+                [
+                    {
+                        "interface": view.id.interface,
+                        "peer": view.id.peer,
+                        "remote": view.id.remote,
+                        "address": None if view.remote is None else list(view.remote),
+                        "state": view.state.value,
+                        "since_s": None if change is None else max(0.0, now - change.at),
+                        "reason": None if change is None else change.reason,
+                        "rtt_s": view.smoothed_rtt_s,
+                        "sent": view.sent,
+                        "lost": max(0, view.lost - view.spurious),
+                        "max_datagram": view.max_datagram,
+                        "proven_s": max(0.0, now - view.proven_at),
+                        "rests": view.state is PathState.UP and view.probe_every_s > 1.0,
+                    }
+                    for view, change in part
+                ],
+            )
+
+
+def _interface(view: InterfaceView, now: float) -> dict[str, Any]:
+    return {
+        "name": view.name,
+        "suspended": view.suspended,
+        "addresses": list(view.addresses),
+        "port": view.port,
+        "mtu": view.mtu,
+        "bound_to": view.bound_to,
+        "hangs": view.hangs,
+        "stun": [
+            {
+                "family": one.family,
+                "mapping": None if one.mapping is None else list(one.mapping),
+                "server": None if one.server is None else list(one.server),
+                "answered_s": None if one.answered_at is None else max(0.0, now - one.answered_at),
+                "changes": one.changes,
+                "problem": one.problem,
+            }
+            for one in view.stun
+            if one.family in view.families
+        ],
+    }
