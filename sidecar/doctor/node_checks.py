@@ -158,7 +158,7 @@ def reverse_path(filters: Mapping[str, int | None]) -> Iterator[Finding]:
     if strict and len(filters) > 1:
         yield warn(
             "rp_filter",
-            f"strict on {', '.join(strict)}: answers that come over an interface which is not the best way back are lost",
+            f"strict on {', '.join(strict)}: answers that come over another interface than the best way back are lost",
             f"sysctl -w {' '.join(f'net.ipv4.conf.{name}.rp_filter=2' for name in ('all', *strict))}; {SEE_ROUTES}",
         )
         return

@@ -157,9 +157,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with _connect(where_of(options)) as client:
             return _ping(client, options)
-    except (LocalError, ConfigError) as error:
+    except LocalError as error:
         sys.stderr.write(f"plr ping: {error}\n")
-        return EXIT_USAGE if isinstance(error, ConfigError) else EXIT_NO_ANSWER
+        return EXIT_NO_ANSWER
 
 
 def _connect(where: Where) -> LocalClient:

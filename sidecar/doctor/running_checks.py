@@ -173,14 +173,14 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
         for name in sorted(dark_interfaces):
             yield warn(
                 "path",
-                f"{name}: no peer is reached over it, while others are over other interfaces: {_why(by_interface[name])}",
+                f"{name}: no peer is reached over it, while others are elsewhere: {_why(by_interface[name])}",
                 f"the carrier or a firewall on it: ping -I {name} CLOUD; docs/troubleshooting.md, A path is down",
             )
         for name in sorted(dark_peers):
             ones = [one for one in by_peer[name] if one["interface"] not in dark_interfaces]
             yield warn(
                 "path",
-                f"{name}: not reached over {_over(ones or by_peer[name])}, while other peers are: {_why(by_peer[name])}",
+                f"{name}: not reached over {_over(ones or by_peer[name])}, while others are: {_why(by_peer[name])}",
                 f"look at {name}: is its host up, does its sidecar run, is its UDP port open",
             )
     told = {(path["interface"], path["peer"]) for path in state["paths"] if not _is_down(path)}
