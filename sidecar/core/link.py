@@ -213,6 +213,10 @@ class Link:
         """What became of pings, the oldest first; the driver takes them out."""
         return self._table.pings.done
 
+    def path_ids(self) -> set[PathId]:
+        """Return all its paths; any thread may ask."""
+        return {path.id for path in list(self._paths.values())}
+
     def paths_to(self, peer: str) -> list[PathId]:
         """Return the paths to a peer; any thread may ask."""
         return [path.id for (name, _), path in self._paths.copy().items() if name == peer]

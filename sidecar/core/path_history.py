@@ -42,6 +42,10 @@ class PathHistory:
             del self._last[next(iter(self._last))]
             self._drops["path_history_full"] += 1
 
+    def all(self) -> dict[PathId, Change]:
+        """Return the last change of each path, those of peers that left included."""
+        return self._last.copy()
+
     def last(self, path: PathId) -> Change | None:
         """Return the last change of a path, if it is remembered."""
         return self._last.get(path)

@@ -19,6 +19,8 @@ class PathView:
     state: PathState
     remote: Address | None
     """Where it leads."""
+    candidates: int
+    """How many addresses of the peer are known, at which it may be."""
     smoothed_rtt_s: float
     """0 while none is known."""
     sent: int
@@ -43,6 +45,7 @@ def view_of(path: Path, now: float) -> PathView:
         path.id,
         path.state,
         path.remote,
+        len(path.candidates),
         recovery.rtt.smoothed,
         recovery.total_sent,
         recovery.total_lost,

@@ -247,6 +247,7 @@ def _running(config: SidecarConfig | None, state: dict[str, Any], pings: Mapping
     yield from _judged(running_checks.stun, state)
     yield from _judged(running_checks.mtu, state)
     yield from _judged(lambda told: running_checks.paths(told, pings), state)
+    yield from _judged(running_checks.gone, state)
     yield from _judged(running_checks.services, state)
     yield from _judged(lambda told: running_checks.mapping(told, target), state)
     yield from _judged(running_checks.control, state)
@@ -295,6 +296,8 @@ def _listen(
             continue
         if line.get("end") or "error" in line:
             del asked[line["id"]]
+            continue
+        if line.get("part") != "pong":
             continue
         pong = line["value"]
         pinged = pings.setdefault((pong["interface"], peer, pong["remote"]), Pinged())

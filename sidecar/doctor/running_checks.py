@@ -23,6 +23,12 @@ STUN_FRESH_S = 60.0
 """A mapping is asked for every 15 s or so; older than this, several answers in a row are missing."""
 SEARCHED_S = 60.0
 """After so long the search for a path's MTU is over."""
+STARTED_S = 20.0
+"""Peers are told, and probed, within this."""
+MAX_GONE = 8
+"""Lines about nodes that are no peers any more."""
+GOODBYE = "peer closed"
+"""Why a path went down to a node that ended as it should."""
 LOSSY = 0.05
 """Of datagrams; more is worth a line."""
 SHARED_ADDRESSES = ip_network("100.64.0.0/10")
@@ -163,10 +169,12 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
     if not by_peer:
         yield warn("path", "no peer is known", "is the control plane reached, does the policy let us: plr status")
         return
-    if len(dark_peers) == len(by_peer):
+    if len(dark_peers) == len(by_peer) and (state.get("node") or {}).get("up_s", STARTED_S) < STARTED_S:
+        yield warn("path", "nothing is reached yet: the sidecar has just started", "look again in a moment")
+    elif len(dark_peers) == len(by_peer):
         yield fail(
             "path",
-            f"nothing is reached, over none of {', '.join(sorted(by_interface))}: requests get no answer",
+            f"nothing is reached over {', '.join(sorted(by_interface))}: {_why(state['paths'])}",
             "look at the interfaces above, then at the peers' UDP port: docs/troubleshooting.md, A path is down",
         )
     else:
@@ -190,6 +198,27 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
         if _is_down(path) and (blamed or (path["interface"], path["peer"]) in told):
             continue
         yield _path(path, pings.get((path["interface"], path["peer"], path["remote"])))
+
+
+def gone(state: State) -> Iterator[Finding]:
+    """Say who was a peer a while ago and is none: just these are missing in everything else."""
+    now = {path["peer"] for path in state["paths"]}
+    left = {
+        peer: ones for peer, ones in _by(state.get("gone") or (), lambda one: one["peer"]).items() if peer not in now
+    }
+    for name, ones in list(left.items())[:MAX_GONE]:
+        since = duration(min(one["since_s"] for one in ones))
+        reasons = sorted({one["reason"] for one in ones})
+        if reasons == [GOODBYE]:
+            yield ok("peer", f"{name}: said goodbye {since} ago")
+            continue
+        yield warn(
+            "peer",
+            f"{name}: gone since {since}: {', '.join(reasons)} over {_over(ones)}; it is no peer now",
+            f"look at {name}: is its host up, does its sidecar run; plr status tells when and why it left",
+        )
+    if len(left) > MAX_GONE:
+        yield ok("peer", f"{len(left) - MAX_GONE} more that were peers within the last hour")
 
 
 def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
@@ -223,7 +252,10 @@ def _is_down(path: Mapping[str, Any]) -> bool:
 
 
 def _why(ones: Sequence[Mapping[str, Any]]) -> str:
-    reasons = sorted({one["reason"] for one in ones if one["reason"]}) or ["never answered"]
+    never = "never answered"
+    if not any(one.get("candidates", 1) or one["address"] for one in ones):
+        never = f"{_names(ones)} told no address (plr doctor there says why)"
+    reasons = sorted({one["reason"] for one in ones if one["reason"]}) or [never]
     known = [one["since_s"] for one in ones if one["since_s"] is not None]
     return ", ".join(reasons) + (f" for {duration(min(known))}" if known else "")
 

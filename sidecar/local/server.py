@@ -366,7 +366,9 @@ class LocalServer:
         paths = self._source.paths_to(request.peer, request.interface)
         if not paths:
             over = "" if request.interface is None else f" over {request.interface}"
-            client.unread += encode_error(request.id, f"there is no path to {request.peer}{over}")
+            client.unread += encode_error(
+                request.id, f"there is no path to {request.peer}{over}: plr doctor names the peers"
+            )
             return
         if len(self._out) + len(paths) > MAX_PINGS_OUT:
             self._too_often(client, request.id)

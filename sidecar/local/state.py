@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 PATHS_A_PART = 16
 SERVICES_A_PART = 16
+GONE_S, MAX_GONE = 3600.0, 64
+"""Paths to nodes that are no peers any more are told for so long, so many."""
 MAX_REFUSED_PEERS = 64
 """Shown of those that are not talked to."""
 ENVIRONMENT = (
@@ -86,6 +88,19 @@ class LocalState:
         yield from self._services(now)
         refused = self.data_plane.refused_peers(MAX_REFUSED_PEERS)
         yield "refused_peers", [{"name": name, "why": why} for name, why in refused]
+        gone = self.data_plane.gone_paths(now - GONE_S, MAX_GONE)
+        yield (
+            "gone",
+            [
+                {
+                    "interface": path.interface,
+                    "peer": path.peer,
+                    "since_s": max(0.0, now - last.at),
+                    "reason": last.reason,
+                }
+                for path, last in gone
+            ],
+        )
         yield from self._paths(now)
 
     def paths_to(self, peer: str, interface: str | None) -> list[PathId]:
@@ -192,6 +207,7 @@ class LocalState:
                         "peer": view.id.peer,
                         "remote": view.id.remote,
                         "address": None if view.remote is None else list(view.remote),
+                        "candidates": view.candidates,
                         "state": view.state.value,
                         "since_s": None if change is None else max(0.0, now - change.at),
                         "reason": None if change is None else change.reason,

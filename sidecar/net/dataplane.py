@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.link_events import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
+from sidecar.core.path_id import PathState
 from sidecar.core.pinging import Pong
 from sidecar.net.decoder import Decoder
 from sidecar.net.timerfd import Timer
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     from sidecar.core.events import ExecutionId, RejectReason, RequestId
     from sidecar.core.link_events import LinkEvent
     from sidecar.core.path_history import Change
-    from sidecar.core.path_id import PathId, PathState
+    from sidecar.core.path_id import PathId
     from sidecar.core.path_view import PathView
     from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
@@ -368,6 +369,16 @@ class ThreadedDataPlane:
         for link in list(self._links.values()):
             for view in link.link.views(now):
                 yield view, link.history.last(view.id)
+
+    def gone_paths(self, since: float, at_most: int) -> list[tuple[PathId, Change]]:
+        """Return the paths that are no more, as their peers are none any more, and that lived after `since`; the latest
+        first; takes no lock."""
+        gone: list[tuple[PathId, Change]] = []
+        for link in list(self._links.values()):
+            known = link.link.path_ids()
+            gone += [(path, last) for path, last in link.history.all().items() if path not in known]
+        gone = [(path, last) for path, last in gone if last.state is PathState.DOWN and last.at > since]
+        return sorted(gone, key=lambda one: -one[1].at)[:at_most]
 
     # -- what metrics and status read -----------------------------------------------------------------------------
 
