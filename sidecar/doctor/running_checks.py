@@ -214,7 +214,7 @@ def gone(state: State) -> Iterator[Finding]:
             continue
         yield warn(
             "peer",
-            f"{name}: gone since {since}: {', '.join(reasons)} over {_over(ones)}; it is no peer now",
+            f"{name}: gone for {since}: {', '.join(reasons)} over {_over(ones)}; it is no peer now",
             f"look at {name}: is its host up, does its sidecar run; plr status tells when and why it left",
         )
     if len(left) > MAX_GONE:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import queue
 import random
 import socket
 import threading
@@ -44,6 +45,7 @@ from sidecar.core.events import (
 )
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
+from sidecar.core.path_id import PathState
 from sidecar.core.rules import ServiceRule
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from protos.credential import SessionCredential
+    from sidecar.core.pinging import Pong
 
 SERVICE, TYPE = ServiceName("/echo"), "t/srv/Echo"
 PATIENCE_S = 20.0
@@ -71,7 +74,16 @@ class Node:
         self.reach_changes = 0
         self.news = threading.Condition()
         config = EngineConfig(role, (ServiceRule(SERVICE, 5.0, 20.0, idempotent=True),))
-        hooks = DataPlaneHooks(self, lambda *_: None, lambda: None, self.count_reach, lambda _: None, lambda *_: None)
+        self.pongs: queue.SimpleQueue[Pong] = queue.SimpleQueue()
+        hooks = DataPlaneHooks(
+            self,
+            lambda *_: None,
+            lambda: None,
+            self.count_reach,
+            lambda _: None,
+            lambda *_: None,
+            pong=self.pongs.put,
+        )
         own = self.own = session_of(name, role, session)
         self.plane = ThreadedDataPlane(config, own, hooks)
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -152,6 +164,41 @@ def test_requests_of_all_sizes_are_answered_once_each(nodes: tuple[Node, Node], 
         b"echo:" + payload for payload in payloads
     ]
     assert len(answers) == len(payloads)
+
+
+@pytest.mark.audit("ops-14")
+def test_each_end_pings_the_other_and_sees_its_paths(nodes: tuple[Node, Node]) -> None:
+    for node, other in (nodes, nodes[::-1]):
+        (path,) = node.plane.paths_to(other.name)
+        for number in range(3):
+            node.plane.ping(path, number, 500)
+            pong = node.pongs.get(timeout=PATIENCE_S)
+            assert (pong.number, pong.path, pong.problem) == (number, path, "")
+            assert 0.0 < pong.rtt_s < PATIENCE_S
+        ((view, change),) = node.plane.path_views(time.monotonic())
+        assert view.id == path
+        assert change is not None
+        assert change.state is view.state is PathState.UP
+        assert not node.thread.link.stats.dropped["unasked_probe_reply"]
+    robot = nodes[0]
+    robot.plane.ping(path._replace(interface=InterfaceName("wwan9")), 9, 64)
+    assert robot.pongs.get(timeout=PATIENCE_S).problem == "there is no such interface"
+
+
+@pytest.mark.audit("ops-14")
+def test_a_peer_that_is_gone_is_told_of(nodes: tuple[Node, Node]) -> None:
+    robot, cloud = nodes
+    cloud.stop()
+    deadline = time.monotonic() + PATIENCE_S
+    while robot.plane._engine.routes.reaches(cloud.name) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    robot.plane.apply_peers(PeerSet(Version(2), 2, ()))
+    while not (gone := robot.plane.gone_paths(0.0, 8)) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    ((path, last),) = gone
+    assert path.peer == cloud.name
+    assert last.reason == "peer closed"
+    assert robot.plane.gone_paths(time.monotonic(), 8) == []
 
 
 def test_garbage_into_the_socket_is_counted_and_the_rest_is_served(nodes: tuple[Node, Node]) -> None:

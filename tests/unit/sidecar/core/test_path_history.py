@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from protos.model import InterfaceId
+from sidecar.core.link_events import PathChanged
+from sidecar.core.path_history import MAX_REMEMBERED, Change, PathHistory
+from sidecar.core.path_id import PathId, PathState
+from tests.unit.sidecar.core.builders import WLAN, A
+
+pytestmark = pytest.mark.audit("ops-14")
+
+PATH = PathId(WLAN, A, InterfaceId(0))
+
+
+def test_it_tells_since_when_and_why_and_not_how_often_it_was_told() -> None:
+    history = PathHistory(Counter())
+    assert history.last(PATH) is None
+    history.note(PathChanged(PATH, PathState.UP, "answers"), 1.0)
+    history.note(PathChanged(PATH, PathState.DOWN, "silent"), 5.0)
+    history.note(PathChanged(PATH, PathState.DOWN, "not usable here"), 9.0)
+    assert history.last(PATH) == Change(PathState.DOWN, 5.0, "silent")
+
+
+def test_it_forgets_what_changed_longest_ago_and_counts_that() -> None:
+    drops: Counter[str] = Counter()
+    history = PathHistory(drops)
+    for number in range(MAX_REMEMBERED + 1):
+        history.note(PathChanged(PATH._replace(peer=f"cloud-{number}"), PathState.UP, "answers"), 1.0)  # type: ignore[arg-type]
+    assert len(history.all()) == MAX_REMEMBERED
+    assert drops == {"path_history_full": 1}

@@ -1,0 +1,159 @@
+"""What is judged of a node without its sidecar: each check is seen to pass and to fail."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from controlplane.ca import Authority
+from protos.identity import IdentityRole
+from protos.model import InterfaceName
+from protos.tls_files import load_tls_files
+from sidecar.doctor import node_checks
+from sidecar.doctor.finding import Finding, Level
+from sidecar.doctor.host import ClockState, reverse_path_filter, unit_environment
+from sidecar.net.interfaces import Interface, choose
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+pytestmark = pytest.mark.audit("ops-14")
+
+NOW = time.time()
+DAY = 86_400.0
+LOCALHOST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def one(findings: Iterable[Finding]) -> Finding:
+    (finding,) = findings
+    return finding
+
+
+def levels(findings: Iterable[Finding]) -> list[Level]:
+    found = list(findings)
+    assert all(finding.remedy for finding in found if finding.level is not Level.OK)
+    return [finding.level for finding in found]
+
+
+@pytest.fixture
+def tls(tmp_path: Path) -> tuple[Authority, Path]:
+    authority = Authority.create()
+    folder = tmp_path / "tls"
+    folder.mkdir()
+    authority.write_tls_dir(folder, "robot-7", IdentityRole.ROBOT, days=30.0)
+    return authority, folder
+
+
+def test_a_certificate_in_force(tls: tuple[Authority, Path]) -> None:
+    finding = one(node_checks.certificate(load_tls_files(tls[1]), NOW))
+    assert finding.level is Level.OK
+    assert "robot-7, robot, 30 days left, not revoked by the list held (number 0" in finding.text
+
+
+def test_one_that_ends_soon_is_warned_of_and_one_that_ended_fails(tls: tuple[Authority, Path]) -> None:
+    files = load_tls_files(tls[1])
+    assert levels(node_checks.certificate(files, NOW + 25 * DAY)) == [Level.WARN]
+    ended = one(node_checks.certificate(files, NOW + 31 * DAY))
+    assert ended.level is Level.FAIL
+    assert "plr ca renew robot-7" in ended.remedy
+
+
+def test_a_revoked_one_fails(tls: tuple[Authority, Path]) -> None:
+    authority, folder = tls
+    authority.revoke("robot-7")
+    (folder / "crl.pem").write_bytes(authority.crl_pem())
+    finding = one(node_checks.certificate(load_tls_files(folder), NOW))
+    assert finding.level is Level.FAIL
+    assert "revoked" in finding.text
+
+
+def test_another_one_in_use_than_on_disk_is_warned_of(tls: tuple[Authority, Path]) -> None:
+    files = load_tls_files(tls[1])
+    same = {"serial": f"{files.identity.serial:x}"}
+    assert levels(node_checks.certificate(files, NOW, same)) == [Level.OK]
+    assert levels(node_checks.certificate(files, NOW, {"serial": "abc"})) == [Level.OK, Level.WARN]
+
+
+def test_the_certificate_that_a_sidecar_tells_of() -> None:
+    used = {"name": "robot-7", "role": "robot", "not_after": NOW + 3 * DAY, "revocation_lists": [], "problem": None}
+    assert levels(node_checks.certificate_in_use(used, NOW)) == [Level.OK]
+    problem = {"in_force": False, "text": "cert.pem: expired; renew it"}
+    finding = one(node_checks.certificate_in_use({**used, "problem": problem}, NOW))
+    assert (finding.level, finding.text, finding.remedy) == (Level.FAIL, "cert.pem: expired", "renew it")
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "state", "level"),
+    [
+        (-1000.0, ClockState(True, 0.01), Level.OK),
+        (100.0, ClockState(True, 0.01), Level.OK),
+        (1000.0, ClockState(True, 0.01), Level.FAIL),
+        (-1000.0, ClockState(False, 16.0), Level.WARN),
+        (-1000.0, None, Level.OK),
+    ],
+)
+def test_the_clock(ahead_s: float, state: ClockState | None, level: Level) -> None:
+    assert levels(node_checks.clock(NOW, NOW + ahead_s, state)) == [level]
+
+
+def test_ros() -> None:
+    assert levels(node_checks.ros(LOCALHOST, LOCALHOST, None)) == [Level.OK, Level.OK]
+    assert levels(node_checks.ros({}, {}, None)) == [Level.OK, Level.WARN]
+    broken, _ = node_checks.ros(LOCALHOST, LOCALHOST, "ROS 2's rclpy is not there for python: pip install it")
+    assert (broken.level, broken.remedy) == (Level.FAIL, "pip install it")
+    unit = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT", "FASTRTPS_DEFAULT_PROFILES_FILE": "/etc/plr/fastdds.xml"}
+    assert levels(node_checks.ros(unit, unit, None)) == [Level.OK, Level.OK]
+    _, domain = node_checks.ros({**LOCALHOST, "ROS_DOMAIN_ID": "10"}, {}, None)
+    assert "this shell: 0" in domain.text
+
+
+def test_types() -> None:
+    wanted = {"/plan": "nav_msgs/srv/GetPlan", "/look": "my_robot/srv/Look"}
+    assert levels(node_checks.types(wanted, {})) == [Level.OK]
+    missing, there = node_checks.types(wanted, {"/look": "my_robot/srv/Look"})
+    assert (missing.level, there.level) == (Level.FAIL, Level.OK)
+    assert "ros-jazzy-my-robot" in missing.remedy
+
+
+def interface(name: str, **changes: object) -> Interface:
+    fields = {"index": 1, "kind": "", "up": True, "carrier": True, "mtu": 1500, "addresses": ("192.0.2.7",),
+              "gateways": ((4, "192.0.2.1"),), **changes}  # fmt: skip
+    return Interface(name=InterfaceName(name), **fields)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("there", "expected"),
+    [
+        ([interface("wlan0"), interface("wwan0")], [Level.OK, Level.OK]),
+        ([interface("wlan0")], [Level.OK, Level.WARN]),
+        ([interface("wlan0"), interface("wwan0", carrier=False)], [Level.OK, Level.WARN]),
+        ([interface("wlan0"), interface("wwan0", addresses=())], [Level.OK, Level.WARN]),
+        ([interface("wlan0"), interface("wwan0", gateways=())], [Level.OK, Level.OK, Level.WARN]),
+        ([interface("wlan0", up=False), interface("wwan0", up=False)], [Level.WARN, Level.WARN, Level.FAIL]),
+        ([], [Level.WARN, Level.WARN, Level.FAIL]),
+    ],
+)
+def test_interfaces(there: list[Interface], expected: list[Level]) -> None:
+    assert levels(node_checks.interfaces(choose(there, ("wlan0", "wwan0")))) == expected
+
+
+def test_the_reverse_path_filter(tmp_path: Path) -> None:
+    assert levels(node_checks.reverse_path({"wlan0": 0, "wwan0": 2})) == [Level.OK]
+    assert levels(node_checks.reverse_path({"wlan0": 1})) == [Level.OK]
+    finding = one(node_checks.reverse_path({"wlan0": 2, "wwan0": 1}))
+    assert finding.level is Level.WARN
+    assert "net.ipv4.conf.wwan0.rp_filter=2" in finding.remedy
+    for name, value in (("all", "1"), ("wlan0", "0"), ("wwan0", "2")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "rp_filter").write_text(value + "\n")
+    assert [reverse_path_filter(name, tmp_path) for name in ("wlan0", "wwan0", "eth9")] == [1, 2, 1]
+    assert reverse_path_filter("wlan0", tmp_path / "none") is None
+
+
+def test_the_environment_of_the_unit_is_read(tmp_path: Path) -> None:
+    (tmp_path / "sidecar.env").write_text("# a comment\nROS_DOMAIN_ID=42\nRMW_IMPLEMENTATION='rmw_x'\nnonsense\n")
+    environment = unit_environment(tmp_path / "sidecar.yaml")
+    assert (environment["ROS_DOMAIN_ID"], environment["RMW_IMPLEMENTATION"]) == ("42", "rmw_x")

@@ -1,0 +1,201 @@
+"""What a running sidecar's state says: whom to blame, and each check seen to pass and to fail."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from sidecar.doctor import running_checks
+from sidecar.doctor.finding import Finding, Level
+from sidecar.doctor.running_checks import Pinged
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+pytestmark = pytest.mark.audit("ops-14")
+
+UP_S = 3600.0
+
+
+def path(interface: str, peer: str, state: str = "up", **changes: Any) -> dict[str, Any]:
+    return {
+        "interface": interface, "peer": peer, "remote": 0, "address": ["192.0.2.1", 24700], "candidates": 1,
+        "state": state, "since_s": 600.0, "reason": "answers" if state == "up" else "silent", "rtt_s": 0.02,
+        "sent": 1000, "lost": 1, "max_datagram": 1472, "proven_s": 0.2, "rests": False, **changes,
+    }  # fmt: skip
+
+
+def stun(**changes: Any) -> dict[str, Any]:
+    return {"family": 4, "mapping": ["203.0.113.7", 5000], "server": ["192.0.2.9", 3478], "answered_s": 3.0,
+            "changes": 0, "problem": "", **changes}  # fmt: skip
+
+
+def interface(name: str, **changes: Any) -> dict[str, Any]:
+    return {"name": name, "suspended": False, "addresses": ["10.0.0.2"], "port": 5000, "mtu": 1500,
+            "bound_to": "device", "hangs": 0, "stun": [stun()], **changes}  # fmt: skip
+
+
+def state(**changes: Any) -> dict[str, Any]:
+    paths = [path(name, peer) for name in ("wlan0", "wwan0") for peer in ("cloud-a", "cloud-b")]
+    return {
+        "node": {"name": "robot-1", "role": "robot", "version": "1", "up_s": UP_S, "stun": True, "insecure": False},
+        "interfaces": [interface("wlan0"), interface("wwan0")],
+        "paths": paths,
+        "services": {"carried": {"/plan": "nav_msgs/srv/GetPlan"}, "unmet": [], "left_alone": {}, "missing_types": {}},
+        "mapping": {"version": 7, "source": "control plane", "age_s": 60.0},
+        "mapped": [{"service": "/plan", "pairs": [{"interface": "wlan0", "server": "cloud-a"}],
+                    "predicted_miss": 0.001, "reason": "", "deadline_s": 0.1}],
+        "control": {"names": ["cp:50051"], "connected": True, "since_s": 5.0, "interface": "wlan0"},
+        "gone": [],
+        **changes,
+    }  # fmt: skip
+
+
+def texts(findings: Iterable[Finding], *levels: Level) -> list[str]:
+    found = list(findings)
+    assert all(finding.remedy for finding in found if finding.level is not Level.OK)
+    return [finding.text for finding in found if finding.level in levels]
+
+
+BAD = (Level.WARN, Level.FAIL)
+
+
+def test_a_healthy_node_has_nothing_but_ok() -> None:
+    healthy = state()
+    checks = [
+        running_checks.node(healthy, "robot-1"), running_checks.devices(healthy), running_checks.stun(healthy),
+        running_checks.mtu(healthy), running_checks.paths(healthy, {}), running_checks.gone(healthy),
+        running_checks.services(healthy), running_checks.mapping(healthy, lambda _: 0.01),
+        running_checks.control(healthy),
+    ]  # fmt: skip
+    for check in checks:
+        assert texts(check, *BAD) == []
+
+
+def test_another_sidecar_and_one_without_certificates_are_told() -> None:
+    assert "the configuration is of robot-9" in texts(running_checks.node(state(), "robot-9"), Level.FAIL)[0]
+    insecure = state(node={**state()["node"], "insecure": True})
+    assert len(texts(running_checks.node(insecure, "robot-1"), Level.WARN)) == 1
+    refused = state(refused_peers=[{"name": "cloud-x", "why": "it is revoked"}])
+    assert texts(running_checks.node(refused, "robot-1"), Level.WARN) == ["cloud-x is not talked to: it is revoked"]
+
+
+def test_a_dark_interface_is_blamed_once() -> None:
+    paths = [path("wlan0", "cloud-a"), path("wlan0", "cloud-b")]
+    paths += [path("wwan0", peer, "down") for peer in ("cloud-a", "cloud-b")]
+    (text,) = texts(running_checks.paths(state(paths=paths), {}), *BAD)
+    assert text.startswith("wwan0: no peer is reached over it, while others are elsewhere: silent for 10 min")
+
+
+def test_a_dead_server_is_blamed_once_and_no_interface_with_it() -> None:
+    paths = [path(name, "cloud-a") for name in ("wlan0", "wwan0")]
+    paths += [path(name, "cloud-b", "down") for name in ("wlan0", "wwan0")]
+    (text,) = texts(running_checks.paths(state(paths=paths), {}), *BAD)
+    assert text.startswith("cloud-b: not reached over wlan0, wwan0")
+
+
+def test_one_path_that_is_down_is_blamed_itself() -> None:
+    paths = [path("wlan0", "cloud-a"), path("wlan0", "cloud-b"), path("wwan0", "cloud-a")]
+    paths += [path("wwan0", "cloud-b", "down")]
+    (text,) = texts(running_checks.paths(state(paths=paths), {}), *BAD)
+    assert text == "wwan0 to cloud-b (192.0.2.1:24700): down for 10 min, silent"
+
+
+def test_with_nothing_reached_it_fails_but_not_just_after_the_start() -> None:
+    dark = [path(name, "cloud-a", "down", reason=None, since_s=None) for name in ("wlan0", "wwan0")]
+    assert texts(running_checks.paths(state(paths=dark), {}), Level.FAIL) == [
+        "nothing is reached over wlan0, wwan0: never answered"
+    ]
+    nowhere = [{**one, "candidates": 0, "address": None} for one in dark]
+    (text,) = texts(running_checks.paths(state(paths=nowhere), {}), Level.FAIL)
+    assert "cloud-a told no address" in text
+    young = state(paths=dark, node={**state()["node"], "up_s": 2.0})
+    assert texts(running_checks.paths(young, {}), Level.FAIL) == []
+    assert len(texts(running_checks.paths(state(paths=[]), {}), Level.WARN)) == 1
+
+
+def test_pings_are_shown_and_missed_ones_warned_of() -> None:
+    key = ("wlan0", "cloud-a", 0)
+    one = state(paths=[path("wlan0", "cloud-a")])
+    (text,) = texts(running_checks.paths(one, {key: Pinged([0.01, 0.02], 3)}), Level.OK)
+    assert text.endswith("ping 10.0 ms to 20.0 ms, 1 of 3 lost")
+    (text,) = texts(running_checks.paths(one, {key: Pinged([], 3)}), Level.WARN)
+    assert text.endswith("3 pings: not answered")
+
+
+def test_a_lossy_or_unstable_path_is_warned_of() -> None:
+    lossy = state(paths=[path("wlan0", "cloud-a", lost=100)])
+    assert "10 % lost" in texts(running_checks.paths(lossy, {}), Level.WARN)[0]
+    unstable = state(paths=[path("wlan0", "cloud-a", "unstable")])
+    assert "unstable" in texts(running_checks.paths(unstable, {}), Level.WARN)[0]
+
+
+@pytest.mark.parametrize(
+    ("of", "expected"),
+    [
+        ({"mapping": ["10.0.0.2", 5000]}, "no NAT"),
+        ({"mapping": ["203.0.113.7", 5000]}, "a NAT that keeps the port"),
+        ({"mapping": ["203.0.113.7", 5999]}, "a NAT that gives another port"),
+        ({"changes": 4}, "another mapping 4 times"),
+    ],
+)
+def test_what_stun_says_of_the_nat(of: dict[str, Any], expected: str) -> None:
+    (text,) = texts(running_checks.stun(state(interfaces=[interface("wlan0", stun=[stun(**of)])])), Level.OK)
+    assert expected in text
+
+
+def test_stun_that_is_not_answered_is_warned_of_unless_the_other_family_is() -> None:
+    silent = stun(mapping=None, answered_s=None, problem="no answer from 192.0.2.9:3478")
+    alone = state(interfaces=[interface("wlan0", stun=[silent])])
+    (text,) = texts(running_checks.stun(alone), Level.WARN)
+    assert text == "wlan0: no answer over IPv4: no answer from 192.0.2.9:3478"
+    old = state(interfaces=[interface("wlan0", stun=[stun(answered_s=300.0)])])
+    assert "the last came 5 min ago" in texts(running_checks.stun(old), Level.WARN)[0]
+    both = state(interfaces=[interface("wlan0", stun=[stun(), {**silent, "family": 6}])])
+    assert texts(running_checks.stun(both), *BAD) == []
+    assert len(texts(running_checks.stun(state(interfaces=[interface("wlan0", stun=[])])), Level.WARN)) == 1
+
+
+def test_a_path_that_carries_the_least_only_is_warned_of() -> None:
+    stuck = state(paths=[path("wlan0", "cloud-a", max_datagram=1200)])
+    (text,) = texts(running_checks.mtu(stuck), Level.WARN)
+    assert "takes 1500 bytes, but to cloud-a only the least passes" in text
+    searching = state(paths=[path("wlan0", "cloud-a", max_datagram=1200, since_s=5.0)])
+    assert texts(running_checks.mtu(searching), *BAD) == []
+
+
+def test_sockets_and_drivers() -> None:
+    odd = state(interfaces=[interface("wlan0", bound_to="address", hangs=2)])
+    assert len(texts(running_checks.devices(odd), Level.WARN)) == 2
+
+
+def test_who_is_gone_is_told_until_it_is_back() -> None:
+    left = {"interface": "wlan0", "peer": "cloud-c", "since_s": 30.0, "reason": "silent"}
+    (text,) = texts(running_checks.gone(state(gone=[left])), Level.WARN)
+    assert text.startswith("cloud-c: gone for 30 s: silent over wlan0")
+    goodbye = {**left, "reason": "peer closed"}
+    assert texts(running_checks.gone(state(gone=[goodbye])), *BAD) == []
+    assert texts(running_checks.gone(state(gone=[{**left, "peer": "cloud-a"}])), Level.OK, *BAD) == []
+
+
+def test_services() -> None:
+    told = {"carried": {}, "unmet": ["/plan"], "left_alone": {"/map": ["/map_server"]}, "missing_types": {}}
+    assert len(texts(running_checks.services(state(services=told)), Level.WARN)) == 3
+
+
+def test_the_mapping() -> None:
+    none = state(mapping={"version": 0, "source": None, "age_s": None}, mapped=[])
+    assert len(texts(running_checks.mapping(none, lambda _: None), Level.WARN)) == 1
+    disk = state(mapping={"version": 7, "source": "disk", "age_s": 9.0})
+    assert "kept on disk" in texts(running_checks.mapping(disk, lambda _: None), Level.WARN)[0]
+    assert "more than its target 0.01 %" in texts(running_checks.mapping(state(), lambda _: 1e-4), Level.WARN)[0]
+    paths = [path("wlan0", "cloud-a", "down"), path("wwan0", "cloud-b")]
+    (text,) = texts(running_checks.mapping(state(paths=paths), lambda _: None), Level.WARN)
+    assert "wlan0 to cloud-a is down" in text
+
+
+def test_the_control_stream() -> None:
+    lost = {"names": ["cp:50051"], "connected": False, "since_s": 90.0, "last_failure": "nothing comes over wlan0"}
+    (text,) = texts(running_checks.control(state(control=lost)), Level.WARN)
+    assert text.startswith("cp:50051 not reached for 90 s: nothing comes over wlan0")
