@@ -1,5 +1,10 @@
 """plr: ask a running control plane, plan ahead, certify nodes, try out a policy, look up configuration keys.
 
+on a robot or a server itself, without the control plane (each has --help):
+  plr doctor               look at this node: what is wrong, and what to do
+  plr ping PEER            how long each path to a peer takes
+  plr bugreport            a tar file for whoever helps
+
 examples:
   plr status --tls-dir ~/.plr/alice --address control.example.org:50051
   plr status --insecure --json

@@ -36,3 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_FAILURE
     code: int = run(given if name == OPERATOR else given[1:])
     return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
