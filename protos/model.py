@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NewType
 
 from protos.preferences import EVERY_INTERFACE, Copies
+from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -150,6 +151,12 @@ class ServiceUse:
     """Above 0: the cheapest mapping that misses the deadline no more often; 0: the most reliable one."""
     fallback_up: bool | None = None
     """Whether its fallback on the robot itself can be asked; None: it has none."""
+    redundancy: RedundancyMode = RedundancyMode.REPLICATE
+    """Which of the mapped pairs carry a copy, and when: for the prediction."""
+    hedge_quantile: float = DEFAULT_HEDGE_QUANTILE
+    """With RedundancyMode.HEDGE: the share of first copies that is waited for."""
+    budgeted: bool = False
+    """Budgets may keep back all copies but the first one."""
 
 
 @dataclass(frozen=True, slots=True)

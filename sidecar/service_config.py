@@ -10,6 +10,7 @@ from pydantic import Field
 from protos.convert.fields import MAX_CHARGE
 from protos.model import Role, ServiceName
 from protos.preferences import AT_MOST_EVERY_INTERFACE, DEFAULT_CHARGE, EVERY_INTERFACE
+from protos.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from sidecar.config_fields import (
     CopiesWanted,
     DomainLabel,
@@ -25,7 +26,6 @@ from sidecar.core.budgets import Budget
 from sidecar.core.fallback_queue import SPARE
 from sidecar.core.fallback_rule import FallbackRule
 from sidecar.core.priority import Priority
-from sidecar.core.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule
 
 if TYPE_CHECKING:

@@ -11,14 +11,13 @@ import numpy as np
 from controlplane.core.choices import MAX_LISTED, list_choices, own_excess
 from controlplane.core.costs import block_cost, charge, choice_costs
 from controlplane.core.domains import shared_domains
-from controlplane.core.objectives import joint_miss
 from controlplane.core.plan import choice_of
 from controlplane.core.problem import FleetKey, block_excess, loads, reachable
 from protos.explanation import Alternative, AlternativeKind
 from protos.model import Assignment
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,14 +29,23 @@ OTHERS = 3
 """Best mappings told of that are not in force."""
 
 
-def of(problem: Problem, plan: Plan, block: Block) -> tuple[Alternative, ...]:
-    """The best other mappings of the block, each interface alone, and the block without each server in use."""
+def of(problem: Problem, plan: Plan, block: Block, miss: Callable[[Block, Choice], float]) -> tuple[Alternative, ...]:
+    """The best other mappings of the block, each interface alone, and the block without each server in use; `miss`
+    says what requests miss with a choice."""
     running = choice_of(block, plan.blocks.get(block.key))
-    return _Alternatives(problem, plan, block, running).all()
+    return _Alternatives(problem, plan, block, running, miss).all()
 
 
 class _Alternatives:
-    def __init__(self, problem: Problem, plan: Plan, block: Block, running: Choice | None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        plan: Plan,
+        block: Block,
+        running: Choice | None,
+        miss: Callable[[Block, Choice], float],
+    ) -> None:
+        self._miss = miss
         self._problem = problem
         self._block = block
         self._running = running
@@ -79,7 +87,7 @@ class _Alternatives:
         assignments = tuple(Assignment(nic, block.servers[server]) for nic, server in pairs if server is not None)
         note = "; ".join(self._against(choice)) if kind is AlternativeKind.OTHER else ""
         cost = charge(block.target, choice) if block.target is not None else None
-        return Alternative(kind, assignments, joint_miss(block, choice), without, note, cost)
+        return Alternative(kind, assignments, self._miss(block, choice), without, note, cost)
 
     def _against(self, choice: Choice) -> Iterator[str]:
         block = self._block

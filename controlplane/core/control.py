@@ -566,6 +566,5 @@ class ControlCore:
         if sidecar is None:
             return None
         sent = self._publisher[name].mapping.sent or ()
-        return view_of(
-            sidecar, sent, self.plan, self.estimator, seen_at=self.registry.heard_at(sidecar.name, now), now=now
-        )
+        heard_at = self.registry.heard_at(sidecar.name, now)
+        return view_of(sidecar, sent, self.plan, self._picture, self.estimator, seen_at=heard_at, now=now)

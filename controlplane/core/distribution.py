@@ -60,7 +60,12 @@ class Distribution:
 
     def sum_exceeds(self, other: Distribution | None, seconds: float) -> float:
         """P(A + B > seconds) for an A of this distribution and a B of the other, independent; B is 0 without one."""
+        return float(self.sums_exceed(other, np.array([seconds]))[0])
+
+    def sums_exceed(self, other: Distribution | None, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same for each of some times."""
         if other is None:
-            return float(self.over(np.array([seconds]))[0])
+            return self.over(seconds)
         used = np.flatnonzero(self.mass)
-        return float(self.mass[used] @ other.over(seconds - _MIDS[used])) + self.never
+        exceeds: NDArray[np.float64] = other.over(seconds[:, np.newaxis] - _MIDS[used]) @ self.mass[used]
+        return exceeds + self.never

@@ -254,7 +254,8 @@ class Drawing:
             servers = tuple(cloud.name for cloud in inputs.clouds)
             self._drawn[key] = _Drawn(inputs, None, BlockNotes(servers, unserved=inputs.unserved))
             return 0
-        known = before.block if before is not None and not anew and before.inputs.use == inputs.use else None
+        kept = before is not None and not anew and before.inputs.use == inputs.use
+        known = (before.block, before.notes) if before is not None and before.block is not None and kept else None
         block, notes = draw_block(
             inputs.robot,
             inputs.use,

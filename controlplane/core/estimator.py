@@ -17,7 +17,7 @@ from controlplane.core.fading import FadedCount, FadedShares
 from controlplane.core.fleet_view import PathView
 from controlplane.core.interface_trouble import InterfaceTrouble
 from controlplane.core.network import RobotNetwork
-from controlplane.core.parts import Asked, from_parts
+from controlplane.core.parts import Asked, from_parts, slower_than
 from controlplane.core.penalties import Penalties
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
 from controlplane.core.shared_fate import SharedFate
@@ -28,6 +28,9 @@ from protos.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from controlplane.core.network import PathState
     from controlplane.core.shared_fate import CommonMisses
@@ -304,6 +307,26 @@ class Estimator:
             if abs(prior.mean - from_parts(asked, ServerTimes(before, processing.requests), now).mean) > CHANGE_MATTERS:
                 pair.trials.forget(CHANGE_KEEPS_REQUESTS / max(carried, CHANGE_KEEPS_REQUESTS))
         return pair.trials.posterior(trouble.moved(prior, interface, server), now)
+
+    def carried(self, robot: NodeName, pair: Pair, now: float) -> float:
+        """Requests of the service that were measured over this pair, as far as they count still."""
+        tables = self._robots.get(robot)
+        found = tables.trials.get(pair) if tables is not None else None
+        return found.trials.counts(now)[0] if found is not None else 0.0
+
+    def slower_than(
+        self, robot: NodeName, pair: Pair, seconds: NDArray[np.float64], now: float
+    ) -> NDArray[np.float64] | None:
+        """How likely an answer over this pair takes longer than each of some times, by what network and server took.
+
+        None where nothing is known of the network.
+        """
+        tables = self._robots.get(robot)
+        if tables is None:
+            return None
+        interface, server, service = pair
+        asked = Asked(tables.network, interface, server, _usual_sizes(tables, service), 0.0, 0.0)
+        return slower_than(asked, self._compute.times(server, service, now), seconds, now)
 
     def _trouble(self, tables: _Robot, service: ServiceName, deadline_s: float, now: float) -> InterfaceTrouble:
         """What the robot's requests of the service met beyond what their parts explain."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from controlplane.core import alternatives
 from controlplane.core.beta import intervals
+from controlplane.core.mode_miss import miss_of, predicted_miss
 from controlplane.core.picture import BlockNotes, interfaces_of
 from controlplane.core.problem import BlockKey
 from protos.explanation import Belief, Explanation, JointExplanation, MappingChange, PairExplanation
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from controlplane.core.picture import Picture
     from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.posterior import Estimate
-    from controlplane.core.problem import Block
+    from controlplane.core.problem import Block, Choice
     from controlplane.core.registry import Registry, Sidecar
     from controlplane.core.shared_fate import CommonMisses
     from protos.model import InterfaceName, NodeName, PenaltyReport, ServiceMapping, ServiceName, ServiceUse
@@ -115,6 +116,11 @@ def explain(
     mapping = next((found for found in sent if found.service == use.name), None)
     paths = _paths(robot, picture, key, mapping)
     planned = plan.blocks.get(key)
+    notes = picture.notes.get(key) or BlockNotes()
+
+    def miss(of: Block, choice: Choice) -> float:
+        return miss_of(use, of, choice, notes.timings)
+
     return Explanation(
         robot=robot.name,
         service=use.name,
@@ -123,15 +129,15 @@ def explain(
         objective=picture.problem.objective.value,
         mapping=mapping,
         sync=sync,
-        predicted_miss=planned.predicted_miss if planned is not None else None,
+        predicted_miss=predicted_miss(use, planned, notes.timings) if planned is not None else None,
         in_force_s=now - history.since if history is not None else None,
         observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
         target_miss=use.target_miss,
         charge=_charge(block, planned),
-        pairs=_pairs(paths, picture.notes.get(key) or BlockNotes(), block, estimator, key, mapping, now),
+        pairs=_pairs(paths, notes, block, estimator, key, mapping, now),
         pairs_left_out=max(0, len(paths) - MAX_PAIRS),
         joints=_joints(robot.name, use.name, block, estimator, now),
-        alternatives=alternatives.of(picture.problem, plan, block) if block is not None else (),
+        alternatives=alternatives.of(picture.problem, plan, block, miss) if block is not None else (),
         changes=_changes(history, now),
     )
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from controlplane.core.mode_miss import predicted_miss
 from controlplane.core.picture import interfaces_of
 from controlplane.core.problem import BlockKey
 from protos.histogram import BUCKETS, MIDS
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.estimator import Estimator
+    from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
     from controlplane.core.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
@@ -70,6 +72,7 @@ def view_of(
     sidecar: Sidecar,
     mapping: tuple[ServiceMapping, ...],
     plan: Plan,
+    picture: Picture,
     estimator: Estimator,
     *,
     seen_at: float,
@@ -89,13 +92,16 @@ def view_of(
         seen_at=seen_at,
         paths=tuple(islice(paths, MAX_VIEWED)),
         mapping=mapping[:MAX_VIEWED],
-        misses=tuple(_misses(sidecar.name, use, plan, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
+        misses=tuple(_misses(sidecar.name, use, plan, picture, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
     )
 
 
-def _misses(robot: NodeName, use: ServiceUse, plan: Plan, estimator: Estimator, now: float) -> MissView:
-    block = plan.blocks.get(BlockKey(robot, use.name))
-    predicted = block.predicted_miss if block is not None else None
+def _misses(
+    robot: NodeName, use: ServiceUse, plan: Plan, picture: Picture, estimator: Estimator, now: float
+) -> MissView:
+    key = BlockKey(robot, use.name)
+    block, notes = plan.blocks.get(key), picture.notes.get(key)
+    predicted = predicted_miss(use, block, notes.timings if notes is not None else {}) if block is not None else None
     return MissView(use.name, predicted, estimator.observed_miss_ratio(robot, use.name, now), use.target_miss)
 
 

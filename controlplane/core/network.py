@@ -22,6 +22,9 @@ from protos.histogram import Histogram
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from controlplane.core.distribution import Distribution
     from protos.model import InterfaceName, LatencyReport, NodeName, PathReport
 
@@ -70,13 +73,13 @@ class Witness(NamedTuple):
     itself: bool = False
     """These are requests on the very path."""
 
-    def exceeds(self, processing: Distribution | None, seconds: float) -> float:
-        """P(network + processing > seconds)."""
+    def exceeds(self, processing: Distribution | None, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """P(network + processing > s) for each s."""
         left = seconds - self.later_s
-        prompt = self.times.sum_exceeds(processing, left)
+        prompt = self.times.sums_exceed(processing, left)
         if not self.resent:
             return prompt
-        return (1.0 - self.resent) * prompt + self.resent * self.times.sum_exceeds(processing, left - self.resend_s)
+        return (1.0 - self.resent) * prompt + self.resent * self.times.sums_exceed(processing, left - self.resend_s)
 
 
 @dataclass(slots=True)

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from controlplane.core.posterior import IGNORANCE, Estimate
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from controlplane.core.compute import ServerTimes
     from controlplane.core.network import RobotNetwork
     from protos.model import InterfaceName, NodeName
@@ -37,26 +41,53 @@ class Asked(NamedTuple):
     """Requests on this very path whose outcomes are counted elsewhere."""
 
 
+class _Parts(NamedTuple):
+    """What the parts say."""
+
+    exceeds: NDArray[np.float64]
+    """P(network + processing > s) for each time s that was asked about."""
+    samples: float
+    shared: float
+    """Requests of any service on the very path among them."""
+
+
 def from_parts(asked: Asked, processing: ServerTimes, now: float) -> Estimate:
     """P(network + processing > deadline), as known without the requests that were carried.
 
     `IGNORANCE` where nothing is known of the network.
     """
-    miss = samples = shared = 0.0
+    found = _put_together(asked, processing, np.array([asked.deadline_s]), now)
+    if found is None:
+        return IGNORANCE
+    samples = min(found.samples, MODEL_MAX_SAMPLES)
+    mean = (samples * float(found.exceeds[0]) + IGNORANCE.misses) / (samples + IGNORANCE.weight)
+    weight = MODEL_REQUESTS + min(found.shared, SHARED_REQUESTS)
+    if processing.requests < STRANGE_SERVER_REQUESTS:
+        weight = STRANGE_SERVER_REQUESTS
+    return Estimate.of(min(mean, 1.0), min(weight, samples + IGNORANCE.weight))
+
+
+def slower_than(
+    asked: Asked, processing: ServerTimes, seconds: NDArray[np.float64], now: float
+) -> NDArray[np.float64] | None:
+    """P(network + processing > s) for each s, as measured; None where nothing is known of the network."""
+    found = _put_together(asked, processing, seconds, now)
+    return found.exceeds if found is not None else None
+
+
+def _put_together(asked: Asked, processing: ServerTimes, seconds: NDArray[np.float64], now: float) -> _Parts | None:
+    exceeds = np.zeros(len(seconds))
+    samples = shared = 0.0
     for size_class, share in asked.sizes:
-        missed = worth = 0.0
+        missed = np.zeros(len(seconds))
+        worth = 0.0
         counted = asked.carried * share
         for witness in asked.network.witnesses(asked.interface, asked.server, size_class, now, counted=counted):
-            missed += witness.requests * witness.exceeds(processing.times, asked.deadline_s)
+            missed += witness.requests * witness.exceeds(processing.times, seconds)
             worth += witness.requests
             samples += share * witness.samples
             shared += witness.requests if witness.itself else 0.0
         if not worth:
-            return IGNORANCE
-        miss += share * missed / worth
-    samples = min(samples, MODEL_MAX_SAMPLES)
-    mean = (samples * miss + IGNORANCE.misses) / (samples + IGNORANCE.weight)
-    weight = MODEL_REQUESTS + min(shared, SHARED_REQUESTS)
-    if processing.requests < STRANGE_SERVER_REQUESTS:
-        weight = STRANGE_SERVER_REQUESTS
-    return Estimate.of(min(mean, 1.0), min(weight, samples + IGNORANCE.weight))
+            return None
+        exceeds += share * missed / worth
+    return _Parts(exceeds, samples, shared)

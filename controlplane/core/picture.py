@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from controlplane.core.block_rules import with_rules
+from controlplane.core.mode_miss import asked_times, is_timed, pair_timing
 from controlplane.core.posterior import Estimate
 from controlplane.core.problem import Block, BlockKey, Problem
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from controlplane.core.estimator import Estimator
+    from controlplane.core.mode_miss import PairTiming
     from controlplane.core.problem import Path
     from controlplane.core.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceUse
@@ -37,6 +39,8 @@ class BlockNotes:
     """Servers left out of the problem, as the robot can not use their answers, and there are others."""
     unserved: str = ""
     """Why there is nothing to assign; then the problem has no such block."""
+    timings: Mapping[tuple[InterfaceName, NodeName], PairTiming] = field(default_factory=dict, compare=False)
+    """Of the pairs of the block, where not all copies are sent at once: for the prediction alone (`mode_miss`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +65,7 @@ def draw_block(
     *,
     capacity: int,
     barred: frozenset[tuple[InterfaceName, NodeName]] = frozenset(),
-    known: Block | None = None,
+    known: tuple[Block, BlockNotes] | None = None,
 ) -> tuple[Block, BlockNotes]:
     """One robot's use of a service on these clouds, of which there is one at least, as of its interfaces.
 
@@ -85,7 +89,7 @@ def draw_block(
     lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
     reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
 
-    kept = _estimates(known) if known is not None else {}
+    kept = _estimates(known[0]) if known is not None else {}
 
     def estimate(interface: InterfaceName, server: NodeName) -> Estimate | None:
         if (interface, server) not in up:
@@ -106,7 +110,35 @@ def draw_block(
         lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
         weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
-    return with_rules(block, robot, use, clouds), BlockNotes(servers, dark, all_dark, barred, penalised)
+    before = known[1].timings if known is not None else {}
+    timings = _timings(block, use, estimator, now, before) if is_timed(use) else {}
+    notes = BlockNotes(servers, dark, all_dark, barred, penalised, timings=timings)
+    return with_rules(block, robot, use, clouds), notes
+
+
+def _timings(
+    block: Block,
+    use: ServiceUse,
+    estimator: Estimator,
+    now: float,
+    before: Mapping[tuple[InterfaceName, NodeName], PairTiming],
+) -> dict[tuple[InterfaceName, NodeName], PairTiming]:
+    """Of each pair; what is known from `before` is not looked at again."""
+    times = asked_times(use.deadline_s)
+    timings: dict[tuple[InterfaceName, NodeName], PairTiming] = {}
+    for interface, row in zip(block.interfaces, block.epsilon, strict=True):
+        for server, epsilon in zip(block.servers, row, strict=True):
+            if epsilon is None:
+                continue
+            if (interface, server) in before:
+                timings[interface, server] = before[interface, server]
+                continue
+            pair = interface, server, use.name
+            carried = estimator.carried(block.key.robot, pair, now)
+            late = use.redundancy.sends_late and not use.budgeted
+            slower = estimator.slower_than(block.key.robot, pair, times, now) if late else None
+            timings[interface, server] = pair_timing(carried, epsilon, slower, use.hedge_quantile)
+    return timings
 
 
 def _estimates(block: Block) -> dict[tuple[InterfaceName, NodeName], Estimate]:

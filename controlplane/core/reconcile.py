@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from controlplane.core.mode_miss import predicted_miss
 from controlplane.core.picture import interfaces_of
 from controlplane.core.problem import BlockKey, Objective
 from protos.model import NO_CALLS, Assignment, ServiceMapping
@@ -60,7 +61,7 @@ def mapping_of(
         kept = tuple(
             assignment for assignment in (*planned, *standby) if _is_allowed(assignment, use.name, interfaces, servers)
         )
-        predicted = block.predicted_miss if set(planned) & set(kept) else 1.0
+        predicted = predicted_miss(use, block, notes.timings) if set(planned) & set(kept) else 1.0
         explore = plan.explore.get(key)
         if explore is not None and (explore in kept or not _is_allowed(explore, use.name, interfaces, servers)):
             explore = None

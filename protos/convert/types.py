@@ -43,6 +43,7 @@ from protos.model import (
 from protos.names import domain_label, interface_name, node_name, service_name, type_name
 from protos.plr.v1 import types_pb2
 from protos.preferences import Copies, InterfaceLabel
+from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,6 +53,14 @@ MAX_INTERFACE_ID = 255
 
 _ROLES = {types_pb2.ROLE_ROBOT: Role.ROBOT, types_pb2.ROLE_CLOUD: Role.CLOUD}
 _ROLE_NUMBERS = {role: number for number, role in _ROLES.items()}
+_REDUNDANCY_NUMBERS = {
+    RedundancyMode.REPLICATE: types_pb2.REDUNDANCY_MODE_REPLICATE,
+    RedundancyMode.SINGLE: types_pb2.REDUNDANCY_MODE_SINGLE,
+    RedundancyMode.BACKUP: types_pb2.REDUNDANCY_MODE_BACKUP,
+    RedundancyMode.HEDGE: types_pb2.REDUNDANCY_MODE_HEDGE,
+    RedundancyMode.ADAPTIVE: types_pb2.REDUNDANCY_MODE_ADAPTIVE,
+}
+_REDUNDANCY_MODES = {number: mode for mode, number in _REDUNDANCY_NUMBERS.items()}
 _CANDIDATE_KINDS = {
     types_pb2.CANDIDATE_KIND_HOST: CandidateKind.HOST,
     types_pb2.CANDIDATE_KIND_SERVER_REFLEXIVE: CandidateKind.SERVER_REFLEXIVE,
@@ -185,6 +194,10 @@ def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
         copies=_copies_from_proto(message),
         target_miss=probability(message.target_miss, "target_miss"),
         fallback_up=message.fallback_up if message.has_fallback else None,
+        # A mode of a later version: nothing but the prediction hangs on it, and no copies promise the least.
+        redundancy=_REDUNDANCY_MODES.get(message.redundancy, RedundancyMode.SINGLE),
+        hedge_quantile=probability(message.hedge_quantile, "hedge_quantile") or DEFAULT_HEDGE_QUANTILE,
+        budgeted=message.budgeted,
     )
 
 
@@ -208,6 +221,9 @@ def use_to_proto(use: ServiceUse) -> types_pb2.ServiceUse:
         target_miss=use.target_miss,
         has_fallback=use.fallback_up is not None,
         fallback_up=bool(use.fallback_up),
+        redundancy=_REDUNDANCY_NUMBERS[use.redundancy],
+        hedge_quantile=use.hedge_quantile,
+        budgeted=use.budgeted,
     )
 
 

@@ -34,6 +34,11 @@ class Budget:
     extra_bytes_a_day: int | None = None
     """Bytes of extra copies in 24 hours, counted from the first one; None: no such limit."""
 
+    @property
+    def limits(self) -> bool:
+        """Whether it has any limit."""
+        return self.extra_load is not None or self.extra_bytes_a_day is not None
+
 
 @dataclass(slots=True)
 class _Purse:
@@ -67,7 +72,7 @@ class Budgets:
 
     def __bool__(self) -> bool:
         """Whether anything is limited."""
-        return any(one.extra_load is not None or one.extra_bytes_a_day is not None for one in self._budgets)
+        return any(one.limits for one in self._budgets)
 
     def earn(self, size: int, interfaces: Iterable[InterfaceName]) -> None:
         """A request of `size` bytes was answered in time; `interfaces` are those that its mapping names."""

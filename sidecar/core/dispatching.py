@@ -9,6 +9,7 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.adaptive import Adaptive
 from sidecar.core.budgets import Budgets
 from sidecar.core.copies import HEDGE_AT, Copy, CopyState, Request
@@ -17,7 +18,6 @@ from sidecar.core.messages import RequestMessage, encode_message
 from sidecar.core.path_id import PathState
 from sidecar.core.path_pace import PathPaces
 from sidecar.core.path_records import PathRecords
-from sidecar.core.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable

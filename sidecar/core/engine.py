@@ -110,7 +110,7 @@ class Engine:
         self.peers = Peers(own, self.stats.dropped)
         self.routes = Routes()
         self.mapping = MappingTable(self.routes)
-        self._offers = Offers(self._rules, self.stats)
+        self._offers = Offers(self._rules, self.stats, budgeted=any(one.limits for one in config.budgets))
         self._outbox = Outbox(self.routes, self._to_link, self.stats)
         self.revocations = RevocationExchange(self.routes, self._outbox, self.stats)
         self._measurements = Measurements(self.stats.dropped)

@@ -15,8 +15,8 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 from protos.model import InterfaceJointReport
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.copies import CopyState
-from sidecar.core.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -31,8 +31,10 @@ WITHDRAW_AFTER_S = 15.0
 class Offers:
     """Services offered on the robot, and the servers behind each."""
 
-    def __init__(self, rules: Rules, stats: EngineStats) -> None:
+    def __init__(self, rules: Rules, stats: EngineStats, *, budgeted: bool = False) -> None:
+        """`budgeted`: budgets limit extra copies, which the control plane is told."""
         self._rules = rules
+        self._budgeted = budgeted
         self._stats = stats
         self._offered: dict[ServiceName, str] = {}
         self._shares = Shares(MAX_OFFERED)
@@ -140,8 +142,20 @@ class Offers:
         for name, kind in self._offered.items():
             rule = self._rules.find(name)
             if rule is not None and name in carried:
-                wanted = (rule.deadline_s, rule.idempotent, rule.copies, rule.target_miss)
-                uses.append(ServiceUse(name, kind, *wanted, fallback_up=carried[name]))
+                uses.append(
+                    ServiceUse(
+                        name,
+                        kind,
+                        rule.deadline_s,
+                        rule.idempotent,
+                        rule.copies,
+                        rule.target_miss,
+                        fallback_up=carried[name],
+                        redundancy=rule.redundancy,
+                        hedge_quantile=rule.hedge_quantile,
+                        budgeted=self._budgeted,
+                    )
+                )
         return tuple(uses)
 
     def set_peer(self, peer: Peer) -> None:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 from protos.histogram import Histogram
 from protos.model import Assignment
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.backlog import GROUP, rest
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Answer, Copy, CopyState, Request
@@ -40,7 +41,6 @@ from sidecar.core.messages import (
 )
 from sidecar.core.no_room import NoRoom
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.redundancy_mode import RedundancyMode
 from sidecar.core.timers import first_of
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.preferences import EVERY_INTERFACE, Copies
+from protos.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from sidecar.core.priority import Priority
-from sidecar.core.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from bench.evaluation.scenario import Scenario, read_scenarios
 from bench.netlab.trace_folder import read_folder
 from controlplane.planning.fifo import FifoLink
-from sidecar.core.redundancy_mode import RedundancyMode
+from protos.redundancy_mode import RedundancyMode
 from tests.sim.mesh import IPV6, Mesh, Node, rule
 from tests.sim.test_mesh import mapped
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from bench.evaluation.scenario import Scenario, read_scenarios
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.budgets import Budget
-from sidecar.core.redundancy_mode import RedundancyMode
 from tests.sim.drives import drive
 
 

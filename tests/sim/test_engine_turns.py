@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from protos.model import InterfaceName, PeerSet, RemovalReason, RemovedPeer, ServiceName, ServiceOffer, Version
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.engine import Engine
 from sidecar.core.events import RequestFailed
 from sidecar.core.link_events import SetCarrier
-from sidecar.core.redundancy_mode import RedundancyMode
 from tests.sim.mesh import TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from protos.model import ServiceOffer
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.events import ApplicationEvent, ExecuteRequest, RejectReason, RequestFailed, WithdrawService
 from sidecar.core.offers import WITHDRAW_AFTER_S
-from sidecar.core.redundancy_mode import RedundancyMode
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 from tests.sim.test_mesh import call_at, mapped
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import Role
-from sidecar.core.redundancy_mode import RedundancyMode
+from protos.redundancy_mode import RedundancyMode
 from tests.sim.mesh import Mesh, rule
 from tests.sim.serial_server import SerialServer
 

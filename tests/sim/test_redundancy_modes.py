@@ -10,8 +10,8 @@ import pytest
 
 from controlplane.core.estimator import Estimator
 from protos.model import InterfaceName
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.budgets import Budget
-from sidecar.core.redundancy_mode import RedundancyMode
 from tests.sim.mesh import SERVICE, Mesh, Node, Wire, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
 

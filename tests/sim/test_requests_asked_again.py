@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from protos.model import Role, ServiceName, ServiceOffer
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core import room as room_module
 from sidecar.core.priority import Priority
-from sidecar.core.redundancy_mode import RedundancyMode
 from sidecar.core.room import SMALL_BYTES, Lane
 from tests.sim.mesh import TYPE, Mesh, rule
 

@@ -58,6 +58,30 @@ CANDIDATE_KIND_SERVER_REFLEXIVE: CandidateKind.ValueType  # 2
 """The address a STUN server saw (RFC 8489)."""
 Global___CandidateKind: _TypeAlias = CandidateKind  # noqa: Y015
 
+class _RedundancyMode:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _RedundancyModeEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_RedundancyMode.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    REDUNDANCY_MODE_REPLICATE: _RedundancyMode.ValueType  # 0
+    """All at once; also what a sidecar does that tells none."""
+    REDUNDANCY_MODE_SINGLE: _RedundancyMode.ValueType  # 1
+    REDUNDANCY_MODE_BACKUP: _RedundancyMode.ValueType  # 2
+    REDUNDANCY_MODE_HEDGE: _RedundancyMode.ValueType  # 3
+    REDUNDANCY_MODE_ADAPTIVE: _RedundancyMode.ValueType  # 4
+
+class RedundancyMode(_RedundancyMode, metaclass=_RedundancyModeEnumTypeWrapper):
+    """Which of the mapped pairs carry a copy of a request, and when (docs/redundancy.md)."""
+
+REDUNDANCY_MODE_REPLICATE: RedundancyMode.ValueType  # 0
+"""All at once; also what a sidecar does that tells none."""
+REDUNDANCY_MODE_SINGLE: RedundancyMode.ValueType  # 1
+REDUNDANCY_MODE_BACKUP: RedundancyMode.ValueType  # 2
+REDUNDANCY_MODE_HEDGE: RedundancyMode.ValueType  # 3
+REDUNDANCY_MODE_ADAPTIVE: RedundancyMode.ValueType  # 4
+Global___RedundancyMode: _TypeAlias = RedundancyMode  # noqa: Y015
+
 @_typing.final
 class Address(_message.Message):
     """An IPv4 (4 bytes) or IPv6 (16 bytes) address in network order, and a UDP port."""
@@ -191,6 +215,9 @@ class ServiceUse(_message.Message):
     TARGET_MISS_FIELD_NUMBER: _builtins.int
     HAS_FALLBACK_FIELD_NUMBER: _builtins.int
     FALLBACK_UP_FIELD_NUMBER: _builtins.int
+    REDUNDANCY_FIELD_NUMBER: _builtins.int
+    HEDGE_QUANTILE_FIELD_NUMBER: _builtins.int
+    BUDGETED_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     type: _builtins.str
     deadline_us: _builtins.int
@@ -206,6 +233,12 @@ class ServiceUse(_message.Message):
     has_fallback: _builtins.bool
     """A service on the robot itself answers when the network does not, and whether it can be asked right now."""
     fallback_up: _builtins.bool
+    redundancy: Global___RedundancyMode.ValueType
+    """For the prediction only: the mapping is chosen as if all copies were sent at once."""
+    hedge_quantile: _builtins.float
+    """With REDUNDANCY_MODE_HEDGE: the share of first copies that is waited for, below 1; 0: as many as is usual."""
+    budgeted: _builtins.bool
+    """Budgets may keep back all copies but the first one."""
     def __init__(
         self,
         *,
@@ -218,10 +251,13 @@ class ServiceUse(_message.Message):
         target_miss: _builtins.float = ...,
         has_fallback: _builtins.bool = ...,
         fallback_up: _builtins.bool = ...,
+        redundancy: Global___RedundancyMode.ValueType = ...,
+        hedge_quantile: _builtins.float = ...,
+        budgeted: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["deadline_us", b"deadline_us", "fallback_up", b"fallback_up", "has_fallback", b"has_fallback", "idempotent", b"idempotent", "least_copies", b"least_copies", "most_copies", b"most_copies", "name", b"name", "target_miss", b"target_miss", "type", b"type"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["budgeted", b"budgeted", "deadline_us", b"deadline_us", "fallback_up", b"fallback_up", "has_fallback", b"has_fallback", "hedge_quantile", b"hedge_quantile", "idempotent", b"idempotent", "least_copies", b"least_copies", "most_copies", b"most_copies", "name", b"name", "redundancy", b"redundancy", "target_miss", b"target_miss", "type", b"type"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

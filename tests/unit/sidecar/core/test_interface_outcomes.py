@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.copies import OBSERVED_ONE_IN, Copy, CopyState, Request
 from sidecar.core.interface_outcomes import interface_outcomes
 from sidecar.core.path_id import PathState
-from sidecar.core.redundancy_mode import RedundancyMode
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id

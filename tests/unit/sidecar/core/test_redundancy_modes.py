@@ -6,11 +6,11 @@ import dataclasses
 
 import pytest
 
+from protos.redundancy_mode import RedundancyMode
 from sidecar.core.budgets import Budget
 from sidecar.core.copies import HEDGE_AT
 from sidecar.core.events import RejectReason
 from sidecar.core.path_id import PathId, PathState
-from sidecar.core.redundancy_mode import RedundancyMode
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 

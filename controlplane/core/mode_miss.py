@@ -1,0 +1,127 @@
+"""How likely a request misses its deadline in the way its service sends copies (docs/redundancy.md, docs/theory.md).
+
+The mapping is chosen as if every pair in it carried a copy at once. That is what `replicate` does; with the other modes
+more is missed, and this says how much, for what the operator is told. With first pair f and its epsilon:
+
+    single, backup    epsilon_f
+    hedge, adaptive   epsilon_f L_s lift_fs, at most epsilon_f
+
+L_s is the probability that a copy over the second pair s, sent later by the delay, misses what is left of the deadline.
+Which pair a request goes over first only the robot knows: each counts by the requests that it carried lately. Where the
+control plane cannot know, what is told is the larger value, so that nobody is called for a promise that was too good:
+`backup` may do better than `single`, as may a service whose extra copies a budget allows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from controlplane.core.objectives import PROBABILITY_FLOOR, joint_miss
+from protos.redundancy_mode import RedundancyMode
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from controlplane.core.plan import BlockPlan
+    from controlplane.core.problem import Block, Choice, Path
+    from protos.model import InterfaceName, NodeName, ServiceUse
+
+    Pair = tuple[InterfaceName, NodeName]
+    Timings = Mapping[Pair, "PairTiming"]
+
+DELAYS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
+"""Parts of the deadline after which a second copy is taken to leave: the next of these, so that it is not promised too
+early. None leaves later than at the last."""
+
+LEAST_CARRIED = 1.0
+"""With fewer requests it is not known which pair goes first, and the worst one stands for it."""
+
+UNTRIED_REQUESTS, UNTRIED_MISSES = 10.0, 0.5
+"""What the robot believes of a pair before it knows it: a pair that was hardly used ranks behind a good one."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairTiming:
+    """What is known of a pair beside its epsilon, where copies are not all sent at once."""
+
+    carried: float
+    """Requests of the service that it carried lately."""
+    delay: int = len(DELAYS) - 1
+    """After which of DELAYS a hedge leaves if this pair goes first."""
+    late: tuple[float, ...] = ()
+    """For each of DELAYS: how likely a copy over it misses that leaves so much later; empty if that is not known."""
+
+
+NO_TIMING = PairTiming(0.0)
+
+
+def is_timed(use: ServiceUse) -> bool:
+    """Whether the service's prediction takes more than the epsilons."""
+    return use.redundancy is not RedundancyMode.REPLICATE or use.budgeted
+
+
+def asked_times(deadline_s: float) -> NDArray[np.float64]:
+    """The times for which `pair_timing` wants to know how likely an answer takes longer."""
+    delays = deadline_s * np.array(DELAYS)
+    return np.concatenate(([deadline_s], delays, deadline_s - delays))
+
+
+def pair_timing(
+    carried: float,
+    epsilon: float,
+    slower: NDArray[np.float64] | None,
+    quantile: float,
+) -> PairTiming:
+    """From the pair's probabilities to take longer than each of `asked_times`."""
+    if slower is None:
+        return PairTiming(carried)
+    in_all, after, left = slower[0], slower[1 : 1 + len(DELAYS)], slower[1 + len(DELAYS) :]
+    soon = np.flatnonzero(after <= 1.0 - quantile)
+    # The parts say how much a later start costs, the requests that ran how much is missed anyway.
+    late = np.clip(epsilon + np.maximum(0.0, left - in_all), epsilon, 1.0)
+    return PairTiming(carried, int(soon[0]) if soon.size else len(DELAYS) - 1, tuple(late.tolist()))
+
+
+def predicted_miss(use: ServiceUse, planned: BlockPlan, timings: Timings) -> float:
+    """What is told of a mapping that was planned."""
+    if planned.block is None:
+        return planned.predicted_miss
+    return miss_of(use, planned.block, planned.choice, timings)
+
+
+def miss_of(use: ServiceUse, block: Block, choice: Choice, timings: Timings) -> float:
+    """Probability that a request misses its deadline with this choice and the service's way to send copies."""
+    at_once = joint_miss(block, choice)
+    paths = [(i, j) for i, j in enumerate(choice) if j is not None]
+    if not is_timed(use) or len(paths) < 2:
+        return at_once
+    of = {path: timings.get((block.interfaces[path[0]], block.servers[path[1]]), NO_TIMING) for path in paths}
+    carried = sum(timing.carried for timing in of.values())
+    if carried < LEAST_CARRIED:
+        return max(at_once, *(_from(path, paths, of, use, block) for path in paths))
+    return max(at_once, sum(of[path].carried / carried * _from(path, paths, of, use, block) for path in paths))
+
+
+def _from(first: Path, paths: list[Path], of: Mapping[Path, PairTiming], use: ServiceUse, block: Block) -> float:
+    """The same for requests that go over this pair first."""
+    alone = _epsilon(block, first)
+    if not use.redundancy.sends_late or use.budgeted:
+        return alone
+    second = min((path for path in paths if path != first), key=lambda path: _rank(of[path], _epsilon(block, path)))
+    delay = of[first].delay if use.redundancy is RedundancyMode.HEDGE else len(DELAYS) - 1
+    late = of[second].late[delay] if of[second].late else 1.0
+    lift = block.lifts.get((min(first, second), max(first, second)), 1.0)
+    return min(alone, alone * late * lift)
+
+
+def _rank(timing: PairTiming, epsilon: float) -> float:
+    return (timing.carried * epsilon + UNTRIED_MISSES) / (timing.carried + UNTRIED_REQUESTS)
+
+
+def _epsilon(block: Block, path: Path) -> float:
+    return max(block.epsilon[path[0]][path[1]] or 0.0, PROBABILITY_FLOOR)
