@@ -16,6 +16,7 @@ from controlplane.core.compute import ComputeTimes, ServerTimes
 from controlplane.core.fading import FadedCount, FadedShares
 from controlplane.core.fleet_view import PathView
 from controlplane.core.interface_trouble import InterfaceTrouble
+from controlplane.core.late_fate import LateFate
 from controlplane.core.network import RobotNetwork
 from controlplane.core.parts import Asked, from_parts, slower_than
 from controlplane.core.penalties import Penalties
@@ -123,7 +124,18 @@ class _Robot:
     """Tables fed by one robot."""
 
     __slots__ = (
-        *("fates", "joints", "network", "outcomes", "penalties", "services", "trials", "troubles", "troubles_at"),
+        *(
+            "fates",
+            "joints",
+            "late",
+            "network",
+            "outcomes",
+            "penalties",
+            "services",
+            "trials",
+            "troubles",
+            "troubles_at",
+        ),
     )
 
     def __init__(self, half_life_s: float) -> None:
@@ -133,6 +145,7 @@ class _Robot:
         self.fates: OrderedDict[FateKey, SharedFate] = OrderedDict()
         self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
+        self.late: OrderedDict[ServiceName, LateFate] = OrderedDict()
         self.penalties = Penalties()
         self.troubles: dict[tuple[ServiceName, float], InterfaceTrouble] = {}
         """Worked out, by service and deadline ..."""
@@ -190,6 +203,7 @@ class Estimator:
             count = tables.outcomes.get(outcome.service) or FadedCount(self._half_life_s, now)
             self._keep(tables.outcomes, outcome.service, count, MAX_OUTCOMES_PER_ROBOT)
             count.add(outcome.ok + bad, bad, now)
+            self._late_fate(tables, outcome.service, now).add_requests(outcome.ok + bad, bad, now)
         self._dropped += network.dropped - dropped_before
         self._histograms += len(network)
         while self._histograms > MAX_HISTOGRAMS and len(self._robots) > 1:
@@ -206,6 +220,7 @@ class Estimator:
             self._keep(tables.services, latency.service, of_service, MAX_OUTCOMES_PER_ROBOT)
             of_service.sizes.add(latency.size_class, latency.requests, now)
             of_service.clock.hear(now)
+            self._late_fate(tables, latency.service, now).add_first(latency.requests, latency.missed, now)
             pair = (latency.interface, latency.server, latency.service)
             found = tables.trials.get(pair)
             if found is None:
@@ -214,6 +229,11 @@ class Estimator:
             self._keep(tables.trials, pair, found, MAX_PAIRS_PER_ROBOT)
             found.trials.add(latency.requests, latency.missed, now)
         return changed
+
+    def _late_fate(self, tables: _Robot, service: ServiceName, now: float) -> LateFate:
+        found = tables.late.get(service) or LateFate(now)
+        self._keep(tables.late, service, found, MAX_OUTCOMES_PER_ROBOT)
+        return found
 
     def _merge_joint(self, tables: _Robot, joint: JointReport, now: float) -> None:
         key = (joint.service, joint.first, joint.second)
@@ -237,6 +257,8 @@ class Estimator:
         if tables is not None:
             self._histograms -= len(tables.network)
             tables.network.forget_paths()
+            # It may send copies in another way from now on.
+            tables.late.clear()
             self._histograms += len(tables.network)
 
     def paths(self, robot: NodeName) -> Iterator[PathReport]:
@@ -313,6 +335,12 @@ class Estimator:
         tables = self._robots.get(robot)
         found = tables.trials.get(pair) if tables is not None else None
         return found.trials.counts(now)[0] if found is not None else 0.0
+
+    def late_fate(self, robot: NodeName, service: ServiceName, now: float) -> tuple[float, float]:
+        """First copies that missed and requests that missed, see `LateFate.counts`."""
+        tables = self._robots.get(robot)
+        found = tables.late.get(service) if tables is not None else None
+        return found.counts(now) if found is not None else (0.0, 0.0)
 
     def slower_than(
         self, robot: NodeName, pair: Pair, seconds: NDArray[np.float64], now: float

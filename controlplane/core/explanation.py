@@ -119,7 +119,7 @@ def explain(
     notes = picture.notes.get(key) or BlockNotes()
 
     def miss(of: Block, choice: Choice) -> float:
-        return miss_of(use, of, choice, notes.timings)
+        return miss_of(use, of, choice, notes.sending)
 
     return Explanation(
         robot=robot.name,
@@ -129,7 +129,7 @@ def explain(
         objective=picture.problem.objective.value,
         mapping=mapping,
         sync=sync,
-        predicted_miss=predicted_miss(use, planned, notes.timings) if planned is not None else None,
+        predicted_miss=predicted_miss(use, planned, notes.sending) if planned is not None else None,
         in_force_s=now - history.since if history is not None else None,
         observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
         target_miss=use.target_miss,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.mode_miss import predicted_miss
+from controlplane.core.mode_miss import NO_SENDING, predicted_miss
 from controlplane.core.picture import interfaces_of
 from controlplane.core.problem import BlockKey
 from protos.histogram import BUCKETS, MIDS
@@ -101,7 +101,8 @@ def _misses(
 ) -> MissView:
     key = BlockKey(robot, use.name)
     block, notes = plan.blocks.get(key), picture.notes.get(key)
-    predicted = predicted_miss(use, block, notes.timings if notes is not None else {}) if block is not None else None
+    sending = notes.sending if notes is not None else NO_SENDING
+    predicted = predicted_miss(use, block, sending) if block is not None else None
     return MissView(use.name, predicted, estimator.observed_miss_ratio(robot, use.name, now), use.target_miss)
 
 

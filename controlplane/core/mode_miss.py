@@ -1,15 +1,15 @@
 """How likely a request misses its deadline in the way its service sends copies (docs/redundancy.md, docs/theory.md).
 
 The mapping is chosen as if every pair in it carried a copy at once. That is what `replicate` does; with the other modes
-more is missed, and this says how much, for what the operator is told. With first pair f and its epsilon:
+more is missed, and this says how much, for what the operator is told. With first pair f and second pair s:
 
-    single, backup    epsilon_f
-    hedge, adaptive   epsilon_f L_s lift_fs, at most epsilon_f
+    single     epsilon_f
+    others     epsilon_f q, where q is the probability that what follows a first copy that misses comes too late as well
 
-L_s is the probability that a copy over the second pair s, sent later by the delay, misses what is left of the deadline.
-Which pair a request goes over first only the robot knows: each counts by the requests that it carried lately. Where the
-control plane cannot know, what is told is the larger value, so that nobody is called for a promise that was too good:
-`backup` may do better than `single`, as may a service whose extra copies a budget allows.
+Before anything is known, q is 1 for `backup`, and where a budget may keep the second copy back. For `hedge` and
+`adaptive` it is L_s lift_fs, at least `TOGETHER`; L_s is the probability that a copy over s, sent later by the delay,
+misses what is left of the deadline. What became of earlier requests moves it (`late_fate`). Which pair a request goes
+over first only the robot knows: each counts by the requests that it carried lately.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceUse
 
     Pair = tuple[InterfaceName, NodeName]
-    Timings = Mapping[Pair, "PairTiming"]
 
 DELAYS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
 """Parts of the deadline after which a second copy is taken to leave: the next of these, so that it is not promised too
@@ -58,6 +57,26 @@ class PairTiming:
 
 
 NO_TIMING = PairTiming(0.0)
+
+TOGETHER = 0.25
+"""The least share of the first copies that miss of which the second one is believed to miss as well ..."""
+
+TOGETHER_MISSES = 1.0
+"""... and what that belief is worth in independent misses of first copies."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sending:
+    """What is known of a service's copies where not all are sent at once."""
+
+    timings: Mapping[Pair, PairTiming]
+    first_missed: float = 0.0
+    """First copies that missed lately ..."""
+    all_missed: float = 0.0
+    """... and requests of which all copies did; in independent ones."""
+
+
+NO_SENDING = Sending({})
 
 
 def is_timed(use: ServiceUse) -> bool:
@@ -87,36 +106,47 @@ def pair_timing(
     return PairTiming(carried, int(soon[0]) if soon.size else len(DELAYS) - 1, tuple(late.tolist()))
 
 
-def predicted_miss(use: ServiceUse, planned: BlockPlan, timings: Timings) -> float:
+def predicted_miss(use: ServiceUse, planned: BlockPlan, sending: Sending) -> float:
     """What is told of a mapping that was planned."""
     if planned.block is None:
         return planned.predicted_miss
-    return miss_of(use, planned.block, planned.choice, timings)
+    return miss_of(use, planned.block, planned.choice, sending)
 
 
-def miss_of(use: ServiceUse, block: Block, choice: Choice, timings: Timings) -> float:
+def miss_of(use: ServiceUse, block: Block, choice: Choice, sending: Sending) -> float:
     """Probability that a request misses its deadline with this choice and the service's way to send copies."""
     at_once = joint_miss(block, choice)
     paths = [(i, j) for i, j in enumerate(choice) if j is not None]
     if not is_timed(use) or len(paths) < 2:
         return at_once
+    timings = sending.timings
     of = {path: timings.get((block.interfaces[path[0]], block.servers[path[1]]), NO_TIMING) for path in paths}
     carried = sum(timing.carried for timing in of.values())
+    each = {path: _from(path, of, use, block, sending) for path in paths}
     if carried < LEAST_CARRIED:
-        return max(at_once, *(_from(path, paths, of, use, block) for path in paths))
-    return max(at_once, sum(of[path].carried / carried * _from(path, paths, of, use, block) for path in paths))
+        return max(at_once, *each.values())
+    return max(at_once, sum(of[path].carried / carried * miss for path, miss in each.items()))
 
 
-def _from(first: Path, paths: list[Path], of: Mapping[Path, PairTiming], use: ServiceUse, block: Block) -> float:
+def _from(first: Path, of: Mapping[Path, PairTiming], use: ServiceUse, block: Block, sending: Sending) -> float:
     """The same for requests that go over this pair first."""
     alone = _epsilon(block, first)
-    if not use.redundancy.sends_late or use.budgeted:
+    if not use.redundancy.helps:
         return alone
-    second = min((path for path in paths if path != first), key=lambda path: _rank(of[path], _epsilon(block, path)))
+    believed = _second_misses(first, of, use, block)
+    missed = TOGETHER_MISSES * believed + sending.all_missed
+    return alone * missed / (TOGETHER_MISSES + sending.first_missed)
+
+
+def _second_misses(first: Path, of: Mapping[Path, PairTiming], use: ServiceUse, block: Block) -> float:
+    """How likely no other copy is in time where the first one is not, before outcomes tell."""
+    if not use.redundancy.sends_late or use.budgeted:
+        return 1.0
+    second = min((path for path in of if path != first), key=lambda path: _rank(of[path], _epsilon(block, path)))
     delay = of[first].delay if use.redundancy is RedundancyMode.HEDGE else len(DELAYS) - 1
     late = of[second].late[delay] if of[second].late else 1.0
     lift = block.lifts.get((min(first, second), max(first, second)), 1.0)
-    return min(alone, alone * late * lift)
+    return min(1.0, max(late * lift, TOGETHER))
 
 
 def _rank(timing: PairTiming, epsilon: float) -> float:

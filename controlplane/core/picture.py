@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from controlplane.core.block_rules import with_rules
-from controlplane.core.mode_miss import asked_times, is_timed, pair_timing
+from controlplane.core.mode_miss import NO_SENDING, Sending, asked_times, is_timed, pair_timing
 from controlplane.core.posterior import Estimate
 from controlplane.core.problem import Block, BlockKey, Problem
 
@@ -39,8 +39,8 @@ class BlockNotes:
     """Servers left out of the problem, as the robot can not use their answers, and there are others."""
     unserved: str = ""
     """Why there is nothing to assign; then the problem has no such block."""
-    timings: Mapping[tuple[InterfaceName, NodeName], PairTiming] = field(default_factory=dict, compare=False)
-    """Of the pairs of the block, where not all copies are sent at once: for the prediction alone (`mode_miss`)."""
+    sending: Sending = field(default=NO_SENDING, compare=False)
+    """Where not all copies are sent at once: for the prediction alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +110,12 @@ def draw_block(
         lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
         weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
     )
-    before = known[1].timings if known is not None else {}
-    timings = _timings(block, use, estimator, now, before) if is_timed(use) else {}
-    notes = BlockNotes(servers, dark, all_dark, barred, penalised, timings=timings)
+    sending = NO_SENDING
+    if is_timed(use):
+        before = known[1].sending if known is not None else NO_SENDING
+        timings = _timings(block, use, estimator, now, before.timings)
+        sending = Sending(timings, *estimator.late_fate(robot.name, use.name, now))
+    notes = BlockNotes(servers, dark, all_dark, barred, penalised, sending=sending)
     return with_rules(block, robot, use, clouds), notes
 
 

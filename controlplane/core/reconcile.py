@@ -61,7 +61,7 @@ def mapping_of(
         kept = tuple(
             assignment for assignment in (*planned, *standby) if _is_allowed(assignment, use.name, interfaces, servers)
         )
-        predicted = predicted_miss(use, block, notes.timings) if set(planned) & set(kept) else 1.0
+        predicted = predicted_miss(use, block, notes.sending) if set(planned) & set(kept) else 1.0
         explore = plan.explore.get(key)
         if explore is not None and (explore in kept or not _is_allowed(explore, use.name, interfaces, servers)):
             explore = None

@@ -77,9 +77,10 @@ class JoinedPlanes:
         end = self.mesh.now + seconds
         while self.mesh.now < end:
             self.mesh.run(STEP_S)
-            self._talk()
+            self.talk()
 
-    def _talk(self) -> None:
+    def talk(self) -> None:
+        """Exchange what the two planes have to say."""
         now = self.mesh.now
         for stream, node in self.streams.items():
             services = ServiceSet(node.offers, node.engine.uses())
