@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 MAX_SERIES = 100_000
 """Of all members."""
 
-SERIES_OF_MEMBER = 3
-"""Of each, there or gone, beside a robot's own."""
+SERIES_OF_MEMBER = 4
+"""Of each at most, there or gone, beside a robot's own."""
 
 MAX_GONE = 1024
 """Members that are gone and still have series, those that went last."""
@@ -68,6 +68,7 @@ class _Room:
 
     misses: int
     paths: int
+    interfaces: int
     mapped: int
     round_trips: int
     left_out: int
@@ -129,6 +130,7 @@ def _room(robot: MemberView, share: int) -> _Room:
     wanted = (
         sum((miss.predicted is not None) + (miss.observed is not None) + (miss.target > 0.0) for miss in robot.misses),
         len(robot.paths),
+        len(robot.carriers),
         sum(len(mapping.assignments) for mapping in robot.mapping),
         len(robot.paths),
     )
@@ -137,7 +139,7 @@ def _room(robot: MemberView, share: int) -> _Room:
     for count in wanted:
         given.append(min(count, left))
         left -= given[-1]
-    return _Room(given[0], given[1], given[2], given[3], sum(wanted) - sum(given))
+    return _Room(*given, left_out=sum(wanted) - sum(given))
 
 
 def _gauge(name: str, text: str, labels: Labels, rows: Rows) -> Metric:
@@ -208,6 +210,14 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
             for path in robot.paths[: room.paths]:
                 yield (robot.name, path.interface, path.server), float(path.up)
 
+    def interfaces() -> Iterator[tuple[Labels, float]]:
+        for robot, room in rooms:
+            for interface, carrier in robot.carriers[: room.interfaces]:
+                yield (robot.name, interface, carrier), 1.0
+
+    def follows() -> Iterator[tuple[Labels, float]]:
+        yield from (((robot.name,), float(robot.follows)) for robot, _ in rooms)
+
     def mapped() -> Iterator[tuple[Labels, float]]:
         for robot, room in rooms:
             pairs = ((mapping.service, pair) for mapping in robot.mapping for pair in mapping.assignments)
@@ -227,7 +237,7 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     path, service = ("robot", "interface", "server"), ("robot", "service")
     yield _gauge(
         "plr_predicted_miss_probability",
-        "Predicted probability that all copies of a request miss its deadline.",
+        "Predicted probability that a request misses its deadline, in the way its copies are sent.",
         service,
         misses(predicted, ()),
     )
@@ -244,6 +254,15 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
         misses(target, (predicted, observed)),
     )
     yield _gauge("plr_robot_path_up", "1 while the robot's path answers, by its last report.", path, up)
+    yield _info(
+        "plr_robot_interface",
+        "Whose network the robot's interface uses: the carrier of its configuration, or the interface's own name.",
+        ("robot", "interface", "carrier"),
+        interfaces,
+    )
+    yield _gauge(
+        "plr_robot_mapping_synced", "1 while the robot has confirmed the mapping sent last.", ("robot",), follows
+    )
     yield _info(
         "plr_robot_mapping",
         "Over which interfaces to which servers requests go.",

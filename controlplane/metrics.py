@@ -37,8 +37,6 @@ SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 """A robot alone takes milliseconds, a hundred a quarter of a second, a thousand some seconds."""
 
 
-SECONDS_PER_DAY = 86_400.0
-
 NO_EVENTS = EventLogState()
 
 REFUSAL_REASONS = (
@@ -297,12 +295,6 @@ def _certificate(known: tuple[Identity, Mapping[int, RevocationList | None]] | N
         "When the certificate in use ends, in seconds since 1970.",
         [],
         {(): own.not_after},
-    )
-    yield _gauge(
-        "plr_certificate_days_left",
-        "Days until the certificate in use ends; negative when it has.",
-        [],
-        {(): (own.not_after - now_wall) / SECONDS_PER_DAY},
     )
     for name, text, by_ca in revocation_gauges(lists, now_wall):
         yield _gauge(name, text, ["ca"], by_ca)

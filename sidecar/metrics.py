@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from sidecar.revocations import RevocationState
     from sidecar.ros.stats import BridgeStats
 
-SECONDS_PER_DAY = 86_400.0
 _OUTCOMES = ("ok", "deadline_missed", "failed", "rejected")
 
 
@@ -130,12 +129,6 @@ def _certificate(own: Identity | None) -> Iterator[Metric]:
         "When the certificate in use ends, in seconds since 1970.",
         (),
         {(): own.not_after},
-    )
-    yield gauge(
-        "plr_certificate_days_left",
-        "Days until the certificate in use ends; negative when it has.",
-        (),
-        {(): (own.not_after - time.time()) / SECONDS_PER_DAY},
     )
 
 

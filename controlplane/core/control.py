@@ -565,6 +565,13 @@ class ControlCore:
         sidecar = self.registry.get(name)
         if sidecar is None:
             return None
-        sent = self._publisher[name].mapping.sent or ()
-        heard_at = self.registry.heard_at(sidecar.name, now)
-        return view_of(sidecar, sent, self.plan, self._picture, self.estimator, seen_at=heard_at, now=now)
+        return view_of(
+            sidecar,
+            self._publisher[name].mapping,
+            self.plan,
+            self._picture,
+            self.estimator,
+            is_there=lambda server: self.registry.get(server) is not None,
+            seen_at=self.registry.heard_at(name, now),
+            now=now,
+        )

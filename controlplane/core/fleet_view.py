@@ -15,9 +15,10 @@ from controlplane.core.picture import interfaces_of
 from controlplane.core.problem import BlockKey
 from protos.histogram import BUCKETS, MIDS
 from protos.model import Role
+from protos.status import SyncState
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
     from controlplane.core.registry import Sidecar
+    from controlplane.core.snapshots import Track
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
 
 MAX_VIEWED = 512
@@ -66,33 +68,45 @@ class MemberView:
     paths: tuple[PathView, ...] = ()
     mapping: tuple[ServiceMapping, ...] = ()
     misses: tuple[MissView, ...] = ()
+    carriers: tuple[tuple[InterfaceName, str], ...] = ()
+    """Whose network each of its interfaces uses; its own name where that is not known."""
+    follows: bool = True
+    """Whether it has confirmed the mapping that it was sent last, if there is one."""
 
 
 def view_of(
     sidecar: Sidecar,
-    mapping: tuple[ServiceMapping, ...],
+    mapping: Track[tuple[ServiceMapping, ...]],
     plan: Plan,
     picture: Picture,
     estimator: Estimator,
     *,
+    is_there: Callable[[NodeName], bool],
     seen_at: float,
     now: float,
 ) -> MemberView:
-    """Look at one; some 30 us for a robot with 15 paths."""
+    """Look at one; some 30 us for a robot with 15 paths. `is_there` tells which servers are."""
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
         return MemberView(sidecar.name, sidecar.role, connected, seen_at)
-    # Whatever a robot reports: it makes no series of interfaces that it has not announced.
-    interfaces = set(interfaces_of(sidecar))
-    paths = (path for path in estimator.path_views(sidecar.name) if path.interface in interfaces)
+    # Whatever a robot reports: it makes no series of interfaces that it has not announced, nor of servers that are gone.
+    carriers = dict.fromkeys(interfaces_of(sidecar)[:MAX_VIEWED], "")
+    carriers |= {label.interface: label.carrier for label in sidecar.labels if label.interface in carriers}
+    paths = (
+        path
+        for path in estimator.path_views(sidecar.name)
+        if path.interface in carriers and is_there(path.server)
+    )
     return MemberView(
         name=sidecar.name,
         role=sidecar.role,
         connected=connected,
         seen_at=seen_at,
         paths=tuple(islice(paths, MAX_VIEWED)),
-        mapping=mapping[:MAX_VIEWED],
+        mapping=(mapping.sent or ())[:MAX_VIEWED],
         misses=tuple(_misses(sidecar.name, use, plan, picture, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
+        carriers=tuple((interface, carrier or interface) for interface, carrier in carriers.items()),
+        follows=mapping.state not in (SyncState.STALE, SyncState.REJECTED),
     )
 
 

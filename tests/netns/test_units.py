@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.netns.unit_sandbox import allowed_calls
-from tests.netns.unit_world import DAYS_LEFT, FIRST_DAYS, WORKING
+from tests.netns.unit_world import FIRST_DAYS, WORKING, days_left
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -65,7 +65,7 @@ def test_the_sidecar_reaches_the_control_plane_and_its_stun_server(seen: dict[st
 
 @pytest.mark.parametrize("program", ["controlplane", "sidecar"])
 def test_a_renewed_certificate_is_taken_up_without_a_restart(seen: dict[str, Any], program: str) -> None:
-    assert seen[program]["metrics"][DAYS_LEFT] > FIRST_DAYS, seen[program]["log"]
+    assert days_left(seen[program]["metrics"]) > FIRST_DAYS, seen[program]["log"]
 
 
 def test_the_sidecar_may_bind_its_sockets_to_the_interface(seen: dict[str, Any]) -> None:

@@ -50,7 +50,8 @@ WORKING = (
 NODES = {"controlplane": IdentityRole.CONTROL_PLANE, "sidecar": IdentityRole.ROBOT}
 FIRST_DAYS = 30.0
 RENEWED_DAYS = 60.0
-DAYS_LEFT = "plr_certificate_days_left"
+EXPIRY = "plr_certificate_expiry_timestamp_seconds"
+SECONDS_PER_DAY = 86_400.0
 
 
 def make_network() -> None:
@@ -173,7 +174,12 @@ def works(seen: dict[str, Any]) -> bool:
 
 
 def renewal_taken_up(seen: dict[str, Any]) -> bool:
-    return all(seen[name]["metrics"].get(DAYS_LEFT, 0.0) > FIRST_DAYS for name in PROGRAMS)
+    return all(days_left(seen[name]["metrics"]) > FIRST_DAYS for name in PROGRAMS)
+
+
+def days_left(metrics: dict[str, float]) -> float:
+    """Of the certificate in use."""
+    return (metrics.get(EXPIRY, 0.0) - time.time()) / SECONDS_PER_DAY
 
 
 def main(folder: Path) -> dict[str, Any]:
