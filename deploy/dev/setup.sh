@@ -44,7 +44,7 @@ missing_packages() {
     unshare:util-linux flock:util-linux capsh:libcap2-bin
     iperf3:iperf3                             # benchmarks: a TCP flow at the same bottleneck
     turnserver:coturn turnutils_stunclient:coturn # third-party STUN
-    promtool:prometheus systemd-analyze:systemd   # checks of deploy/
+    promtool:prometheus amtool:prometheus-alertmanager systemd-analyze:systemd # checks of deploy/
   )
   {
     for pair in "${tools[@]}"; do
@@ -61,7 +61,7 @@ PYTHON
   } | sort -u
 }
 
-# Installs Debian packages without letting any of them start a service (prometheus and coturn would), now or at boot.
+# Installs Debian packages without letting any of them start a service (prometheus, its Alertmanager and coturn would), now or at boot.
 install_packages() {
   local policy=/usr/sbin/policy-rc.d unit
   say "installing Debian packages: $*"
@@ -79,7 +79,7 @@ install_packages() {
   fi
   rm -f "$log"
   if [[ -d /run/systemd/system ]]; then
-    for unit in prometheus coturn; do
+    for unit in prometheus prometheus-alertmanager coturn; do
       if [[ " $* " == *" $unit "* ]]; then
         systemctl --quiet disable "$unit" || true
       fi

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from controlplane.__main__ import EXIT_USAGE
+from controlplane.cli import main as plr
 from controlplane.config import load_config as load_controlplane_config
 from controlplane.core.control import ControlCore
 from controlplane.fleet_metrics import Fleet
@@ -33,7 +34,12 @@ DEPLOY = Path(__file__).parents[2] / "deploy"
 LISTS = {1: RevocationList(3, 0.0, 1.0, b"")}
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 DASHBOARDS = sorted((DEPLOY / "grafana").glob("*.json"))
-RULES = DEPLOY / "prometheus" / "plr-rules.yml"
+PROMETHEUS = DEPLOY / "prometheus"
+RULES = PROMETHEUS / "plr-rules.yml"
+RULE_TESTS = sorted((PROMETHEUS / "tests").glob("*.yml"))
+RUNBOOK = DEPLOY.parent / "docs" / "runbook.md"
+RECORDED = r"\w+:\w+:\w+"
+"""Names of what is recorded: level, metric, what was done to it."""
 
 MAX_EXPOSURE_TENTHS = 20
 """systemd-analyze's scale of 0 to 10.0, in tenths: a service without any hardening has 96."""
@@ -59,11 +65,23 @@ CONTRACT: dict[str, set[str]] = {
 
 BEYOND_CONTRACT: dict[str, set[str]] = {
     "plr_control_plane_connected": set(),
-    "plr_certificate_days_left": set(),
+    "plr_certificate_expiry_timestamp_seconds": set(),
+    "plr_refused_connections_total": {"reason"},
+    "plr_registrations_refused_total": {"reason"},
     "plr_revocation_list_number": {"ca"},
     "plr_revocation_list_age_seconds": {"ca"},
     "plr_revocation_list_max_age_seconds": set(),
     "plr_revocation_lists_too_old": set(),
+    "plr_robot_interface_info": {"robot", "interface", "carrier"},
+    "plr_robot_mapping_synced": {"robot"},
+    "plr_robot_path_rtt_seconds": {"robot", "interface", "server"},
+    "plr_robot_path_up": {"robot", "interface", "server"},
+    "plr_sidecar_certificate_expiry_timestamp_seconds": {"sidecar", "role"},
+    "plr_sidecar_gone_info": {"sidecar", "role", "why"},
+    "plr_sidecar_info": {"name", "role", "version"},
+    "plr_sidecar_last_seen_timestamp_seconds": {"sidecar", "role"},
+    "plr_sidecar_up": {"sidecar", "role"},
+    "plr_target_miss_probability": {"robot", "service"},
 }
 """Further metrics of the programs that the rules and dashboards use."""
 
@@ -189,12 +207,49 @@ def test_prometheus_accepts_its_configuration() -> None:
     assert "1 rule files found" in output
 
 
+@pytest.mark.audit("ops-12")
 def test_each_alert_fires_when_it_should_and_only_then() -> None:
-    tests = Path(__file__).with_name("plr_rules_test.yml")
-    run("promtool", "test", "rules", tests.name, cwd=tests.parent)
-    cases = yaml.safe_load(tests.read_text())["tests"]
-    fired = {rule["alertname"] for case in cases for rule in case["alert_rule_test"] if rule.get("exp_alerts")}
-    assert fired == {rule["alert"] for rule in rules()}
+    run("promtool", "test", "rules", *(path.name for path in RULE_TESTS), cwd=PROMETHEUS / "tests")
+    cases = [case for path in RULE_TESTS for case in yaml.safe_load(path.read_text())["tests"]]
+    fired = {rule["alertname"] for case in cases for rule in case.get("alert_rule_test", ()) if rule.get("exp_alerts")}
+    assert fired == {rule["alert"] for rule in alerts()}
+
+
+@pytest.mark.audit("ops-12")
+def test_each_alert_has_a_section_in_the_runbook_and_each_section_an_alert() -> None:
+    sections = re.findall(r"^### (\w+)$", RUNBOOK.read_text(), re.MULTILINE)
+    assert sorted(sections) == sorted(rule["alert"] for rule in alerts())
+    for rule in alerts():
+        page, _, anchor = rule["annotations"]["runbook_url"].partition("#")
+        assert DEPLOY.parent / page == RUNBOOK
+        assert anchor == rule["alert"].lower()
+    texts = re.split(r"^### ", RUNBOOK.read_text(), flags=re.MULTILINE)[1:]
+    assert [text.split()[0] for text in texts if not re.search(r"Meaning.*Look at.*Do\.", text, re.DOTALL)] == []
+
+
+@pytest.mark.audit("ops-12")
+def test_the_runbook_names_only_commands_that_exist() -> None:
+    for command in set(re.findall(r"`plr ((?:ca )?[a-z]+)", RUNBOOK.read_text())):
+        with pytest.raises(SystemExit) as ended:
+            plr([*command.split(), "--help"])
+        assert ended.value.code == 0, command
+
+
+@pytest.mark.audit("ops-12")
+def test_the_alertmanager_accepts_its_configuration() -> None:
+    run("amtool", "check-config", "alertmanager.yml", cwd=PROMETHEUS)
+    config = yaml.safe_load((PROMETHEUS / "alertmanager.yml").read_text())
+    names = {rule["alert"] for rule in alerts()}
+    for inhibits in config["inhibit_rules"]:
+        for matcher in (*inhibits["source_matchers"], *inhibits["target_matchers"]):
+            found = re.fullmatch(r'alertname=~?"(.+)"', matcher)
+            assert found is not None
+            for pattern in found[1].split("|"):
+                assert any(re.fullmatch(pattern, name) for name in names), pattern
+
+
+def alerts() -> list[dict[str, Any]]:
+    return [rule for rule in rules() if "alert" in rule]
 
 
 def rules() -> list[dict[str, Any]]:
@@ -249,10 +304,12 @@ def exported_metrics() -> dict[str, set[str]]:
     config = load_controlplane_config(DEPLOY / "config" / "controlplane.yaml")
     control.update(ControlCore(config.settings(), version_epoch=1, now=0.0), (), 0)
     families = [*sidecar.collect(), *control.registry.collect()]
+    suffixes = {"counter": "_total", "info": "_info"}
     exported: dict[str, set[str]] = {}
     for family in families:
-        name = f"{family.name}_total" if family.type == "counter" else family.name
-        exported.setdefault(name, set()).update(getattr(family, "_labelnames", ()))
+        labels = exported.setdefault(family.name + suffixes.get(family.type, ""), set())
+        labels.update(getattr(family, "_labelnames", ()), *(sample.labels for sample in family.samples))
+        labels.discard("le")
     return exported
 
 
@@ -263,9 +320,17 @@ def test_the_programs_export_the_contract() -> None:
 
 @pytest.mark.parametrize("expression", expressions())
 def test_expressions_use_only_metrics_and_labels_that_exist(expression: str) -> None:
+    recorded = {rule["record"] for rule in rules() if "record" in rule}
+    assert set(re.findall(RECORDED, expression)) <= recorded
+    labels = SCRAPE_LABELS
+    if re.search(RECORDED, expression):
+        labels = labels | {label for of in METRICS.values() for label in of}
+    expression = re.sub(RECORDED, "", expression)
     names = {family(name) for name in re.findall(r"\bplr_\w+", expression)}
     assert names <= METRICS.keys()
-    known = SCRAPE_LABELS.union(*(METRICS[name] for name in names))
+    # Also those that label_replace makes, which is by its third argument.
+    made = set(re.findall(r',\s*"(\w+)",\s*"[^"]*",\s*"\w*"', expression))
+    known = labels.union(made, *(METRICS[name] for name in names))
     compared = re.findall(r'(\w+)\s*(?:=~|!~|!=|=)\s*"', expression)
     grouped = [
         label for labels in re.findall(r"\b(?:by|on|without)\s*\(([^)]*)\)", expression) for label in labels.split(",")
@@ -274,7 +339,7 @@ def test_expressions_use_only_metrics_and_labels_that_exist(expression: str) -> 
 
 
 def test_the_dashboards_show_every_metric_of_the_contract() -> None:
-    shown = {family(name) for e in expressions() for name in re.findall(r"\bplr_\w+", e)}
+    shown = {family(name) for e in expressions() for name in re.findall(r"\bplr_\w+", re.sub(RECORDED, "", e))}
     assert shown == METRICS.keys()
 
 
