@@ -6,6 +6,7 @@ examples:
   make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
   make bench-insiders BENCH_ARGS='--minutes 2'              a robot and a cloud of the fleet attack the others
   make bench-control BENCH_ARGS='--size 500'                a fleet's control streams at one control plane
+  python -m bench alerts                                   what a real Alertmanager says when one server of five dies
   make bench-quick                                         15 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
   python -m bench report --out bench/results               verdicts, page and summary anew from the records of runs
@@ -19,6 +20,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from bench.alerts import command as alerts
 from bench.churn import command as churn
 from bench.control import command as control
 from bench.dataplane import command as dataplane
@@ -43,6 +45,7 @@ def main() -> int:
     control.add_arguments(
         commands.add_parser("control", help="the control plane with 500 to 4,000 sidecars: starts, load, a dead server")
     )
+    alerts.add_arguments(commands.add_parser("alerts", help="what a real Alertmanager says when a server dies"))
     matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
     scenarios.add_arguments(commands.add_parser("scenarios", help="what is replayed; the generator beside traces"))
     evaluate.add_arguments(commands.add_parser("evaluate", help="the system beside others on replayed networks"))
@@ -53,6 +56,7 @@ def main() -> int:
         else [[name] for name in ("dataplane", "churn", "insiders", "control", "matcher", "evaluate")]
     )
     runs = {
+        "alerts": alerts.run,
         "churn": churn.run,
         "control": control.run,
         "dataplane": dataplane.run,

@@ -47,7 +47,14 @@ class Member:
     """A sidecar of the crowd; `servers` are the clouds that robots reach."""
 
     def __init__(
-        self, name: NodeName, role: Role, issued: Issued, servers: tuple[NodeName, ...], rng: random.Random
+        self,
+        name: NodeName,
+        role: Role,
+        issued: Issued,
+        servers: tuple[NodeName, ...],
+        rng: random.Random,
+        *,
+        interfaces: tuple[InterfaceName, ...] = INTERFACES,
     ) -> None:
         self.name = name
         self.role = role
@@ -58,6 +65,7 @@ class Member:
         self.dead: NodeName | None = None
         """The server to which no path is up any more."""
         self._servers = servers
+        self._interfaces = interfaces
         self._rng = rng
         incarnation = int(time.time() * 1000.0)
         public_key = hashlib.sha256(f"{name} {incarnation}".encode()).digest()
@@ -79,7 +87,7 @@ class Member:
         self._announce(number)
 
     def _announce(self, number: SessionId) -> None:
-        interfaces = INTERFACES if self.role is Role.ROBOT else (InterfaceName("eth0"),)
+        interfaces = self._interfaces if self.role is Role.ROBOT else (InterfaceName("eth0"),)
         candidates = tuple(
             Candidate(InterfaceId(place), name, CandidateKind.HOST, (f"10.{place}.0.1", 4000 + place))
             for place, name in enumerate(interfaces)
@@ -98,7 +106,7 @@ class Member:
             return Report()
         requests = max(round(10 * interval_s), 1)
         paths, latencies = [], []
-        for interface in INTERFACES:
+        for interface in self._interfaces:
             for server in self._servers:
                 up = server != self.dead
                 rtt = Histogram()
