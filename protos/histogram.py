@@ -23,6 +23,7 @@ import itertools
 import math
 from array import array
 from bisect import bisect_right
+from operator import lt
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
@@ -72,9 +73,13 @@ where a 64-bit sum or a float would lose it."""
 
 
 class Histogram:
-    """Counts of latencies by bucket; mutable, and for one thread at a time. Times are seconds."""
+    """Counts of latencies by bucket; mutable, and for one thread at a time. Times are seconds.
 
-    __slots__ = ("_counts", "_lost")
+    One that came over the network stays as sparse as it came until somebody asks for the buckets: a report has dozens,
+    each with a handful of samples.
+    """
+
+    __slots__ = ("_counts", "_lost", "_sparse")
 
     # Mutable: equal by content, hence not hashable.
     __hash__ = None  # type: ignore[assignment]  # Python's own way to say so
@@ -83,6 +88,21 @@ class Histogram:
         # Of Python's integers in a row one is counted up twice as fast as in numpy, which computes on the same memory.
         self._counts = array("q", _EMPTY)
         self._lost = 0
+        # Tuples of numbers: unlike lists, the garbage collector passes them over.
+        self._sparse: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+        """The buckets in use and their counts, while `_counts` is not made yet."""
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> array[int]:
+            # Python asks here for a slot that is empty, so that `record` pays nothing for sparse ones.
+            if name != "_counts":
+                raise AttributeError(name)
+            counts = array("q", _EMPTY)
+            for index, count in zip(*self._sparse, strict=True):
+                counts[index] = count
+            self._counts, self._sparse = counts, None
+            return counts
 
     def record(self, seconds: float) -> None:
         """Count one answered request; negative times (clock noise) count as zero. NaN raises ValueError."""
@@ -108,9 +128,9 @@ class Histogram:
 
     def merge(self, other: Histogram) -> None:
         """Add the counts of `other` to this one."""
-        counts, added = self._counts, other._counts
-        for index in other._used():
-            counts[index] += added[index]
+        counts = self._counts
+        for index, added in other._items():
+            counts[index] += added
         self._lost += other._lost
 
     def subtract(self, earlier: Histogram) -> None:
@@ -119,11 +139,11 @@ class Histogram:
         Raises ValueError, and leaves all as it was, if `earlier` counts more anywhere: then it is not this histogram's
         past.
         """
-        counts, taken = self._counts, earlier._counts
-        if self._lost < earlier._lost or any(counts[index] < taken[index] for index in earlier._used()):
+        counts = self._counts
+        if self._lost < earlier._lost or any(counts[index] < taken for index, taken in earlier._items()):
             raise ValueError("the histogram to subtract counts what this one does not")
-        for index in earlier._used():
-            counts[index] -= taken[index]
+        for index, taken in earlier._items():
+            counts[index] -= taken
         self._lost -= earlier._lost
 
     def copy(self) -> Histogram:
@@ -137,6 +157,7 @@ class Histogram:
         """Forget everything."""
         self._counts = array("q", _EMPTY)
         self._lost = 0
+        self._sparse = None
 
     def take(self) -> Histogram:
         """What was recorded so far, and start anew."""
@@ -160,12 +181,12 @@ class Histogram:
     @property
     def answered(self) -> int:
         """Requests that were answered, however late."""
-        return sum(self._counts)
+        return sum(self._counts if self._sparse is None else self._sparse[1])
 
     @property
     def total(self) -> int:
         """All requests, answered or lost."""
-        return sum(self._counts) + self._lost
+        return self.answered + self._lost
 
     def count_over(self, seconds: float) -> float:
         """How many took longer than `seconds`, linear inside a bucket; the lost took longer than anything.
@@ -197,7 +218,9 @@ class Histogram:
         if not total:
             return math.nan
         rank = max(1, math.ceil(q * total))
-        for index, up_to in enumerate(itertools.accumulate(self._counts)):
+        up_to = 0
+        for index, count in self._items():
+            up_to += count
             if up_to >= rank:
                 return MIDS[index]
         return math.inf
@@ -209,15 +232,26 @@ class Histogram:
 
     def sum_s(self) -> float:
         """Seconds of all answered requests together, within 2 %."""
-        return sum(self._counts[index] * MIDS[index] for index in self._used())
+        return sum(count * MIDS[index] for index, count in self._items())
+
+    @property
+    def used(self) -> Sequence[int]:
+        """Indices of the buckets in use, ascending."""
+        return [index for index, _ in self._items()] if self._sparse is None else self._sparse[0]
 
     def to_sparse(self) -> tuple[list[int], list[int], int]:
         """Indices of the buckets in use, ascending, their counts, and the lost."""
-        used = list(self._used())
+        if self._sparse is not None:
+            indices, found = self._sparse
+            return list(indices), list(found), self._lost
+        used = list(itertools.compress(range(BUCKETS), self._counts))
         return used, [self._counts[index] for index in used], self._lost
 
-    def _used(self) -> Iterator[int]:
-        return itertools.compress(range(BUCKETS), self._counts)
+    def _items(self) -> Iterator[tuple[int, int]]:
+        """The buckets in use, ascending, with their counts."""
+        if self._sparse is not None:
+            return zip(*self._sparse, strict=True)
+        return itertools.compress(enumerate(self._counts), self._counts)
 
     @classmethod
     def from_sparse(
@@ -230,21 +264,19 @@ class Histogram:
             raise DecodeError(f"histogram has {len(indices)} indices but {len(counts)} counts")
         if not 0 <= lost <= MAX_COUNT:
             raise DecodeError(f"histogram counts {lost} lost, which is not within 0..{MAX_COUNT}")
-        histogram = cls()
-        previous = -1
-        for index, count in zip(indices, counts, strict=True):
-            if not previous < index < BUCKETS:
-                raise DecodeError(f"histogram index {index} does not follow {previous} within 0..{BUCKETS - 1}")
-            if not 1 <= count <= MAX_COUNT:
-                raise DecodeError(f"histogram count {count} is not within 1..{MAX_COUNT}")
-            histogram._counts[index] = count
-            previous = index
+        indices, counts = tuple(indices), tuple(counts)
+        if indices:
+            _check_sparse(indices, counts)
+        histogram = cls.__new__(cls)
+        histogram._sparse = indices, counts
         histogram._lost = lost
         return histogram
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Histogram):
             return NotImplemented
+        if self._sparse is not None and other._sparse is not None:
+            return self._lost == other._lost and self._sparse == other._sparse
         return self._lost == other._lost and self._counts == other._counts
 
     def __repr__(self) -> str:
@@ -261,3 +293,17 @@ def _edges() -> NDArray[np.float64]:
     import numpy as np
 
     return np.array(EDGES)
+
+
+def _check_sparse(indices: tuple[int, ...], counts: tuple[int, ...]) -> None:
+    """Check as many of both; raises DecodeError on the first that is wrong."""
+    ascend = indices[0] >= 0 and indices[-1] < BUCKETS and all(map(lt, indices, indices[1:]))
+    if ascend and min(counts) >= 1 and max(counts) <= MAX_COUNT:
+        return
+    previous = -1
+    for index, count in zip(indices, counts, strict=True):
+        if not previous < index < BUCKETS:
+            raise DecodeError(f"histogram index {index} does not follow {previous} within 0..{BUCKETS - 1}")
+        if not 1 <= count <= MAX_COUNT:
+            raise DecodeError(f"histogram count {count} is not within 1..{MAX_COUNT}")
+        previous = index

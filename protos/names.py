@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 
 from protos.errors import DecodeError
 from protos.model import InterfaceName, NodeName, ServiceName
 
 MAX_STRING_BYTES = 255
 """Longest string, UTF-8: ROS names its limit for topic and service names 255 too."""
+
+KEPT_NAMES = 16_384
+"""Names remembered as good, of some hundred bytes each: a report repeats the same dozen, each of a fleet's reports."""
 
 # At most 63 characters: such a name fits a certificate's common name (X.520) and a DNS label (RFC 1035).
 _NODE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
@@ -36,6 +40,7 @@ def text(value: str, field: str) -> str:
     return value
 
 
+@lru_cache(KEPT_NAMES)
 def _name(value: str, field: str, pattern: re.Pattern[str], expected: str) -> str:
     text(value, field)
     if not pattern.fullmatch(value):

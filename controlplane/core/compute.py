@@ -103,7 +103,8 @@ class ComputeTimes:
 
     def merge(self, robot: NodeName, server: NodeName, service: ServiceName, processing: Histogram, now: float) -> bool:
         """Add what a server needed, as a robot says; True if that is not what it needed before."""
-        if not processing.total:
+        samples = processing.total
+        if not samples:
             return False
         of_service = self._services.get(service)
         if of_service is None:
@@ -120,7 +121,9 @@ class ComputeTimes:
             self._servers[server, service] = of_server
             of_service.servers[server] = of_server.times
         self._servers.move_to_end((server, service))
-        kept = self._kept.setdefault(server, OrderedDict())
+        kept = self._kept.get(server)
+        if kept is None:
+            kept = self._kept[server] = OrderedDict()
         kept[service] = None
         kept.move_to_end(service)
         if len(kept) > MAX_PROCESSING_OF_SERVER:
@@ -128,7 +131,7 @@ class ComputeTimes:
         elif len(self._servers) > MAX_PROCESSING:
             self._forget(*next(iter(self._servers)))
         # No more than a robot may count for: what it says of one moment shall not pass for minutes.
-        of_server.lately.add(min(processing.total, int(COUNTS_ANYWAY)), 0.0, now)
+        of_server.lately.add(min(samples, int(COUNTS_ANYWAY)), 0.0, now)
         processing = of_server.witnesses.weigh(robot, processing, now)
         since = of_server.changed_with(robot, processing, now)
         if since is None:

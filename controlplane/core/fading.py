@@ -45,6 +45,10 @@ class FadedCount:
         """How many events it is worth by now."""
         return self._all * math.exp2((self._at - now) / self._half_life_s)
 
+    def rank(self) -> float:
+        """Of counts with the same half-life the one of higher rank is worth more events, at any time."""
+        return math.log2(self._all) + self._at / self._half_life_s if self._all else -math.inf
+
     def ratio(self) -> float:
         """Share of the wrong ones; NaN without events."""
         return self._bad / self._all if self._all else math.nan
@@ -82,7 +86,9 @@ class FadedHistogram:
     clock of its like they fade faster while only these are heard of.
     """
 
-    __slots__ = ("_at", "_called_off", "_counts", "_distribution", "_half_life_s", "_lost", "_silence", "_total")
+    __slots__ = (
+        *("_answered", "_at", "_called_off", "_counts", "_distribution", "_half_life_s", "_lost", "_silence", "_total"),
+    )
 
     def __init__(self, half_life_s: float, now: float, clock: HeardClock | None = None) -> None:
         self._silence = Silence(clock)
@@ -93,12 +99,14 @@ class FadedHistogram:
         self._lost = 0.0
         self._total = 0.0
         self._distribution: Distribution | None = None
+        self._answered: Distribution | None = None
 
     def add(self, histogram: Histogram, now: float, called_off: Histogram | None = None) -> None:
         """Merge new samples, and of those called off when they were."""
         factor = math.exp2((self._at - now) / self._half_life_s) * self._silence.end()
         self._at = now
-        self._counts = self._counts * factor + histogram.counts
+        self._counts = self._counts * factor
+        histogram.add_to(self._counts)
         self._lost = self._lost * factor + histogram.lost
         ended = 0
         if called_off is not None and (ended := called_off.answered) and self._called_off is None:
@@ -106,9 +114,9 @@ class FadedHistogram:
         if self._called_off is not None:
             self._called_off *= factor
             if called_off is not None:
-                self._called_off += called_off.counts
+                called_off.add_to(self._called_off)
         self._total = self._total * factor + histogram.total + ended
-        self._distribution = None
+        self._distribution = self._answered = None
 
     def forget(self, kept: float) -> None:
         """Only this share of what was counted still counts."""
@@ -117,7 +125,7 @@ class FadedHistogram:
         self._total *= kept
         if self._called_off is not None:
             self._called_off *= kept
-        self._distribution = None
+        self._distribution = self._answered = None
 
     def held_against(self, new: Histogram, watch: ChangeWatch, now: float) -> Histogram | None:
         """Let a watch judge samples that are still to be added by what is known now."""
@@ -157,8 +165,11 @@ class FadedHistogram:
 
     def answered(self) -> Distribution | None:
         """The answered samples alone; None without any."""
-        total = float(self._counts.sum())
-        return Distribution.of(self._counts / total, 0.0) if total > _FORGOTTEN else None
+        if self._answered is None:
+            total = float(np.add.reduce(self._counts))
+            if total > _FORGOTTEN:
+                self._answered = Distribution.of(self._counts / total, 0.0)
+        return self._answered
 
     def distribution(self) -> Distribution | None:
         """What the samples tell; None without any.
@@ -171,7 +182,7 @@ class FadedHistogram:
         return self._distribution
 
     def _known(self) -> Distribution:
-        total = float(self._counts.sum()) + self._lost
+        total = float(np.add.reduce(self._counts)) + self._lost
         return Distribution.of(self._counts / total, self._lost / total)
 
     def _survived(self, called_off: NDArray[np.float64]) -> Distribution:

@@ -124,10 +124,9 @@ class RobotNetwork:
         """Add a path's report; True if it went up or down, or is new."""
         self._fresh = False
         key = (path.interface, path.server)
-        known = self.paths.get(key)
-        state = known or PathState(
-            path.up, FadedHistogram(self._half_life_s, now), FadedCount(self._half_life_s, now), path
-        )
+        state = known = self.paths.get(key)
+        if state is None:
+            state = PathState(path.up, FadedHistogram(self._half_life_s, now), FadedCount(self._half_life_s, now), path)
         self._keep(self.paths, key, state, MAX_PATHS)
         changed = known is None or known.up != path.up
         state.up = path.up
@@ -143,7 +142,9 @@ class RobotNetwork:
             return
         self._fresh = False
         key = (report.interface, report.server, report.size_class)
-        clock = self._clocks.setdefault(report.size_class, HeardClock(now))
+        clock = self._clocks.get(report.size_class)
+        if clock is None:
+            clock = self._clocks[report.size_class] = HeardClock(now)
         clock.hear(now)
         cell = self._cells.get(key) or FadedHistogram(self._half_life_s, now, clock)
         self._keep(self._cells, key, cell, MAX_CELLS)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from protos.model import PenaltyReport
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection
 
     from protos.model import NodeName
 
@@ -27,8 +27,10 @@ class Penalties:
     def __init__(self) -> None:
         self._until: dict[NodeName, tuple[float, int]] = {}
 
-    def replace(self, told: Iterable[PenaltyReport], now: float) -> bool:
+    def replace(self, told: Collection[PenaltyReport], now: float) -> bool:
         """These are all that are in force; True if the servers are not those of before."""
+        if not told and not self._until:
+            return False
         before = self._until.keys()
         self._until = {
             one.server: (now + min(one.left_s, LONGEST_S), one.bad_answers) for one in told if one.left_s > 0.0

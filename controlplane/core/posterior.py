@@ -152,12 +152,12 @@ class FadedTrials:
         passed_s = now - self._at
         self._at = now
         self.forget(self._silence.end())
-        ratios = self._ratios(IGNORANCE, 0.0)
-        predicted, _ = self._average(ratios, 0.0)
+        predicted, _, ratios = self._predict(IGNORANCE, 0.0)
         score_fade = math.exp2(-passed_s / (self._half_life_s * SCORE_HALF_LIFE))
+        hits = trials - misses
         for memory, ratio in zip(self._memories, ratios, strict=True):
             sure = min(max(ratio, _SURE), 1.0 - _SURE)
-            surprise = misses * math.log(sure) + (trials - misses) * math.log1p(-sure)
+            surprise = misses * math.log(sure) + hits * math.log1p(-sure)
             memory.score = memory.score * score_fade + surprise
             fade = math.exp2(-passed_s / memory.half_life_s)
             memory.trials = memory.trials * fade + trials
@@ -173,29 +173,26 @@ class FadedTrials:
                 memory.misses *= kept
                 memory.score *= kept
 
-    def _ratios(self, prior: Estimate, passed_s: float) -> list[float]:
-        """Of each memory after so many more seconds, each from the one before, the longest from the prior."""
-        ratios: list[float] = []
-        start = prior
-        kept = self._silence.kept()
-        for memory in self._memories:
-            fade = math.exp2(-passed_s / memory.half_life_s) * kept
-            ratio = (memory.misses * fade + start.misses) / (memory.trials * fade + start.weight)
-            ratios.append(ratio)
-            start = Estimate.of(ratio, HANDED_ON)
-        return ratios
+    def _predict(self, prior: Estimate, passed_s: float) -> tuple[float, float, list[float]]:
+        """(ratio, trials) after so many more seconds over all memories, by how well each predicted; and their ratios.
 
-    def _average(self, ratios: list[float], passed_s: float) -> tuple[float, float]:
-        """(ratio, trials) over all memories, by how well each predicted."""
-        best = max(memory.score for memory in self._memories)
-        shares = [memory.share * math.exp(memory.score - best) for memory in self._memories]
+        Each memory starts from the one before, the longest from the prior.
+        """
         kept = self._silence.kept()
-        trials = [memory.trials * math.exp2(-passed_s / memory.half_life_s) * kept for memory in self._memories]
-        total = sum(shares)
-        return (
-            sum(share * ratio for share, ratio in zip(shares, ratios, strict=True)) / total,
-            sum(share * count for share, count in zip(shares, trials, strict=True)) / total,
-        )
+        best = max([memory.score for memory in self._memories])
+        misses, weight = prior.misses, prior.weight
+        ratios: list[float] = []
+        shares = mean = mean_trials = 0.0
+        for memory in self._memories:
+            fade = math.exp2(-passed_s / memory.half_life_s)
+            ratio = (memory.misses * (fade * kept) + misses) / (memory.trials * (fade * kept) + weight)
+            ratios.append(ratio)
+            misses, weight = ratio * HANDED_ON, ratio * HANDED_ON + (1.0 - ratio) * HANDED_ON
+            share = memory.share * math.exp(memory.score - best)
+            shares += share
+            mean += share * ratio
+            mean_trials += share * (memory.trials * fade * kept)
+        return mean / shares, mean_trials / shares, ratios
 
     def counts(self, now: float) -> tuple[float, float]:
         """Trials and misses that the longest memory still holds."""
@@ -209,5 +206,5 @@ class FadedTrials:
     def posterior(self, prior: Estimate, now: float) -> Estimate:
         """The prior, and what the trials say: their mean counts every trial, the weight only what they are worth."""
         passed_s = now - self._at
-        mean, trials = self._average(self._ratios(prior, passed_s), passed_s)
+        mean, trials, _ = self._predict(prior, passed_s)
         return Estimate.of(mean, trials / self.design_effect() + prior.weight)

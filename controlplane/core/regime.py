@@ -111,9 +111,9 @@ class ChangeWatch:
 def _is_usual(new: Histogram, known: NDArray[np.float64], known_lost: float, kept: float) -> bool:
     if new.lost:
         return False
-    least = USUAL_SHARE * (float(known.sum()) + known_lost + PRIOR_SAMPLES / kept)
-    used = np.flatnonzero(new.counts).tolist()
-    return all(float(known[max(0, bucket - _PER_BIN) : bucket + _PER_BIN + 1].sum()) >= least for bucket in used)
+    sums = np.add.reduce
+    least = USUAL_SHARE * (float(sums(known)) + known_lost + PRIOR_SAMPLES / kept)
+    return all(sums(known[max(0, bucket - _PER_BIN) : bucket + _PER_BIN + 1]) >= least for bucket in new.used)
 
 
 def _log_begun(counts: NDArray[np.float64], since: Histogram | None) -> float:

@@ -38,9 +38,10 @@ def believable(report: Report, robot: NodeName, registry: Registry, permits: Per
     )
     paths = tuple(one for one in report.paths if of(one.server)[0])
     penalties = tuple(one for one in report.penalties if of(one.server)[0])
-    left = replace(report, latencies=latencies, joints=joints, paths=paths, penalties=penalties)
-    left_out = _entries(report) - _entries(left)
-    return (left if left_out else report), left_out
+    left_out = _entries(report) - (len(latencies) + len(joints) + len(paths) + len(penalties))
+    if not left_out:
+        return report, 0
+    return replace(report, latencies=latencies, joints=joints, paths=paths, penalties=penalties), left_out
 
 
 def _entries(report: Report) -> int:

@@ -8,6 +8,7 @@ bears witness.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,9 @@ COUNTS_ANYWAY = 300.0
 MOST_ALONE = 1000.0
 """For so many a robot counts where no other one has reported lately: those who come later need not wait for long."""
 
+RANKS_ALIKE = 1e-6
+"""Ranks closer than this may differ by rounding alone."""
+
 LATELY_S = 5.0
 """Who reported within this time bears witness now: robots report once a second or so."""
 
@@ -35,11 +39,13 @@ LATELY_S = 5.0
 class Witnesses:
     """The robots that reported on one server and service. Times are monotonic seconds."""
 
-    __slots__ = ("_accusers", "_counts", "_half_life_s", "_heard_at")
+    __slots__ = ("_accusers", "_counts", "_half_life_s", "_heard_at", "_ranks")
 
     def __init__(self, half_life_s: float) -> None:
         self._half_life_s = half_life_s
         self._counts: OrderedDict[NodeName, FadedCount] = OrderedDict()
+        self._ranks: dict[NodeName, float] = {}
+        """By which they count for more or less, whatever the time: see `FadedCount.rank`."""
         self._heard_at: dict[NodeName, float] = {}
         self._accusers: set[NodeName] = set()
         """Whose samples lately spoke for a change."""
@@ -54,13 +60,24 @@ class Witnesses:
         self._heard_at[robot] = now
         if len(self._counts) > MAX_WITNESSES:
             gone, _ = self._counts.popitem(last=False)
-            del self._heard_at[gone]
+            del self._heard_at[gone], self._ranks[gone]
             self._accusers.discard(gone)
-        busiest = max((other.weight(now) for name, other in self._counts.items() if name != robot), default=0.0)
+        busiest = self._busiest_but(robot, now)
         most = max(busiest, COUNTS_ANYWAY) if busiest >= 1.0 else MOST_ALONE
-        kept = min(processing.total, max(0, int(most - count.weight(now))))
+        samples = processing.total
+        kept = min(samples, max(0, int(most - count.weight(now))))
         count.add(kept, 0.0, now)
-        return processing if kept == processing.total else thinned(processing, kept)
+        self._ranks[robot] = count.rank()
+        return processing if kept == samples else thinned(processing, kept)
+
+    def _busiest_but(self, robot: NodeName, now: float) -> float:
+        """For how much the busiest other one counts by now."""
+        self._ranks[robot] = -math.inf
+        least = max(self._ranks.values()) - RANKS_ALIKE
+        return max(
+            (self._counts[name].weight(now) for name, rank in self._ranks.items() if rank >= least and name != robot),
+            default=0.0,
+        )
 
     def accuses(self, robot: NodeName) -> None:
         """Its samples spoke for a change."""

@@ -307,9 +307,12 @@ def peer_to_proto(peer: Peer) -> types_pb2.Peer:
 
 def histogram_from_proto(message: types_pb2.Histogram) -> Histogram:
     """Check a histogram; a message never filled in is an empty one."""
-    if message.layout == 0 and not message.index and not message.count and not message.lost:
-        return Histogram()
-    return Histogram.from_sparse(message.index, message.count, message.lost, layout=message.layout)
+    layout, lost = message.layout, message.lost
+    # Slices of repeated fields are lists, made in C.
+    index, count = message.index[:], message.count[:]
+    if layout == 0 and not lost and not index and not count:
+        layout = LAYOUT
+    return Histogram.from_sparse(index, count, lost, layout=layout)
 
 
 def histogram_to_proto(histogram: Histogram) -> types_pb2.Histogram:
