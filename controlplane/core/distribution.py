@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,41 +18,74 @@ _ROUNDING = 1e-9
 """What sums of probabilities may be off by: half of the samples is half, whatever was added in between."""
 
 
-@dataclass(frozen=True, slots=True)
 class Distribution:
-    """Probabilities of the buckets; what is left to 1 is that there never is an answer. Times are seconds."""
+    """Probabilities of the buckets; what is left to 1 is that there never is an answer. Times are seconds.
 
-    mass: NDArray[np.float64]
-    tail: NDArray[np.float64]
-    """For each bucket the probability of more than its lower edge."""
+    Only the buckets from the first to the last that may be in use are kept, and nothing of them changes.
+    """
+
+    __slots__ = ("_first", "_mass", "_used", "never", "tail")
+
+    def __init__(self, first: int, mass: NDArray[np.float64], tail: NDArray[np.float64]) -> None:
+        self._first = first
+        self._mass = mass
+        """From that bucket on."""
+        self.tail = tail
+        """For each of these buckets, and the next one, if there is one, the probability of more than its lower edge."""
+        self.never = max(0.0, float(tail[-1] - mass[-1]) if first + len(mass) == BUCKETS else float(tail[-1]))
+        """Probability of no answer."""
+        self._used: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @classmethod
-    def of(cls, mass: NDArray[np.float64], never: float) -> Distribution:
-        """From the buckets' probabilities and that of no answer, which together are 1."""
-        return cls(mass, mass[::-1].cumsum()[::-1] + never)
+    def of(cls, mass: NDArray[np.float64], never: float, *, first: int = 0) -> Distribution:
+        """From the probabilities of buckets, from the `first` on, and that of no answer, which together are 1."""
+        tail = np.empty(min(len(mass) + 1, BUCKETS - first))
+        tail[-1] = 0.0
+        np.cumsum(mass[::-1], out=tail[len(mass) - 1 :: -1])
+        tail += never
+        return cls(first, mass, tail)
 
     @classmethod
     def mixed(cls, first: Distribution, share: float, second: Distribution) -> Distribution:
         """`first` with probability `share`, else `second`."""
-        return cls(
-            share * first.mass + (1.0 - share) * second.mass,
-            share * first.tail + (1.0 - share) * second.tail,
-        )
+        start = min(first._first, second._first)
+        end = max(first._first + len(first._mass), second._first + len(second._mass))
+        (mass, tail), (other_mass, other_tail) = first._within(start, end), second._within(start, end)
+        return cls(start, share * mass + (1.0 - share) * other_mass, share * tail + (1.0 - share) * other_tail)
+
+    def _within(self, start: int, end: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mass and tail of more buckets."""
+        mass = np.zeros(end - start)
+        tail = np.full(min(end + 1, BUCKETS) - start, self.tail[-1])
+        before = self._first - start
+        mass[before : before + len(self._mass)] = self._mass
+        tail[:before] = self.tail[0]
+        tail[before : before + len(self.tail)] = self.tail
+        return mass, tail
 
     @property
-    def never(self) -> float:
-        """Probability of no answer."""
-        return max(0.0, float(self.tail[-1] - self.mass[-1]))
+    def mass(self) -> NDArray[np.float64]:
+        """Probabilities of all `BUCKETS` buckets."""
+        return self._within(0, BUCKETS)[0]
+
+    @property
+    def used(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Probabilities of the buckets that have any, and the times that stand for these buckets."""
+        if self._used is None:
+            used = self._mass.nonzero()[0]
+            self._used = self._mass[used], _MIDS[used + self._first]
+        return self._used
 
     def median(self) -> float:
         """Median within 2 %; inf if an answer is less likely than none."""
-        slower = np.flatnonzero(self.tail <= 0.5 + _ROUNDING)
-        index = int(slower[0]) - 1 if slower.size else BUCKETS - 1
+        slower = (self.tail <= 0.5 + _ROUNDING).nonzero()[0]
+        index = int(slower[0]) + self._first - 1 if slower.size else BUCKETS - 1
         return MIDS[index] if index < BUCKETS - 1 or self.never <= 0.5 + _ROUNDING else math.inf
 
     def over(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """P(X > s) for each s, linear inside a bucket; the overflow bucket is over whatever there is."""
-        over: NDArray[np.float64] = np.interp(seconds, _LOWER_EDGES, self.tail)
+        edges = _LOWER_EDGES[self._first : self._first + len(self.tail)]
+        over: NDArray[np.float64] = np.interp(seconds, edges, self.tail)
         over[seconds >= MAX_S] = self.tail[-1]
         over[seconds < 0.0] = 1.0
         return over
@@ -66,6 +98,6 @@ class Distribution:
         """The same for each of some times."""
         if other is None:
             return self.over(seconds)
-        used = np.flatnonzero(self.mass)
-        exceeds: NDArray[np.float64] = other.over(seconds[:, np.newaxis] - _MIDS[used]) @ self.mass[used]
+        mass, took = self.used
+        exceeds: NDArray[np.float64] = other.over(seconds[:, np.newaxis] - took) @ mass
         return exceeds + self.never

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -87,14 +88,20 @@ class FadedHistogram:
     """
 
     __slots__ = (
-        *("_answered", "_at", "_called_off", "_counts", "_distribution", "_half_life_s", "_lost", "_silence", "_total"),
+        *("_answered", "_at", "_called_off", "_counts", "_distribution", "_first", "_half_life_s", "_lost", "_silence"),
+        *("_total", "_values"),
     )
 
     def __init__(self, half_life_s: float, now: float, clock: HeardClock | None = None) -> None:
         self._silence = Silence(clock)
         self._half_life_s = half_life_s
         self._at = now
-        self._counts: NDArray[np.float64] = np.zeros(BUCKETS)
+        # Most histograms use a few dozen buckets side by side; all of a fleet's would not stay in a processor's cache.
+        self._first = BUCKETS
+        self._values = array("d")
+        """Weights from the first bucket in use to the last: one is counted up as in a list of Python's ..."""
+        self._counts: NDArray[np.float64] = np.zeros(0)
+        """... and numpy computes on the same memory."""
         self._called_off: NDArray[np.float64] | None = None
         self._lost = 0.0
         self._total = 0.0
@@ -105,22 +112,39 @@ class FadedHistogram:
         """Merge new samples, and of those called off when they were."""
         factor = math.exp2((self._at - now) / self._half_life_s) * self._silence.end()
         self._at = now
-        self._counts = self._counts * factor
-        histogram.add_to(self._counts)
-        self._lost = self._lost * factor + histogram.lost
+        indices, counts, lost = histogram.to_sparse()
+        self._counts *= factor
+        if indices:
+            self._make_room(indices[0], indices[-1] + 1)
+            values, first = self._values, self._first
+            for index, count in zip(indices, counts, strict=True):
+                values[index - first] += count
+        self._lost = self._lost * factor + lost
         ended = 0
         if called_off is not None and (ended := called_off.answered) and self._called_off is None:
             self._called_off = np.zeros(BUCKETS)
         if self._called_off is not None:
             self._called_off *= factor
-            if called_off is not None:
-                called_off.add_to(self._called_off)
-        self._total = self._total * factor + histogram.total + ended
+            if called_off is not None and ended:
+                self._called_off += called_off.counts
+        self._total = self._total * factor + (sum(counts) + lost) + ended
         self._distribution = self._answered = None
+
+    def _make_room(self, first: int, end: int) -> None:
+        """Keep the buckets from `first` to before `end` as well."""
+        had_first, had_end = self._first, self._first + len(self._values)
+        if had_first <= first and end <= had_end:
+            return
+        if not self._values:
+            had_end = 0
+        first, end = min(first, had_first), max(end, had_end)
+        values = array("d", bytes(8 * (end - first)))
+        values[had_first - first : had_first - first + len(self._values)] = self._values
+        self._first, self._values, self._counts = first, values, np.frombuffer(values)
 
     def forget(self, kept: float) -> None:
         """Only this share of what was counted still counts."""
-        self._counts = self._counts * kept
+        self._counts *= kept
         self._lost *= kept
         self._total *= kept
         if self._called_off is not None:
@@ -130,7 +154,7 @@ class FadedHistogram:
     def held_against(self, new: Histogram, watch: ChangeWatch, now: float) -> Histogram | None:
         """Let a watch judge samples that are still to be added by what is known now."""
         kept = math.exp2((self._at - now) / self._half_life_s) * self._silence.kept()
-        return watch.add(new, self._counts, self._lost, max(kept, _FORGOTTEN), now)
+        return watch.add(new, self.snapshot(), self._lost, max(kept, _FORGOTTEN), now)
 
     def weight(self, now: float) -> float:
         """How many samples it is worth by now, the lost and those called off included."""
@@ -155,8 +179,10 @@ class FadedHistogram:
         return self._lost / self._total if self._total > _FORGOTTEN else math.nan
 
     def snapshot(self) -> NDArray[np.float64]:
-        """Weights of the answered samples by bucket; what comes later makes another array."""
-        return self._counts
+        """Weights of the answered samples by bucket, `BUCKETS` of them, as they are now."""
+        dense = np.zeros(BUCKETS)
+        dense[self._first : self._first + len(self._counts)] = self._counts
+        return dense
 
     def median(self) -> float:
         """Median of the answered samples, within 2 %; NaN without any."""
@@ -166,9 +192,9 @@ class FadedHistogram:
     def answered(self) -> Distribution | None:
         """The answered samples alone; None without any."""
         if self._answered is None:
-            total = float(np.add.reduce(self._counts))
+            total = self._answered_total()
             if total > _FORGOTTEN:
-                self._answered = Distribution.of(self._counts / total, 0.0)
+                self._answered = Distribution.of(self._counts / total, 0.0, first=self._first)
         return self._answered
 
     def distribution(self) -> Distribution | None:
@@ -181,14 +207,21 @@ class FadedHistogram:
             self._distribution = self._known() if self._called_off is None else self._survived(self._called_off)
         return self._distribution
 
+    def _answered_total(self) -> float:
+        # Over all buckets, as numpy sums up pairwise: the figure does not depend on which of them are kept.
+        return float(np.add.reduce(self.snapshot()))
+
     def _known(self) -> Distribution:
-        total = float(np.add.reduce(self._counts)) + self._lost
-        return Distribution.of(self._counts / total, self._lost / total)
+        total = self._answered_total() + self._lost
+        if not self._values:
+            return Distribution.of(np.zeros(BUCKETS), self._lost / total)
+        return Distribution.of(self._counts / total, self._lost / total, first=self._first)
 
     def _survived(self, called_off: NDArray[np.float64]) -> Distribution:
-        ended = self._counts + called_off
+        counts = self.snapshot()
+        ended = counts + called_off
         there = ended[::-1].cumsum()[::-1] + self._lost
-        hazard = np.divide(self._counts, there, out=np.zeros(BUCKETS), where=there > 0.0)
+        hazard = np.divide(counts, there, out=np.zeros(BUCKETS), where=there > 0.0)
         slower = np.cumprod(1.0 - np.minimum(hazard, 1.0))
         before = np.concatenate(([1.0], slower[:-1]))
         return Distribution.of(before - slower, float(slower[-1]))

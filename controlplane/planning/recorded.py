@@ -17,7 +17,6 @@ from controlplane.planning.prospects import Prospect
 from protos.convert import explanation_from_proto
 from protos.errors import DecodeError
 from protos.explanation import SAMPLE
-from protos.histogram import MIDS
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
@@ -167,8 +166,7 @@ class RecordedService:
             compute = _distribution(first.compute)
             if first.path.server != second.path.server or compute is None:
                 continue
-            used = np.flatnonzero(compute.mass)
-            shares, took = compute.mass[used], np.array(MIDS)[used]
+            shares, took = compute.used
             one, other = (
                 network.over(deadline_s - later_s - took) for network, later_s in map(self._network, (first, second))
             )
