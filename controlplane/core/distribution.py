@@ -92,7 +92,10 @@ class Distribution:
 
     def sum_exceeds(self, other: Distribution | None, seconds: float) -> float:
         """P(A + B > seconds) for an A of this distribution and a B of the other, independent; B is 0 without one."""
-        return float(self.sums_exceed(other, np.array([seconds]))[0])
+        if other is None:
+            return float(self.over(np.array([seconds]))[0])
+        mass, took = self.used
+        return float(mass @ other.over(seconds - took)) + self.never
 
     def sums_exceed(self, other: Distribution | None, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same for each of some times."""

@@ -18,7 +18,7 @@ from controlplane.core.fleet_view import PathView
 from controlplane.core.interface_trouble import InterfaceTrouble
 from controlplane.core.late_fate import LateFate
 from controlplane.core.network import RobotNetwork
-from controlplane.core.parts import Asked, from_parts, slower_than
+from controlplane.core.parts import Asked, from_parts, parts_of, slower_than
 from controlplane.core.penalties import Penalties
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
 from controlplane.core.shared_fate import SharedFate
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.network import PathState
+    from controlplane.core.parts import Parts
     from controlplane.core.shared_fate import CommonMisses
     from protos.model import (
         Assignment,
@@ -169,6 +170,13 @@ class Estimator:
         self._histograms = 0
         self._dropped = 0
         self._reports = 0
+        self._times: dict[tuple[NodeName, ServiceName], ServerTimes] = {}
+        """Worked out ..."""
+        self._parts: dict[tuple[ServiceName, Asked], Parts] = {}
+        """... as well as what there is to tell of each path of this robot ..."""
+        self._worked_out_of: _Robot | None = None
+        self._worked_out_at = (0, 0.0)
+        """... from so many reports, at this time."""
 
     @property
     def dropped(self) -> int:
@@ -259,6 +267,7 @@ class Estimator:
             tables.network.forget_paths()
             # It may send copies in another way from now on.
             tables.late.clear()
+            self._worked_out_of = None
             self._histograms += len(tables.network)
 
     def paths(self, robot: NodeName) -> Iterator[PathReport]:
@@ -317,16 +326,18 @@ class Estimator:
             return IGNORANCE
         pair = tables.trials.get((interface, server, service))
         carried = pair.trials.counts(now)[0] if pair is not None else 0.0
-        processing = self._compute.times(server, service, now)
-        asked = Asked(tables.network, interface, server, _usual_sizes(tables, service), deadline_s, carried)
-        prior = from_parts(asked, processing, now)
+        self._begin(tables, now)
+        processing = self._times_of(server, service, now)
+        asked = Asked(interface, server, _usual_sizes(tables, service), deadline_s)
+        prior = from_parts(self._parts_of(tables, service, asked, now), carried, processing.requests)
         trouble = self._trouble(tables, service, deadline_s, now)
         if pair is None:
             return trouble.moved(prior, interface, server)
         changes, before = self._compute.changes(server, service)
         if pair.changes != changes:
             pair.changes = changes
-            if abs(prior.mean - from_parts(asked, ServerTimes(before, processing.requests), now).mean) > CHANGE_MATTERS:
+            parts = parts_of(asked, tables.network, ServerTimes(before, processing.requests), now)
+            if abs(prior.mean - from_parts(parts, carried, processing.requests).mean) > CHANGE_MATTERS:
                 pair.trials.forget(CHANGE_KEEPS_REQUESTS / max(carried, CHANGE_KEEPS_REQUESTS))
         return pair.trials.posterior(trouble.moved(prior, interface, server), now)
 
@@ -353,14 +364,40 @@ class Estimator:
         if tables is None:
             return None
         interface, server, service = pair
-        asked = Asked(tables.network, interface, server, _usual_sizes(tables, service), 0.0, 0.0)
-        return slower_than(asked, self._compute.times(server, service, now), seconds, now)
+        asked = Asked(interface, server, _usual_sizes(tables, service), 0.0)
+        return slower_than(asked, tables.network, self._compute.times(server, service, now), seconds, now)
+
+    def _begin(self, tables: _Robot, now: float) -> None:
+        """What was worked out from other reports, for another time or robot, counts no more."""
+        at = (self._reports, now)
+        if self._worked_out_at != at:
+            self._worked_out_at = at
+            self._times.clear()
+            self._parts.clear()
+        elif self._worked_out_of is not tables:
+            self._parts.clear()
+        self._worked_out_of = tables
+        if tables.troubles_at != at:
+            tables.troubles.clear()
+            tables.troubles_at = at
+
+    def _times_of(self, server: NodeName, service: ServiceName, now: float) -> ServerTimes:
+        key = (server, service)
+        times = self._times.get(key)
+        if times is None:
+            times = self._times[key] = self._compute.times(server, service, now)
+        return times
+
+    def _parts_of(self, tables: _Robot, service: ServiceName, asked: Asked, now: float) -> Parts:
+        key = (service, asked)
+        parts = self._parts.get(key)
+        if parts is None:
+            times = self._times_of(asked.server, service, now)
+            parts = self._parts[key] = parts_of(asked, tables.network, times, now)
+        return parts
 
     def _trouble(self, tables: _Robot, service: ServiceName, deadline_s: float, now: float) -> InterfaceTrouble:
         """What the robot's requests of the service met beyond what their parts explain."""
-        if tables.troubles_at != (self._reports, now):
-            tables.troubles.clear()
-            tables.troubles_at = (self._reports, now)
         trouble = tables.troubles.get((service, deadline_s))
         if trouble is None:
             trouble = tables.troubles[service, deadline_s] = InterfaceTrouble()
@@ -371,8 +408,8 @@ class Estimator:
                     continue
                 if self._compute.is_odd(server, service):
                     continue
-                asked = Asked(tables.network, interface, server, sizes, deadline_s, 0.0)
-                expected = from_parts(asked, self._compute.times(server, service, now), now)
+                parts = self._parts_of(tables, service, Asked(interface, server, sizes, deadline_s), now)
+                expected = from_parts(parts, 0.0, self._times_of(server, service, now).requests)
                 requests, _ = pair.trials.counts(now)
                 trouble.note(interface, server, requests, expected, pair.trials.posterior(expected, now))
         return trouble

@@ -73,7 +73,15 @@ class Witness(NamedTuple):
     itself: bool = False
     """These are requests on the very path."""
 
-    def exceeds(self, processing: Distribution | None, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    def exceeds(self, processing: Distribution | None, seconds: float) -> float:
+        """P(network + processing > seconds)."""
+        left = seconds - self.later_s
+        prompt = self.times.sum_exceeds(processing, left)
+        if not self.resent:
+            return prompt
+        return (1.0 - self.resent) * prompt + self.resent * self.times.sum_exceeds(processing, left - self.resend_s)
+
+    def exceeds_each(self, processing: Distribution | None, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """P(network + processing > s) for each s."""
         left = seconds - self.later_s
         prompt = self.times.sums_exceed(processing, left)
@@ -171,16 +179,13 @@ class RobotNetwork:
         return cell.scaled(now, sample) if cell is not None else Histogram()
 
     def witnesses(
-        self, interface: InterfaceName, server: NodeName, size_class: int, now: float, *, counted: float = 0.0
+        self, interface: InterfaceName, server: NodeName, size_class: int, now: float
     ) -> Iterator[Witness]:
-        """All that tells what requests of the class would take from the interface to the server.
-
-        `counted` of the path's own requests count for nothing here, as their outcomes are known.
-        """
+        """All that tells what requests of the class would take from the interface to the server."""
         self._refresh(now)
         key = (interface, server)
         own = self._cells.get((*key, size_class))
-        requests = own.weight(now) - counted if own is not None else 0.0
+        requests = own.weight(now) if own is not None else 0.0
         if own is not None and requests > 0.0 and (times := own.distribution()) is not None:
             yield Witness(requests, requests, times, 0.0, itself=True)
         round_trip, measured = self._round_trip(key)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.compute import ServerTimes
-    from controlplane.core.network import RobotNetwork
+    from controlplane.core.network import RobotNetwork, Witness
     from protos.model import InterfaceName, NodeName
 
 MODEL_REQUESTS = 5.0
@@ -31,63 +31,74 @@ MODEL_MAX_SAMPLES = 100.0
 class Asked(NamedTuple):
     """Which requests, over which path."""
 
-    network: RobotNetwork
     interface: InterfaceName
     server: NodeName
     sizes: tuple[tuple[int, float], ...]
     """(size class, share) of the requests."""
     deadline_s: float
-    carried: float
-    """Requests on this very path whose outcomes are counted elsewhere."""
 
 
-class _Parts(NamedTuple):
-    """What the parts say."""
-
-    exceeds: NDArray[np.float64]
-    """P(network + processing > s) for each time s that was asked about."""
-    samples: float
-    shared: float
-    """Requests of any service on the very path among them."""
+Parts = list[tuple[float, "list[tuple[Witness, float]]"]]
+"""For each size class the share of the requests, and who tells what of them: that a request misses is so probable."""
 
 
-def from_parts(asked: Asked, processing: ServerTimes, now: float) -> Estimate:
+def parts_of(asked: Asked, network: RobotNetwork, processing: ServerTimes, now: float) -> Parts:
+    """Ask all who tell of the path, with what the server needs."""
+    times, deadline_s = processing.times, asked.deadline_s
+    return [
+        (
+            share,
+            [
+                (witness, witness.exceeds(times, deadline_s))
+                for witness in network.witnesses(asked.interface, asked.server, size_class, now)
+            ],
+        )
+        for size_class, share in asked.sizes
+    ]
+
+
+def from_parts(parts: Parts, carried: float, known_requests: float) -> Estimate:
     """P(network + processing > deadline), as known without the requests that were carried.
 
-    `IGNORANCE` where nothing is known of the network.
+    `carried` are the requests on this very path whose outcomes are counted elsewhere, `known_requests` those from which
+    it is known what the server needs. `IGNORANCE` where nothing is known of the network.
     """
-    found = _put_together(asked, processing, np.array([asked.deadline_s]), now)
-    if found is None:
-        return IGNORANCE
-    samples = min(found.samples, MODEL_MAX_SAMPLES)
-    mean = (samples * float(found.exceeds[0]) + IGNORANCE.misses) / (samples + IGNORANCE.weight)
-    weight = MODEL_REQUESTS + min(found.shared, SHARED_REQUESTS)
-    if processing.requests < STRANGE_SERVER_REQUESTS:
+    miss = samples = shared = 0.0
+    for share, told in parts:
+        missed = worth = 0.0
+        for witness, exceeds in told:
+            requests, of_samples = witness.requests, witness.samples
+            if witness.itself:
+                requests = of_samples = requests - carried * share
+                if requests <= 0.0:
+                    continue
+                shared += requests
+            missed += requests * exceeds
+            worth += requests
+            samples += share * of_samples
+        if not worth:
+            return IGNORANCE
+        miss += share * missed / worth
+    samples = min(samples, MODEL_MAX_SAMPLES)
+    mean = (samples * miss + IGNORANCE.misses) / (samples + IGNORANCE.weight)
+    weight = MODEL_REQUESTS + min(shared, SHARED_REQUESTS)
+    if known_requests < STRANGE_SERVER_REQUESTS:
         weight = STRANGE_SERVER_REQUESTS
     return Estimate.of(min(mean, 1.0), min(weight, samples + IGNORANCE.weight))
 
 
 def slower_than(
-    asked: Asked, processing: ServerTimes, seconds: NDArray[np.float64], now: float
+    asked: Asked, network: RobotNetwork, processing: ServerTimes, seconds: NDArray[np.float64], now: float
 ) -> NDArray[np.float64] | None:
     """P(network + processing > s) for each s, as measured; None where nothing is known of the network."""
-    found = _put_together(asked, processing, seconds, now)
-    return found.exceeds if found is not None else None
-
-
-def _put_together(asked: Asked, processing: ServerTimes, seconds: NDArray[np.float64], now: float) -> _Parts | None:
-    exceeds = np.zeros(len(seconds))
-    samples = shared = 0.0
+    slower = np.zeros(len(seconds))
     for size_class, share in asked.sizes:
         missed = np.zeros(len(seconds))
         worth = 0.0
-        counted = asked.carried * share
-        for witness in asked.network.witnesses(asked.interface, asked.server, size_class, now, counted=counted):
-            missed += witness.requests * witness.exceeds(processing.times, seconds)
+        for witness in network.witnesses(asked.interface, asked.server, size_class, now):
+            missed += witness.requests * witness.exceeds_each(processing.times, seconds)
             worth += witness.requests
-            samples += share * witness.samples
-            shared += witness.requests if witness.itself else 0.0
         if not worth:
             return None
-        exceeds += share * missed / worth
-    return _Parts(exceeds, samples, shared)
+        slower += share * missed / worth
+    return slower
