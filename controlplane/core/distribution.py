@@ -84,10 +84,15 @@ class Distribution:
 
     def over(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """P(X > s) for each s, linear inside a bucket; the overflow bucket is over whatever there is."""
-        edges = _LOWER_EDGES[self._first : self._first + len(self.tail)]
-        over: NDArray[np.float64] = np.interp(seconds, edges, self.tail)
+        over = self._between(seconds)
         over[seconds >= MAX_S] = self.tail[-1]
         over[seconds < 0.0] = 1.0
+        return over
+
+    def _between(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same for 0 <= s < MAX_S."""
+        tail = self.tail
+        over: NDArray[np.float64] = np.interp(seconds, _LOWER_EDGES[self._first : self._first + len(tail)], tail)
         return over
 
     def sum_exceeds(self, other: Distribution | None, seconds: float) -> float:
@@ -95,7 +100,12 @@ class Distribution:
         if other is None:
             return float(self.over(np.array([seconds]))[0])
         mass, took = self.used
-        return float(mass @ other.over(seconds - took)) + self.never
+        if not len(took):
+            return self.never
+        left = seconds - took
+        # The longest is left beside the shortest time.
+        usual = left[0] < MAX_S and left[-1] >= 0.0
+        return float(mass @ (other._between(left) if usual else other.over(left))) + self.never
 
     def sums_exceed(self, other: Distribution | None, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same for each of some times."""

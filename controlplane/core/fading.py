@@ -13,8 +13,6 @@ from controlplane.core.silence import Silence
 from protos.histogram import BUCKETS, Histogram
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
     from controlplane.core.regime import ChangeWatch
@@ -72,12 +70,13 @@ class FadedShares:
         self._counts = [old * factor for old in self._counts]
         self._counts[kind] += count
 
-    def shares(self, least: float) -> Iterator[tuple[int, float]]:
+    def shares(self, least: float) -> list[tuple[int, float]]:
         """(kind, share) of those that make up at least `least` of all; their shares sum up to 1."""
-        limit = least * sum(self._counts)
-        common = [(kind, count) for kind, count in enumerate(self._counts) if count and count >= limit]
-        total = sum(count for _, count in common)
-        yield from ((kind, count / total) for kind, count in common)
+        counts = self._counts
+        limit = least * sum(counts)
+        common = [(kind, count) for kind, count in enumerate(counts) if count and count >= limit]
+        total = sum([count for _, count in common])
+        return [(kind, count / total) for kind, count in common]
 
 
 class FadedHistogram:

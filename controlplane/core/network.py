@@ -101,8 +101,12 @@ class PathState:
 
     def loss(self) -> float:
         """Share of what was sent that got lost, as datagrams or as probes, whichever is worse."""
-        found = [ratio for ratio in (self.datagrams.ratio(), self.rtt.lost_share()) if not math.isnan(ratio)]
-        return max(found, default=0.0)
+        worst = 0.0
+        for ratio in (self.datagrams.ratio(), self.rtt.lost_share()):
+            # Of what nothing was sent it is NaN, which is not larger than anything.
+            if ratio > worst:
+                worst = ratio
+        return worst
 
 
 class RobotNetwork:
