@@ -114,7 +114,8 @@ class FadedHistogram:
         indices, counts, lost = histogram.to_sparse()
         self._counts *= factor
         if indices:
-            self._make_room(indices[0], indices[-1] + 1)
+            if indices[0] < self._first or indices[-1] - self._first >= len(self._values):
+                self._make_room(indices[0], indices[-1] + 1)
             values, first = self._values, self._first
             for index, count in zip(indices, counts, strict=True):
                 values[index - first] += count
@@ -132,11 +133,7 @@ class FadedHistogram:
     def _make_room(self, first: int, end: int) -> None:
         """Keep the buckets from `first` to before `end` as well."""
         had_first, had_end = self._first, self._first + len(self._values)
-        if had_first <= first and end <= had_end:
-            return
-        if not self._values:
-            had_end = 0
-        first, end = min(first, had_first), max(end, had_end)
+        first, end = min(first, had_first), max(end, had_end) if self._values else end
         values = array("d", bytes(8 * (end - first)))
         values[had_first - first : had_first - first + len(self._values)] = self._values
         self._first, self._values, self._counts = first, values, np.frombuffer(values)

@@ -156,7 +156,7 @@ class FadedTrials:
         score_fade = math.exp2(-passed_s / (self._half_life_s * SCORE_HALF_LIFE))
         hits = trials - misses
         for memory, ratio in zip(self._memories, ratios, strict=True):
-            sure = min(max(ratio, _SURE), 1.0 - _SURE)
+            sure = ratio if _SURE < ratio < 1.0 - _SURE else min(max(ratio, _SURE), 1.0 - _SURE)
             surprise = misses * math.log(sure) + hits * math.log1p(-sure)
             memory.score = memory.score * score_fade + surprise
             fade = math.exp2(-passed_s / memory.half_life_s)
