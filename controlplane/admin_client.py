@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, TypeVar
 import grpc
 
 from protos import tls_advice
-from protos.config_fields import check_remote
 from protos.errors import ConfigError, DecodeError
+from protos.host_port import check_remote
 from protos.identity import CONTROL_PLANE_DNS
 from protos.plr.v1 import admin_pb2_grpc
 from protos.tls_files import load_tls_files
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from protos.tls_files import TlsFiles
 
-P = TypeVar("P")
 A = TypeVar("A")
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
@@ -66,23 +65,18 @@ def _address(text: str) -> str:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def ask(
-    arguments: argparse.Namespace,
-    call: Callable[[admin_pb2_grpc.AdminStub, float], P],
-    convert: Callable[[P], A],
-) -> tuple[P, A]:
-    """Make a call with the stub and the time limit in seconds; returns its answer, and that converted.
+def ask(arguments: argparse.Namespace, call: Callable[[admin_pb2_grpc.AdminStub, float], A]) -> A:
+    """Make a call with the stub and the time limit in seconds; returns what it returns.
 
     Raises:
-        AskError: no answer, or not one that `convert` takes.
+        AskError: no answer, or not one that could be converted (`call` raised DecodeError).
     """
     files = None
     address = arguments.address
     try:
         files = load_tls_files(arguments.tls_dir) if arguments.tls_dir is not None else None
         with _open_channel(address, files) as channel:
-            answer = call(admin_pb2_grpc.AdminStub(channel), arguments.timeout_s)
-        return answer, convert(answer)
+            return call(admin_pb2_grpc.AdminStub(channel), arguments.timeout_s)
     except grpc.RpcError as error:
         # The error of a call is the call itself, which the stubs do not say.
         detail = " ".join(str(getattr(error, "details", error.__str__)()).split())

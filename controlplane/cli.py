@@ -8,6 +8,7 @@ on a robot or a server itself, without the control plane (each has --help):
 examples:
   plr status --tls-dir ~/.plr/alice --address control.example.org:50051
   plr status --insecure --json
+  plr status --tls-dir ~/.plr/alice robot-7
   plr explain --tls-dir ~/.plr/alice robot-7 /plan
   plr events --tls-dir ~/.plr/alice --node robot-7 --since 2h
   plr plan --traces drive.csv.gz --request-bytes 120000 --deadline-ms 250 --target 0.01
@@ -25,51 +26,29 @@ denies it, or the plan misses its target, 2 bad usage
 from __future__ import annotations
 
 import argparse
-import base64
-import json
-import subprocess
 import sys
-import time
-from ipaddress import ip_address
 from typing import TYPE_CHECKING
 
-from google.protobuf import json_format
-
-from controlplane import (
-    event_text,
-    events_command,
-    explain_command,
-    plan_command,
-    policy_command,
-    status_table,
-)
-from controlplane.admin_client import AskError, add_options, ask
-from controlplane.ca import commands as ca_commands
-from controlplane.config import ControlPlaneConfig
-from protos.convert import (
-    departed_from_proto,
-    events_from_proto,
-    log_state_from_proto,
-    own_revocations_from_proto,
-    status_from_proto,
-)
-from protos.plr.v1 import admin_pb2
 from protos.version_option import ShowVersion
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
-EXIT_OK = 0
+    from controlplane.arguments import Commands
+
+# Each command imports what it needs when it is the one that is asked for: `plr status` is used where each second
+# counts, and what all commands import together takes longer than its answer.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
-    arguments = _parser().parse_args(argv)
+    argv = sys.argv[1:] if argv is None else argv
+    arguments = _parser(argv[0] if argv else "").parse_args(argv)
     code: int = arguments.run(arguments)
     return code
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(asked_for: str) -> argparse.ArgumentParser:
     summary, _, epilog = (__doc__ or "").partition("\n\n")
     parser = argparse.ArgumentParser(
         prog="plr",
@@ -79,70 +58,73 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=ShowVersion)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    status = commands.add_parser("status", help="who is connected, how far each follows, and who is gone")
-    add_options(status)
-    status.set_defaults(run=_status)
-
-    explain_command.add_to(commands)
-    events_command.add_to(commands)
-    plan_command.add_to(commands)
-    ca_commands.add_to(commands)
-
-    config = commands.add_parser("config", help="about configuration files")
-    about = config.add_subparsers(required=True, metavar="COMMAND")
-    schema = about.add_parser("schema", help="print the JSON Schema of a program's configuration")
-    schema.add_argument("program", choices=["controlplane", "sidecar"])
-    schema.set_defaults(run=_schema)
-
-    policy_command.add_to(commands)
+    for name, (about, add) in _COMMANDS.items():
+        if name == asked_for:
+            add(commands, about)
+        else:
+            commands.add_parser(name, help=about)
     return parser
 
 
-def _status(arguments: argparse.Namespace) -> int:
-    try:
-        answer, (sidecars, own, gone, events, state) = ask(
-            arguments,
-            lambda stub, timeout_s: stub.GetStatus(admin_pb2.GetStatusRequest(), timeout=timeout_s),
-            lambda message: (
-                status_from_proto(message),
-                own_revocations_from_proto(message),
-                departed_from_proto(message.departed),
-                events_from_proto(message.events),
-                log_state_from_proto(message.log),
-            ),
-        )
-    except AskError as error:
-        sys.stderr.write(f"plr: {error}\n")
-        return error.code
-    if arguments.json:
-        print(_status_json(answer))
-    else:
-        print(status_table.render(sidecars, own, time.time()))
-        for section in (event_text.departed(gone, answer.departed_left_out), event_text.events(events, state)):
-            lines = list(section)
-            if lines:
-                print("", *lines, sep="\n")
-    return EXIT_OK
+def _status(commands: Commands, summary: str) -> None:
+    from controlplane import status_command
+
+    status_command.add_to(commands, summary)
 
 
-def _status_json(answer: admin_pb2.GetStatusResponse) -> str:
-    """Return the answer in protobuf's JSON, but addresses as people write them: bytes would be base64."""
-    shown = json_format.MessageToDict(answer, preserving_proto_field_name=True)
-    for sidecar in shown.get("sidecars", ()):
-        for candidate in sidecar.get("peer", {}).get("candidates", ()):
-            address = candidate.get("address", {})
-            if "ip" in address:
-                address["ip"] = str(ip_address(base64.b64decode(address["ip"])))
-    return json.dumps(shown, indent=2)
+def _explain(commands: Commands, summary: str) -> None:
+    from controlplane import explain_command
+
+    explain_command.add_to(commands, summary)
 
 
-def _schema(arguments: argparse.Namespace) -> int:
-    if arguments.program == "sidecar":
-        # The planes do not import each other: the program that has these keys is asked.
-        return subprocess.run([sys.executable, "-m", "sidecar", "--print-schema"], check=False).returncode
-    print(json.dumps(ControlPlaneConfig.model_json_schema(), indent=2))
-    return EXIT_OK
+def _events(commands: Commands, summary: str) -> None:
+    from controlplane import events_command
+
+    events_command.add_to(commands, summary)
+
+
+def _plan(commands: Commands, summary: str) -> None:
+    from controlplane import plan_command
+
+    plan_command.add_to(commands, summary)
+
+
+def _ca(commands: Commands, summary: str) -> None:
+    from controlplane.ca import commands as ca_commands
+
+    ca_commands.add_ca(commands, summary)
+
+
+def _request(commands: Commands, summary: str) -> None:
+    from controlplane.ca import commands as ca_commands
+
+    ca_commands.add_request(commands, summary)
+
+
+def _config(commands: Commands, summary: str) -> None:
+    from controlplane import config_command
+
+    config_command.add_to(commands, summary)
+
+
+def _policy(commands: Commands, summary: str) -> None:
+    from controlplane import policy_command
+
+    policy_command.add_to(commands, summary)
+
+
+_COMMANDS: dict[str, tuple[str, Callable[[Commands, str], None]]] = {
+    "status": ("who is connected, how far each follows, and who is gone", _status),
+    "explain": ("why a robot's requests for a service go where they go", _explain),
+    "events": ("what happened in the fleet: who came, who went and why", _events),
+    "plan": ("how many interfaces and servers meet a target, from recordings", _plan),
+    "ca": ("issue and revoke the fleet's certificates", _ca),
+    "request": ("make a key on its node, and a request to certify it", _request),
+    "config": ("about configuration files", _config),
+    "policy": ("about the access policy in a control plane's configuration", _policy),
+}
+"""By name: what it is for, and what adds its options."""
 
 
 if __name__ == "__main__":

@@ -43,11 +43,11 @@ examples:
 """
 
 
-def add_to(commands: Commands) -> None:
+def add_to(commands: Commands, summary: str) -> None:
     """Add the command to `plr`."""
     events = commands.add_parser(
         "events",
-        help="what happened in the fleet: who came, who went and why",
+        help=summary,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -113,10 +113,7 @@ def _events(arguments: argparse.Namespace) -> int:
 
 def _ask(arguments: argparse.Namespace, query: EventQuery) -> EventList:
     request = event_query_to_proto(query)
-    _, found = ask(
-        arguments, lambda stub, timeout_s: stub.ListEvents(request, timeout=timeout_s), event_list_from_proto
-    )
-    return found
+    return ask(arguments, lambda stub, timeout_s: event_list_from_proto(stub.ListEvents(request, timeout=timeout_s)))
 
 
 def _follow(arguments: argparse.Namespace, query: EventQuery) -> EventList:

@@ -6,8 +6,6 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from google.protobuf import json_format
-
 from controlplane import explanation_text
 from controlplane.admin_client import AskError, add_options, ask
 from controlplane.arguments import checked_name
@@ -17,6 +15,8 @@ from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
     from controlplane.arguments import Commands
+    from protos.explanation import Explanation
+    from protos.plr.v1 import admin_pb2_grpc
 
 EXIT_OK = 0
 
@@ -32,11 +32,11 @@ examples:
 """
 
 
-def add_to(commands: Commands) -> None:
+def add_to(commands: Commands, summary: str) -> None:
     """Add the command to `plr`."""
     explain = commands.add_parser(
         "explain",
-        help="why a robot's requests for a service go where they go",
+        help=summary,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -48,17 +48,21 @@ def add_to(commands: Commands) -> None:
 
 def _explain(arguments: argparse.Namespace) -> int:
     request = admin_pb2.ExplainRequest(robot=arguments.robot, service=arguments.service)
+
+    def call(stub: admin_pb2_grpc.AdminStub, timeout_s: float) -> tuple[admin_pb2.ExplainResponse, Explanation]:
+        answer = stub.Explain(request, timeout=timeout_s)
+        return answer, explanation_from_proto(answer)
+
     try:
-        answer, explanation = ask(
-            arguments, lambda stub, timeout_s: stub.Explain(request, timeout=timeout_s), explanation_from_proto
-        )
+        answer, explanation = ask(arguments, call)
     except AskError as error:
         sys.stderr.write(f"plr: {error}\n")
         return error.code
-    text = (
-        json_format.MessageToJson(answer, preserving_proto_field_name=True)
-        if arguments.json
-        else explanation_text.render(explanation)
-    )
+    if arguments.json:
+        from google.protobuf import json_format
+
+        text = json_format.MessageToJson(answer, preserving_proto_field_name=True)
+    else:
+        text = explanation_text.render(explanation)
     sys.stdout.write(f"{text}\n")
     return EXIT_OK

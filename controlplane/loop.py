@@ -30,6 +30,8 @@ from controlplane.core.registry import Refusal
 from controlplane.fleet_metrics import MAX_GONE, Fleet
 from controlplane.mailbox import Mailbox
 from controlplane.remembered import departures
+from controlplane.turns import Turns
+from protos.convert import status_to_proto
 from protos.fleet_events import EventKind
 from protos.identity import EXPIRED, REVOKED, CertificateError
 from protos.model import NO_REVOCATIONS, RemovalReason, Role
@@ -52,7 +54,6 @@ if TYPE_CHECKING:
     from protos.explanation import Explanation
     from protos.identity import Trust
     from protos.model import NodeName, Registration, RevocationSet, ServiceName, SidecarMessage
-    from protos.status import SidecarStatus
 
 log = logging.getLogger(__name__)
 
@@ -64,10 +65,6 @@ ENDED_LINES_PER_S, ENDED_LINES_BURST = 1.0, 20.0
 
 METRICS_INTERVAL_S = 1.0
 """How old what is scraped may be: Prometheus scrapes every few seconds at most."""
-
-
-MEMBERS_A_TURN = 32
-"""Members looked at for the metrics in one go, some 2 ms."""
 
 FLEET_TIMEOUT_S = 4.0
 """For all of them: a scrape waits no longer, and Prometheus not much."""
@@ -134,6 +131,8 @@ class ControlLoop:
         self._mailboxes: dict[StreamId, Mailbox] = {}
         self._callers: dict[NodeName, Caller] = {}
         self._superseded = 0
+        self.turns = Turns()
+        """For whatever takes long."""
         self.revocations = NO_REVOCATIONS
         """The lists in use here."""
         self._wake = asyncio.Event()
@@ -190,9 +189,13 @@ class ControlLoop:
         self._core.disconnected(stream, self._loop.time())
         self._dispatch()
 
-    def status(self) -> list[SidecarStatus]:
-        """Every registered sidecar."""
-        return self._core.status(self._loop.time())
+    def names(self) -> list[NodeName]:
+        """Every registered sidecar's, in order."""
+        return sorted(sidecar.name for sidecar in self._core.registry)
+
+    def status(self, name: NodeName, *, abridged: bool) -> bytes:
+        """One registered sidecar as part of a GetStatusResponse, encoded; empty if it is not there (any more)."""
+        return status_to_proto(self._core.status(self._loop.time(), (name,), abridged=abridged)).SerializeToString()
 
     @property
     def departed(self) -> Departed:
@@ -220,13 +223,10 @@ class ControlLoop:
 
     async def gather_fleet(self) -> Fleet:
         """The same, on the loop, in turns."""
-        members: list[MemberView] = []
-        for number, name in enumerate([sidecar.name for sidecar in self._core.registry]):
-            if number % MEMBERS_A_TURN == 0:
-                await asyncio.sleep(0)
-            view = self._core.view(name, self._loop.time())
-            if view is not None:
-                members.append(view)
+        views: list[MemberView | None] = []
+        async for found in self.turns.each(self.names(), lambda name: self._core.view(name, self._loop.time())):
+            views += found
+        members = [view for view in views if view is not None]
         ends = {name: caller.identity.not_after for name, caller in self._callers.items()}
         now = self._loop.time()
         return Fleet(members, self._core.departed.told(now, MAX_GONE), ends, now, time.time())

@@ -48,11 +48,11 @@ class _UsageError(Exception):
     """One line for the user."""
 
 
-def add_to(commands: Commands) -> None:
+def add_to(commands: Commands, summary: str) -> None:
     """Add the command to `plr`."""
     plan = commands.add_parser(
         "plan",
-        help="how many interfaces and servers meet a target, from recordings",
+        help=summary,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -22,9 +22,9 @@ EXIT_DENIED = 1
 EXIT_USAGE = 2
 
 
-def add_to(commands: Commands) -> None:
+def add_to(commands: Commands, summary: str) -> None:
     """Add the command to `plr`."""
-    policy = commands.add_parser("policy", help="about the access policy in a control plane's configuration")
+    policy = commands.add_parser("policy", help=summary)
     about = policy.add_subparsers(required=True, metavar="COMMAND")
     check = about.add_parser(
         "check",

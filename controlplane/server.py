@@ -27,8 +27,8 @@ from controlplane.metrics import Metrics
 from controlplane.stun_server import start_stun_server
 from controlplane.tls_gate import TlsGate
 from protos.clock_floor import ClockFloor
-from protos.config_fields import split_host_port
 from protos.fleet_events import EventKind
+from protos.host_port import split_host_port
 from protos.plr.v1 import admin_pb2_grpc
 from protos.version_option import describe
 
@@ -160,7 +160,7 @@ def _make_server(
     server = grpc.aio.server(interceptors=guards, options=GRPC_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
     caller = None if gate is None else gate.caller
     service.ControlPlaneService(loop, config.report_interval_ms / 1000, caller).add_to(server)
-    admin_pb2_grpc.add_AdminServicer_to_server(admin.AdminService(loop), server)
+    admin.AdminService(loop).add_to(server)
     health_service = health.aio.HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(health_service, server)
     reflected = (service.SERVICE_NAME, admin.SERVICE_NAME, health.SERVICE_NAME, reflection.SERVICE_NAME)

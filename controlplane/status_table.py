@@ -39,6 +39,9 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
         details = [*_details(status), *_unmet(status, offered), *_revocations(status.revocations, newest, now_wall)]
         if details:
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in details)]
+    abridged = sum(status.abridged for status in sidecars)
+    if abridged:
+        lines += ["", f"mapping and paths of {abridged} that are in order are not shown: plr status NAME, or --all"]
     return "\n".join(lines)
 
 

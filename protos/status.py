@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from protos.model import NO_REVOCATIONS, RevocationSet, Version
 
 if TYPE_CHECKING:
-    from protos.model import PathReport, Peer, ServiceMapping, ServiceName, ServiceUse
+    from protos.model import NodeName, PathReport, Peer, ServiceMapping, ServiceName, ServiceUse
 
 _NONE_YET = Version(0)
 
@@ -35,6 +35,17 @@ class ResourceStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class StatusQuery:
+    """Whose status is asked for (nobody named: everybody's), and how many are told in full though they are in order.
+
+    0: any number.
+    """
+
+    names: tuple[NodeName, ...] = ()
+    detailed_at_most: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class SidecarStatus:
     """What the control plane knows of one sidecar, for the operator; its secret token is left out."""
 
@@ -52,3 +63,5 @@ class SidecarStatus:
     revocations: RevocationSet = NO_REVOCATIONS
     unmet: tuple[ServiceName, ...] = ()
     """Services that its configuration names and nobody serves."""
+    abridged: bool = False
+    """Its addresses, mapping and paths are left out, as it is in order and one of many."""

@@ -10,17 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from protos.config_fields import (
-    IpAddress,
-    ListenAddress,
-    RemoteAddress,
-    TlsDir,
-    check_security,
-    is_loopback,
-    refuse_duplicates,
-)
+from protos.config_fields import IpAddress, ListenAddress, RemoteAddress, TlsDir, check_security, refuse_duplicates
 from protos.config_file import key_path, parse_yaml, read_text, validate
 from protos.errors import ConfigError
+from protos.host_port import is_loopback
 from protos.identity import IdentityRole
 from protos.model import NodeName, Role, ServiceName
 from protos.preferences import DEFAULT_CHARGE, InterfaceLabel

@@ -7,9 +7,10 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
-from protos.config_fields import check_remote, refuse_duplicates
+from protos.config_fields import refuse_duplicates
 from protos.convert.fields import MAX_COPIES
 from protos.errors import DecodeError
+from protos.host_port import check_remote
 from protos.names import domain_label, node_name
 from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from protos import interpreter
 from protos.clock_floor import ClockFloor
-from protos.config_fields import split_host_port
 from protos.errors import StartError
+from protos.host_port import split_host_port
 from protos.model import (
     MAX_UNMET,
     OLDEST_PROTOCOL_VERSION,

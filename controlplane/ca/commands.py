@@ -20,6 +20,8 @@ from protos.names import node_name, text
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from controlplane.arguments import Commands
+
 EXIT_OK = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
@@ -61,18 +63,17 @@ _MAX_DAYS = 36_500.0
 _MAX_COMMON_NAME = 64
 
 
-def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `ca` and `request` to the commands of plr."""
+def add_ca(commands: Commands, summary: str) -> None:
+    """Add `plr ca`."""
     ca = commands.add_parser(
         "ca",
-        help="issue and revoke the fleet's certificates",
+        help=summary,
         description="Issue, renew and revoke the certificates that name every node of the fleet.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    _add_request(commands)
     about = ca.add_subparsers(required=True, metavar="COMMAND")
-    for name, command, summary, details in (
+    for name, command, about_it, details in (
         ("init", actions.init, "make the CA", "Make the CA's key and certificate in a folder of its own."),
         ("issue", actions.issue, "make a node's key and certificate", "Write a folder ready to be the node's tls_dir."),
         (
@@ -105,16 +106,17 @@ def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
             "Encrypt the key again, or for the first time. No certificate changes.",
         ),
     ):
-        parser = about.add_parser(name, help=summary, description=details)
+        parser = about.add_parser(name, help=about_it, description=details)
         parser.add_argument("--dir", type=Path, default=Path("plr-ca"), help="the CA's folder (default: ./plr-ca)")
         _ARGUMENTS[name](parser)
         parser.set_defaults(run=_reported(command, lambda arguments: arguments.dir))
 
 
-def _add_request(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_request(commands: Commands, summary: str) -> None:
+    """Add `plr request`."""
     parser = commands.add_parser(
         "request",
-        help="make a key on its node, and a request to certify it",
+        help=summary,
         description="Make a key and a request for its certificate, which plr ca sign answers. The key stays here.",
         epilog=_REQUEST_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -532,9 +532,15 @@ class ControlCore:
 
     # ── what the operator sees ──
 
-    def status(self, now: float) -> list[SidecarStatus]:
-        """Every registered sidecar, by name."""
-        return list(statuses(self.registry, self._publisher, self.estimator, self.permits, now))
+    def status(
+        self, now: float, names: Iterable[NodeName] | None = None, *, abridged: bool = False
+    ) -> list[SidecarStatus]:
+        """Every registered sidecar by name, or those of these names; `abridged`: shorter where all is in order."""
+        if names is None:
+            names = sorted(sidecar.name for sidecar in self.registry)
+        return list(
+            statuses(names, self.registry, self._publisher, self.estimator, self.permits, now, abridged=abridged)
+        )
 
     def explain(self, robot: NodeName, service: ServiceName, now: float) -> Explanation:
         """Why requests go where they go, or went. Raises UnknownNameError if robot or service is not known."""

@@ -2,36 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from protos.status import SidecarStatus
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.permits import Permits
     from controlplane.core.publisher import Publisher
     from controlplane.core.registry import Registry
+    from protos.model import NodeName
 
 
 def statuses(
-    registry: Registry, publisher: Publisher, estimator: Estimator, permits: Permits, now: float
+    names: Iterable[NodeName],
+    registry: Registry,
+    publisher: Publisher,
+    estimator: Estimator,
+    permits: Permits,
+    now: float,
+    *,
+    abridged: bool,
 ) -> Iterator[SidecarStatus]:
-    """Every registered sidecar, by name."""
-    for sidecar in sorted(registry, key=lambda sidecar: sidecar.name):
-        snapshots = publisher[sidecar.name]
+    """Those of the sidecars of these names that are registered; `abridged`: shorter where all is in order."""
+    for name in names:
+        sidecar = registry.get(name)
+        if sidecar is None:
+            continue
+        snapshots = publisher[name]
+        services = snapshots.mapping.sent or ()
+        paths = tuple(estimator.paths(name))
+        shorter = abridged and all(path.up for path in paths) and all(mapping.assignments for mapping in services)
         yield SidecarStatus(
-            peer=sidecar.as_peer(),
+            peer=replace(sidecar.as_peer(), candidates=()) if shorter else sidecar.as_peer(),
             connected=sidecar.stream is not None,
-            lease_left_s=max(0.0, registry.lease_end(sidecar.name) - now),
+            lease_left_s=max(0.0, registry.lease_end(name) - now),
             software_version=sidecar.registration.software_version,
             uses=sidecar.uses,
             peers=snapshots.peers.status,
             mapping=snapshots.mapping.status,
-            services=snapshots.mapping.sent or (),
-            paths=tuple(estimator.paths(sidecar.name)),
+            services=() if shorter else services,
+            paths=() if shorter else paths,
             refused_offers=permits.refused_offers(sidecar),
             revocations=sidecar.revocations,
             unmet=sidecar.unmet,
+            abridged=shorter,
         )

@@ -8,7 +8,13 @@ to `MAX_STRING_BYTES` printable bytes.
 
 from __future__ import annotations
 
-from protos.convert.admin import own_revocations_from_proto, status_from_proto, status_to_proto
+from protos.convert.admin import (
+    own_revocations_from_proto,
+    status_from_proto,
+    status_query_from_proto,
+    status_query_to_proto,
+    status_to_proto,
+)
 from protos.convert.control import (
     control_message_from_proto,
     control_message_to_proto,
@@ -81,6 +87,8 @@ __all__ = [
     "sidecar_message_from_proto",
     "sidecar_message_to_proto",
     "status_from_proto",
+    "status_query_from_proto",
+    "status_query_to_proto",
     "status_to_proto",
     "use_from_proto",
     "use_to_proto",

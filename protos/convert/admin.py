@@ -20,10 +20,11 @@ from protos.convert.fields import (
 from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
 from protos.convert.reports import path_from_proto, path_to_proto
 from protos.convert.types import peer_from_proto, peer_to_proto, service_names, use_from_proto, use_to_proto
+from protos.errors import DecodeError
 from protos.model import MAX_PATHS, MAX_UNMET, NO_REVOCATIONS, RevocationSet
-from protos.names import clean_text, text
+from protos.names import clean_text, node_name, text
 from protos.plr.v1 import admin_pb2
-from protos.status import ResourceStatus, SidecarStatus, SyncState
+from protos.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -54,6 +55,18 @@ def status_to_proto(
     return admin_pb2.GetStatusResponse(sidecars=map(_sidecar_to_proto, sidecars), revocations=revocations_to_proto(own))
 
 
+def status_query_from_proto(message: admin_pb2.StreamStatusRequest) -> StatusQuery:
+    """Check a question for the status."""
+    if len(message.names) > MAX_SIDECARS:
+        raise DecodeError(f"names has {len(message.names)} elements, more than {MAX_SIDECARS}")
+    return StatusQuery(tuple(node_name(name, "names") for name in message.names), message.detailed_at_most)
+
+
+def status_query_to_proto(query: StatusQuery) -> admin_pb2.StreamStatusRequest:
+    """Encode a question for the status."""
+    return admin_pb2.StreamStatusRequest(names=query.names, detailed_at_most=query.detailed_at_most)
+
+
 def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
     return SidecarStatus(
         peer=peer_from_proto(message.peer, with_token=False),
@@ -68,6 +81,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
         revocations=revocations_from_proto(message.revocations),
         unmet=service_names(message.unmet, MAX_UNMET, "unmet"),
+        abridged=message.abridged,
     )
 
 
@@ -85,6 +99,7 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         refused_offers=status.refused_offers,
         revocations=revocations_to_proto(status.revocations),
         unmet=status.unmet,
+        abridged=status.abridged,
     )
 
 

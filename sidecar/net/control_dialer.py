@@ -18,7 +18,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.config_fields import numeric_host
+from protos.host_port import numeric_host
 from sidecar.core.control_race import ControlRace
 from sidecar.core.control_watch import CHEAPER, GONE, SILENT, ControlWatch, Leave
 from sidecar.core.control_ways import STRANGER, ControlWays, Life, WayClass

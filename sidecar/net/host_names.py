@@ -12,7 +12,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from protos.config_fields import numeric_host, split_host_port
+from protos.host_port import numeric_host, split_host_port
 from protos.token_bucket import TokenBucket
 from sidecar.net.sockets import normalise
 

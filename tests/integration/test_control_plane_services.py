@@ -26,7 +26,7 @@ from protos.model import (
 from protos.status import SyncState
 from protos.stun import MessageClass, StunMessage, decode, encode
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
-from tests.unit.controlplane.samples import PLAN
+from tests.unit.controlplane.samples import PLAN, histogram, path
 
 
 def test_health_and_reflection(plane: ControlPlaneProcess) -> None:
@@ -114,3 +114,29 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
     ]
     assert addresses
     assert all(ip_address(address) for address in addresses), "as people write them, not base64"
+
+
+@pytest.mark.audit("ops-19")
+def test_plr_status_imports_only_what_it_needs(plane: ControlPlaneProcess) -> None:
+    """Names, not times: what is imported takes most of the time that the command takes."""
+    program = (
+        "import sys; from controlplane.cli import main;"
+        f"code = main(['status', '--insecure', '--address', {plane.address!r}, '--timeout-s', '30']);"
+        "print('IMPORTED', *sys.modules); sys.exit(code)"
+    )
+    with cloud(plane.address, "cloud-a"), robot(plane.address) as r:
+        r.expect(PeerSet, lambda message: bool(message.peers))
+        r.send(Report(paths=(path("wlan0", "cloud-a", rtt=histogram(0.02)),)))
+        until = time.monotonic() + PATIENCE_S
+        while not plane.status()["robot"].paths:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    text, _, names = found.partition("IMPORTED ")
+    assert "wlan0 -> cloud-a" in text
+    modules = set(names.split())
+    heavy = ("numpy", "pydantic", "yaml", "ortools", "pandas", "matplotlib", "prometheus_client", "grpc_health.v1")
+    rest = ("grpc_reflection.v1alpha", "google.protobuf.json_format", "controlplane.ca", "controlplane.planning")
+    ours = ("controlplane.config", "controlplane.core", "controlplane.loop", "controlplane.version")
+    assert modules & {*heavy, *rest, *ours} == set()
+    assert {"grpc", "controlplane.status_command"} <= modules

@@ -199,6 +199,34 @@ class GetStatusRequest(_message.Message):
 Global___GetStatusRequest: _TypeAlias = GetStatusRequest  # noqa: Y015
 
 @_typing.final
+class StreamStatusRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAMES_FIELD_NUMBER: _builtins.int
+    DETAILED_AT_MOST_FIELD_NUMBER: _builtins.int
+    detailed_at_most: _builtins.int
+    """If more sidecars than so many are asked for, those that are in order are told without their addresses,
+    mapping and paths. 0: no number is too many.
+    """
+    @_builtins.property
+    def names(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Of these sidecars alone, as far as they are registered; empty: of all."""
+
+    def __init__(
+        self,
+        *,
+        names: _abc.Iterable[_builtins.str] | None = ...,
+        detailed_at_most: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["detailed_at_most", b"detailed_at_most", "names", b"names"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___StreamStatusRequest: _TypeAlias = StreamStatusRequest  # noqa: Y015
+
+@_typing.final
 class ResourceStatus(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -243,9 +271,12 @@ class SidecarStatus(_message.Message):
     REFUSED_OFFERS_FIELD_NUMBER: _builtins.int
     REVOCATIONS_FIELD_NUMBER: _builtins.int
     UNMET_FIELD_NUMBER: _builtins.int
+    ABRIDGED_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
+    abridged: _builtins.bool
+    """Its candidates, `services` and `paths` are left out: it is in order, and one of many."""
     @_builtins.property
     def peer(self) -> _types_pb2.Peer: ...
     @_builtins.property
@@ -285,10 +316,11 @@ class SidecarStatus(_message.Message):
         refused_offers: _abc.Iterable[_builtins.str] | None = ...,
         revocations: _control_pb2.Revocations | None = ...,
         unmet: _abc.Iterable[_builtins.str] | None = ...,
+        abridged: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unmet", b"unmet", "uses", b"uses"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unmet", b"unmet", "uses", b"uses"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -40,6 +40,11 @@ class AdminStub:
                 request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.SerializeToString,
                 response_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
                 _registered_method=True)
+        self.StreamStatus = channel.unary_stream(
+                '/plr.v1.Admin/StreamStatus',
+                request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.SerializeToString,
+                response_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
+                _registered_method=True)
         self.Explain = channel.unary_unary(
                 '/plr.v1.Admin/Explain',
                 request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.SerializeToString,
@@ -57,7 +62,15 @@ class AdminServicer:
     """
 
     def GetStatus(self, request, context):
-        """Missing associated documentation comment in .proto file."""
+        """In one message, which may be longer than gRPC's default of 4 MiB; RESOURCE_EXHAUSTED if it were longer than 16 MiB.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def StreamStatus(self, request, context):
+        """The same in parts: what is repeated is to be put together, all else is in one of them.
+        """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
@@ -71,7 +84,7 @@ class AdminServicer:
         raise NotImplementedError('Method not implemented!')
 
     def ListEvents(self, request, context):
-        """What happened in the fleet.
+        """What happened in the fleet. All that is remembered fits in a message of 4 MiB.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -83,6 +96,11 @@ def add_AdminServicer_to_server(servicer, server):
             'GetStatus': grpc.unary_unary_rpc_method_handler(
                     servicer.GetStatus,
                     request_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.FromString,
+                    response_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.SerializeToString,
+            ),
+            'StreamStatus': grpc.unary_stream_rpc_method_handler(
+                    servicer.StreamStatus,
+                    request_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.FromString,
                     response_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.SerializeToString,
             ),
             'Explain': grpc.unary_unary_rpc_method_handler(
@@ -123,6 +141,33 @@ class Admin:
             target,
             '/plr.v1.Admin/GetStatus',
             protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.SerializeToString,
+            protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def StreamStatus(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/plr.v1.Admin/StreamStatus',
+            protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.SerializeToString,
             protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
             options,
             channel_credentials,

@@ -34,12 +34,15 @@ class AdminStub:
     @_typing.overload
     def __new__(cls, channel: _aio.Channel) -> AdminAsyncStub: ...
     GetStatus: _grpc.UnaryUnaryMultiCallable[_admin_pb2.GetStatusRequest, _admin_pb2.GetStatusResponse]
+    """In one message, which may be longer than gRPC's default of 4 MiB; RESOURCE_EXHAUSTED if it were longer than 16 MiB."""
+    StreamStatus: _grpc.UnaryStreamMultiCallable[_admin_pb2.StreamStatusRequest, _admin_pb2.GetStatusResponse]
+    """The same in parts: what is repeated is to be put together, all else is in one of them."""
     Explain: _grpc.UnaryUnaryMultiCallable[_admin_pb2.ExplainRequest, _admin_pb2.ExplainResponse]
     """Why a robot's requests for a service go where they go. NOT_FOUND, with the nearest name, if there is no such robot
     or it carries no such service.
     """
     ListEvents: _grpc.UnaryUnaryMultiCallable[_admin_pb2.ListEventsRequest, _admin_pb2.ListEventsResponse]
-    """What happened in the fleet."""
+    """What happened in the fleet. All that is remembered fits in a message of 4 MiB."""
 
 @_typing.type_check_only
 class AdminAsyncStub(AdminStub):
@@ -47,12 +50,15 @@ class AdminAsyncStub(AdminStub):
 
     def __init__(self, channel: _aio.Channel) -> None: ...
     GetStatus: _aio.UnaryUnaryMultiCallable[_admin_pb2.GetStatusRequest, _admin_pb2.GetStatusResponse]  # type: ignore[assignment]
+    """In one message, which may be longer than gRPC's default of 4 MiB; RESOURCE_EXHAUSTED if it were longer than 16 MiB."""
+    StreamStatus: _aio.UnaryStreamMultiCallable[_admin_pb2.StreamStatusRequest, _admin_pb2.GetStatusResponse]  # type: ignore[assignment]
+    """The same in parts: what is repeated is to be put together, all else is in one of them."""
     Explain: _aio.UnaryUnaryMultiCallable[_admin_pb2.ExplainRequest, _admin_pb2.ExplainResponse]  # type: ignore[assignment]
     """Why a robot's requests for a service go where they go. NOT_FOUND, with the nearest name, if there is no such robot
     or it carries no such service.
     """
     ListEvents: _aio.UnaryUnaryMultiCallable[_admin_pb2.ListEventsRequest, _admin_pb2.ListEventsResponse]  # type: ignore[assignment]
-    """What happened in the fleet."""
+    """What happened in the fleet. All that is remembered fits in a message of 4 MiB."""
 
 class AdminServicer(metaclass=_abc_1.ABCMeta):
     """Serves the operator's command line."""
@@ -62,7 +68,16 @@ class AdminServicer(metaclass=_abc_1.ABCMeta):
         self,
         request: _admin_pb2.GetStatusRequest,
         context: _ServicerContext,
-    ) -> _typing.Union[_admin_pb2.GetStatusResponse, _abc.Awaitable[_admin_pb2.GetStatusResponse]]: ...
+    ) -> _typing.Union[_admin_pb2.GetStatusResponse, _abc.Awaitable[_admin_pb2.GetStatusResponse]]:
+        """In one message, which may be longer than gRPC's default of 4 MiB; RESOURCE_EXHAUSTED if it were longer than 16 MiB."""
+
+    @_abc_1.abstractmethod
+    def StreamStatus(
+        self,
+        request: _admin_pb2.StreamStatusRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_abc.Iterator[_admin_pb2.GetStatusResponse], _abc.AsyncIterator[_admin_pb2.GetStatusResponse]]:
+        """The same in parts: what is repeated is to be put together, all else is in one of them."""
 
     @_abc_1.abstractmethod
     def Explain(
@@ -80,6 +95,6 @@ class AdminServicer(metaclass=_abc_1.ABCMeta):
         request: _admin_pb2.ListEventsRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_admin_pb2.ListEventsResponse, _abc.Awaitable[_admin_pb2.ListEventsResponse]]:
-        """What happened in the fleet."""
+        """What happened in the fleet. All that is remembered fits in a message of 4 MiB."""
 
 def add_AdminServicer_to_server(servicer: AdminServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

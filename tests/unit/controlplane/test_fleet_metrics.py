@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from controlplane import turns
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.control_events import Settings
 from controlplane.core.fleet_view import MemberView, MissView, PathView, medians
 from controlplane.core.registry import Refusal
 from controlplane.event_log import EventLog
 from controlplane.fleet_metrics import MAX_GONE, MAX_SERIES, REUSED_S, Fleet, FleetCollector, families
-from controlplane.loop import MEMBERS_A_TURN, ControlLoop
+from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
 from protos.fleet_events import DepartedSidecar, Why
 from protos.histogram import BUCKETS
@@ -197,29 +198,30 @@ def test_medians_are_those_of_the_histogram() -> None:
 
 
 @pytest.mark.parametrize("threaded", [False, True])
-def test_gathering_leaves_the_loop_to_others_in_between(threaded: bool) -> None:
-    members = 10 * MEMBERS_A_TURN
+def test_gathering_leaves_the_loop_to_others_in_between(threaded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    members = 100
+    monkeypatch.setattr(turns, "TURN_S", 0.0)
 
     async def gather() -> tuple[Fleet, int]:
         loop = make_loop()
         for number in range(members):
             assert not isinstance(loop.register(registration(f"robot-{number}"), None), Refusal)
-        turns = 0
+        passes = 0
 
         async def others() -> None:
-            nonlocal turns
+            nonlocal passes
             while True:
-                turns += 1
+                passes += 1
                 await asyncio.sleep(0)
 
         other = asyncio.create_task(others())
         fleet = await asyncio.to_thread(loop.ask_fleet) if threaded else await loop.gather_fleet()
         other.cancel()
-        return fleet, turns
+        return fleet, passes
 
-    found, turns = asyncio.run(gather())
+    found, passes = asyncio.run(gather())
     assert len(found.members) == members
-    assert turns >= 10
+    assert passes >= members
 
 
 def make_loop() -> ControlLoop:

@@ -1,0 +1,34 @@
+"""`plr config`: which keys a program's configuration has."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+from controlplane.config import ControlPlaneConfig
+
+if TYPE_CHECKING:
+    import argparse
+
+    from controlplane.arguments import Commands
+
+EXIT_OK = 0
+
+
+def add_to(commands: Commands, summary: str) -> None:
+    """Add the command to `plr`."""
+    config = commands.add_parser("config", help=summary)
+    about = config.add_subparsers(required=True, metavar="COMMAND")
+    schema = about.add_parser("schema", help="print the JSON Schema of a program's configuration")
+    schema.add_argument("program", choices=["controlplane", "sidecar"])
+    schema.set_defaults(run=_schema)
+
+
+def _schema(arguments: argparse.Namespace) -> int:
+    if arguments.program == "sidecar":
+        # The planes do not import each other: the program that has these keys is asked.
+        return subprocess.run([sys.executable, "-m", "sidecar", "--print-schema"], check=False).returncode
+    sys.stdout.write(json.dumps(ControlPlaneConfig.model_json_schema(), indent=2) + "\n")
+    return EXIT_OK

@@ -1,0 +1,157 @@
+"""`plr status`: who is connected, how far each follows, and who is gone."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import grpc
+
+from controlplane import event_text, status_table
+from controlplane.admin_client import EXIT_FAILED, AskError, add_options, ask
+from controlplane.arguments import checked_name
+from protos.convert import (
+    departed_from_proto,
+    events_from_proto,
+    log_state_from_proto,
+    own_revocations_from_proto,
+    status_from_proto,
+    status_query_to_proto,
+)
+from protos.convert.fields import MAX_SIDECARS
+from protos.errors import DecodeError
+from protos.names import node_name
+from protos.plr.v1 import admin_pb2
+from protos.status import StatusQuery
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from controlplane.arguments import Commands
+    from protos.fleet_events import DepartedSidecar
+    from protos.model import NodeName
+    from protos.plr.v1 import admin_pb2_grpc
+    from protos.status import SidecarStatus
+
+EXIT_OK = 0
+
+DETAILED_AT_MOST = 64
+"""Sidecars shown with their mapping and paths though they are in order: some screens full."""
+
+_EPILOG = """\
+shows: one row a sidecar; then mapping and paths of each, of a fleet of more than 64 only where something is wrong;
+who is gone; the last events. Those named are shown in full, and with --all all are.
+
+examples:
+  plr status --tls-dir ~/.plr/alice --address control.example.org:50051
+  plr status --tls-dir ~/.plr/alice robot-7 cloud-a
+  plr status --insecure --all --json
+"""
+
+
+def add_to(commands: Commands, summary: str) -> None:
+    """Add the command to `plr`."""
+    status = commands.add_parser(
+        "status", help=summary, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    status.add_argument("names", nargs="*", type=checked_name(node_name), metavar="NAME", help="these sidecars alone")
+    status.add_argument("--all", action="store_true", help="mapping and paths of all, however many they are")
+    add_options(status)
+    status.set_defaults(run=_status)
+
+
+@dataclass(slots=True)
+class _Answer:
+    """What has come so far: converted as it comes, and, for JSON, as it is."""
+
+    raw: admin_pb2.GetStatusResponse | None
+    rest: admin_pb2.GetStatusResponse = field(default_factory=admin_pb2.GetStatusResponse)
+    """Without sidecars."""
+    sidecars: list[SidecarStatus] = field(default_factory=list)
+
+    def take(self, part: admin_pb2.GetStatusResponse) -> None:
+        """Raises DecodeError."""
+        self.sidecars += status_from_proto(part)
+        if len(self.sidecars) > MAX_SIDECARS:
+            raise DecodeError(f"sidecars has more than {MAX_SIDECARS} elements")
+        if self.raw is not None:
+            self.raw.MergeFrom(part)
+        del part.sidecars[:]
+        self.rest.MergeFrom(part)
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    everything = arguments.all or arguments.json or arguments.names
+    query = StatusQuery(tuple(dict.fromkeys(arguments.names)), 0 if everything else DETAILED_AT_MOST)
+
+    def call(stub: admin_pb2_grpc.AdminStub, timeout_s: float) -> tuple[_Answer, str]:
+        answer = _Answer(admin_pb2.GetStatusResponse() if arguments.json else None)
+        for part in _parts(stub, query, timeout_s):
+            answer.take(part)
+        return answer, _text(answer, query.names)
+
+    try:
+        answer, text = ask(arguments, call)
+    except AskError as error:
+        sys.stderr.write(f"plr: {error}\n")
+        return error.code
+    sys.stdout.write(f"{_json(answer.raw) if answer.raw is not None else text}\n")
+    missing = set(query.names) - {status.peer.name for status in answer.sidecars}
+    for name in sorted(missing):
+        sys.stderr.write(f"plr: {name} is not registered; try: plr events --node {name}\n")
+    return EXIT_FAILED if missing else EXIT_OK
+
+
+def _parts(
+    stub: admin_pb2_grpc.AdminStub, query: StatusQuery, timeout_s: float
+) -> Iterable[admin_pb2.GetStatusResponse]:
+    try:
+        yield from stub.StreamStatus(status_query_to_proto(query), timeout=timeout_s)
+    except grpc.RpcError as error:
+        if getattr(error, "code", lambda: None)() is not grpc.StatusCode.UNIMPLEMENTED:
+            raise
+        # A control plane of the version before.
+        whole = stub.GetStatus(admin_pb2.GetStatusRequest(), timeout=timeout_s)
+        if query.names:
+            kept = [sidecar for sidecar in whole.sidecars if sidecar.peer.name in query.names]
+            del whole.sidecars[:]
+            whole.sidecars.extend(kept)
+        yield whole
+
+
+def _text(answer: _Answer, names: Sequence[NodeName]) -> str:
+    rest = answer.rest
+    gone: Sequence[DepartedSidecar] = departed_from_proto(rest.departed)
+    if names:
+        gone = [one for one in gone if one.name in names]
+        rest.departed_left_out = 0
+        del rest.events[:]
+    lines = [status_table.render(answer.sidecars, own_revocations_from_proto(rest), time.time())]
+    for section in (
+        event_text.departed(gone, rest.departed_left_out),
+        event_text.events(events_from_proto(rest.events), log_state_from_proto(rest.log)),
+    ):
+        found = list(section)
+        if found:
+            lines += ["", *found]
+    return "\n".join(lines)
+
+
+def _json(answer: admin_pb2.GetStatusResponse) -> str:
+    """Return the answer in protobuf's JSON, but addresses as people write them: bytes would be base64."""
+    import base64
+    import json
+    from ipaddress import ip_address
+
+    from google.protobuf import json_format
+
+    shown = json_format.MessageToDict(answer, preserving_proto_field_name=True)
+    for sidecar in shown.get("sidecars", ()):
+        for candidate in sidecar.get("peer", {}).get("candidates", ()):
+            address = candidate.get("address", {})
+            if "ip" in address:
+                address["ip"] = str(ip_address(base64.b64decode(address["ip"])))
+    return json.dumps(shown, indent=2)
