@@ -306,4 +306,5 @@ def _stun(servers: Sequence[StunServer]) -> Iterable[Metric]:
         outcomes.update({(outcome.value,): count for outcome, count in server.outcomes.items()})
         outcomes["send_failed",] += server.send_failures
         outcomes["receive_failed",] += server.receive_failures
+        outcomes["buffer_full",] += server.buffer_full
     yield _counter("plr_stun_datagrams_total", "Datagrams on the STUN port, by outcome.", ["outcome"], outcomes)

@@ -9,13 +9,15 @@ import select
 import shutil
 import socket
 import subprocess
+import sys
+import threading
 import time
 from typing import TYPE_CHECKING
 
 import pytest
 
 from controlplane.core.stun_responder import StunOutcome
-from controlplane.stun_server import StunServer, start_stun_server
+from controlplane.stun_server import SHARE, StunServer, start_stun_server
 from protos.stun import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun_client import StunClient
 from sidecar.core.stun_events import Mapped, StunEvent
@@ -236,5 +238,60 @@ def test_a_port_in_use_is_an_error() -> None:
                 await start_stun_server("127.0.0.1", first.addresses[0][1])
         finally:
             first.close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.audit("ops-19")
+def test_an_answer_does_not_wait_for_the_event_loop() -> None:
+    async def use(server: StunServer) -> None:
+        question = encode(StunMessage(MessageClass.REQUEST, bytes(12)))
+        asked = asyncio.get_running_loop().run_in_executor(None, ask, server.addresses[0], question)
+        patience = time.monotonic() + PATIENCE_S
+        # One turn of the loop, which computes and does not end before the answer is there.
+        while server.outcomes[StunOutcome.ANSWERED] == 0:
+            assert time.monotonic() < patience
+        await asked
+
+    assert with_server("127.0.0.1", use) == {StunOutcome.ANSWERED: 1}
+
+
+FLOOD = """
+import socket, sys, time
+sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+sock.connect(("127.0.0.1", int(sys.argv[1])))
+ends, sent = time.monotonic() + 1.0, 0
+while time.monotonic() < ends:
+    sent += sock.send(bytes(20)) == 20
+print(sent)
+"""
+
+
+@pytest.mark.audit("ops-19")
+def test_a_flood_takes_its_share_of_a_processor_and_what_is_dropped_is_counted() -> None:
+    async def run() -> None:
+        server = await start_stun_server("127.0.0.1", 0)
+        try:
+            (thread,) = (one for one in threading.enumerate() if one.name == "plr-stun")
+            assert thread.ident is not None
+            clock = time.pthread_getcpuclockid(thread.ident)
+            before, began = time.clock_gettime(clock), time.monotonic()
+            port = str(server.addresses[0][1])
+            flood = await asyncio.create_subprocess_exec(
+                sys.executable, "-c", FLOOD, port, stdout=asyncio.subprocess.PIPE
+            )
+            sent = int((await flood.communicate())[0])
+            share = (time.clock_gettime(clock) - before) / (time.monotonic() - began)
+            assert share < 1.2 * SHARE
+            patience = time.monotonic() + PATIENCE_S
+            while server.outcomes.total() + server.buffer_full < sent:
+                # The kernel tells what it dropped along with what comes later.
+                await asyncio.to_thread(ask, server.addresses[0], encode(StunMessage(MessageClass.REQUEST, bytes(12))))
+                sent += 1
+                assert time.monotonic() < patience
+            assert server.outcomes.total() + server.buffer_full == sent
+            assert server.buffer_full > 0
+        finally:
+            server.close()
 
     asyncio.run(run())
