@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
+import math
+import struct
+import termios
+import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,6 +23,8 @@ class PipeEnd(asyncio.Protocol):
         self._early = bytearray()
         self._on_lost = on_lost
         self.lost = False
+        self.received_at = -math.inf
+        """When it passed something on last, in monotonic seconds."""
 
     @property
     def transport(self) -> asyncio.Transport:
@@ -50,6 +57,13 @@ class PipeEnd(asyncio.Protocol):
         if self._transport is not None:
             self._transport.abort()
 
+    def unread(self) -> bool:
+        """Whether something has arrived that is not even read from the socket yet."""
+        if self.lost or self._transport is None:
+            return False
+        waiting = fcntl.ioctl(self._transport.get_extra_info("socket").fileno(), termios.FIONREAD, bytes(4))
+        return bool(struct.unpack("i", waiting)[0])
+
     # ── asyncio.Protocol ──
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -60,6 +74,7 @@ class PipeEnd(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Pass it on."""
+        self.received_at = time.monotonic()
         if self._other is None:
             self._early += data
         else:

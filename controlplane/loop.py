@@ -38,7 +38,7 @@ from protos.model import NO_REVOCATIONS, RemovalReason, Role
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from controlplane.config import ControlPlaneConfig
     from controlplane.core.departed import Departed
@@ -143,6 +143,8 @@ class ControlLoop:
         self._matcher = _LateMatcher()
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
         self.stun_servers: list[StunServer] = []
+        self.has_unread: Callable[[NodeName, float], bool] = lambda name, since: False
+        """Whether something of a member is there that came later than what was read of it at this time."""
 
     # ── for the streams ──
 
@@ -355,7 +357,7 @@ class ControlLoop:
             while not self._stopping:
                 now = self._loop.time()
                 self._wake.clear()
-                self._core.handle_timer(now)
+                self._core.handle_timer(now, self._unread(now))
                 picture = self._core.start_solving(now)
                 if picture is not None:
                     solving.create_task(self._solve(picture))
@@ -369,6 +371,11 @@ class ControlLoop:
                 next_at = max(self._core.next_timer() or metrics_at, self._loop.time() + drawn_s)
                 await self._sleep_until(min(metrics_at, next_at))
         self._executor.shutdown()
+
+    def _unread(self, now: float) -> set[NodeName]:
+        """Of those whose lease has ended, whose bytes have arrived: a late loop must cost nobody the lease."""
+        registry = self._core.registry
+        return {name for name in registry.due(now) if self.has_unread(name, registry.heard_at(name, now))}
 
     def _dispatch_quietly(self) -> None:
         """Dispatch what the loop itself caused, without waking it for that."""

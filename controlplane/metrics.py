@@ -171,6 +171,12 @@ def _members(core: ControlCore) -> Iterable[Metric]:
     yield _gauge("plr_connected_sidecars", "Sidecars with an open control stream.", ["role"], connected)
     yield _gauge("plr_registered_sidecars", "Sidecars whose lease has not ended.", ["role"], registered)
     yield _counter(
+        "plr_leases_postponed_total",
+        "Times that a lease was not ended yet, as something of its sidecar was still to be read.",
+        [],
+        {(): counters.postponed},
+    )
+    yield _counter(
         "plr_registrations_refused_total",
         "Registrations refused, by reason.",
         ["reason"],

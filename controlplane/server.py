@@ -109,6 +109,7 @@ async def serve(
         clock = ClockFloor(time.time, alert=log.error)
         gate = TlsGate(files, upstream, metrics.refused_connection, clock) if files is not None else None
         if gate is not None:
+            loop.has_unread = gate.has_unread
             gate.on_member_refused = lambda name, text: events.record(EventKind.REFUSED, name, text)
         server, health_service = _make_server(config, loop, metrics, gate)
         stun = await _start_stun(config, loop, cleanup)

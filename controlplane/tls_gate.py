@@ -157,6 +157,14 @@ class TlsGate:
         connection = self._connections.get(peer)
         return None if connection is None else connection.caller
 
+    def has_unread(self, name: NodeName, since: float) -> bool:
+        """Whether a member has sent something, over any connection, that nobody can have read by `since`, in monotonic
+        seconds: bytes that wait in the kernel, or were passed on to gRPC later than that."""
+        return any(
+            connection.outside.received_at > since or connection.outside.unread()
+            for connection in map(self._connections.__getitem__, self._of_name.get(name, ()))
+        )
+
     def use(self, files: TlsFiles) -> None:
         """Take these files from now on; connections of certificates that they do not believe end.
 

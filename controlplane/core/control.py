@@ -70,7 +70,7 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Set
+    from collections.abc import Collection, Iterable, Iterator, Set
 
     from controlplane.core.policy import Policy
     from controlplane.core.registry import Sidecar
@@ -375,9 +375,12 @@ class ControlCore:
         )
         return min((time for time in times if time is not None), default=None)
 
-    def handle_timer(self, now: float) -> None:
-        """Let leases end, and publish what changed."""
-        for sidecar in self.registry.expire(now):
+    def handle_timer(self, now: float, unread: Collection[NodeName] = ()) -> None:
+        """Let leases end, and publish what changed.
+
+        `unread`: those of `registry.due` of whom the driver has something that it has not passed on yet.
+        """
+        for sidecar in self.registry.expire(now, unread):
             self._close(sidecar.stream, CloseReason.LEASE_EXPIRED, now)
             self._forget(sidecar, RemovalReason.LEASE_EXPIRED, now)
             self._members_changed(now)

@@ -23,7 +23,7 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
     from protos.model import Candidate, CandidateSet, ServiceName, ServiceOffer, ServiceSet, ServiceUse, SessionId
     from protos.preferences import InterfaceLabel
@@ -39,6 +39,15 @@ MAX_OFFERED = 1024
 
 MAX_REMEMBERED_REMOVALS = 4096
 """Reasons of removals kept for notices; beyond that the oldest goes, and its notice says "lease expired"."""
+
+
+POSTPONE_S = 1.0
+"""From one judgement of a lease to the next, for a member whose bytes have arrived and are not read yet: a second's
+messages of a fleet are read meanwhile."""
+
+MAX_POSTPONED = 4
+"""Judgements put off for one silence: bytes are not words. Who says nothing while its kernel or gRPC still answers
+loses its lease so many seconds later."""
 
 
 class Refusal(enum.Enum):
@@ -145,6 +154,8 @@ class RegistryCounters:
     refused: dict[Refusal, int] = field(default_factory=lambda: dict.fromkeys(Refusal, 0))
     departed: dict[RemovalReason, int] = field(default_factory=lambda: dict.fromkeys(DEPARTURES, 0))
     removals_forgotten: int = 0
+    postponed: int = 0
+    """Leases not ended yet, as something of their sidecars was still to be read."""
 
 
 @dataclass(slots=True)
@@ -154,6 +165,8 @@ class _Lease:
     length_s: float
     end: float
     heard_at: float
+    postponed: int = 0
+    """Times since it was heard."""
 
 
 class Registry:
@@ -246,6 +259,7 @@ class Registry:
         lease = self._leases[name]
         lease.end = max(lease.end, now + lease.length_s)
         lease.heard_at = now
+        lease.postponed = 0
         return True
 
     def _is_current(self, name: NodeName, stream: StreamId) -> bool:
@@ -310,19 +324,42 @@ class Registry:
         """When to call `expire` next; it may then find that the lease was renewed."""
         return self._ends[0][0] if self._ends else None
 
-    def expire(self, now: float) -> list[Sidecar]:
-        """Remove those whose lease ended, and return them as they were."""
-        gone: list[Sidecar] = []
+    def due(self, now: float) -> list[NodeName]:
+        """Those whose lease ended, and whom `expire` would remove now unless there is something of them to read."""
+        found = self._take_due(now)
+        for name in found:
+            self._await_end(name)
+        return found
+
+    def _take_due(self, now: float) -> list[NodeName]:
+        found: list[NodeName] = []
         while self._ends and self._ends[0][0] <= now:
             _, name = heapq.heappop(self._ends)
             self._awaited.discard(name)
-            known = self._sidecars.get(name)
-            if known is None:
+            lease = self._leases.get(name)
+            if lease is None:
                 continue
-            if self._leases[name].end > now:
+            if lease.end > now:
+                self._await_end(name)
+            else:
+                found.append(name)
+        return found
+
+    def expire(self, now: float, unread: Collection[NodeName] = ()) -> list[Sidecar]:
+        """Remove those whose lease ended, and return them as they were.
+
+        Of those in `unread` bytes have arrived after what was read last. They are judged a little later, some times.
+        """
+        gone: list[Sidecar] = []
+        for name in self._take_due(now):
+            lease = self._leases[name]
+            if name in unread and lease.postponed < MAX_POSTPONED:
+                lease.postponed += 1
+                lease.end = now + POSTPONE_S
+                self.counters.postponed += 1
                 self._await_end(name)
                 continue
-            gone.append(known)
+            gone.append(self._sidecars[name])
             self._remove(name, RemovalReason.LEASE_EXPIRED)
         return gone
 

@@ -125,6 +125,10 @@ class ControlPlaneProcess:
         self.config.write_text(yaml.safe_dump(self.settings))
         self._process.send_signal(signal.SIGHUP)
 
+    def send_signal(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send a signal and return the exit code."""
         self._process.send_signal(number)

@@ -6,7 +6,7 @@ import contextlib
 import re
 import time
 import urllib.request
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from controlplane.ca import Authority
 from protos.identity import IdentityRole
@@ -25,12 +25,12 @@ HOUR_S = 3600.0
 class SecuredControlPlane(ControlPlaneProcess):
     """A secured control plane with the CA of its fleet."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **changes: Any) -> None:
         self.authority = Authority.create()
         self.tls_dir = folder / "tls"
         self.authority.write_tls_dir(self.tls_dir, "control", IdentityRole.CONTROL_PLANE)
         self._issued: dict[str, Secured] = {}
-        super().__init__(folder, tls_dir=str(self.tls_dir))
+        super().__init__(folder, tls_dir=str(self.tls_dir), **changes)
 
     def member(self, name: str, role: IdentityRole = IdentityRole.ROBOT, validity: Validity | None = None) -> Secured:
         """The certificate of this name, issued when it is first asked for."""

@@ -17,6 +17,7 @@ from controlplane.ca import Authority
 from controlplane.tls_gate import TlsGate
 from protos.clock_floor import ClockFloor
 from protos.identity import CONTROL_PLANE_DNS, IdentityRole
+from protos.model import NodeName
 from protos.tls_files import load_tls_files
 
 if TYPE_CHECKING:
@@ -243,5 +244,34 @@ def test_a_revoked_certificates_connections_end_and_no_others(tmp_path: Path) ->
             writer.write(b"x")
             assert await reader.readexactly(1) == b"x"
             writer.close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.audit("ops-16")
+def test_the_gate_knows_of_bytes_that_nobody_has_read(tmp_path: Path) -> None:
+    """In the kernel while the loop is busy, and behind the gate until the time that the asker has read to."""
+    name = NodeName("robot-1")
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            reader, writer = await gate.connect(name)
+            writer.write(b"one")
+            assert await reader.readexactly(3) == b"one"
+            read_at = time.monotonic()
+            assert not gate.gate.has_unread(name, read_at)
+            assert not gate.gate.has_unread(NodeName("nobody"), 0.0)
+            before = read_at - PATIENCE_S
+            assert gate.gate.has_unread(name, before), "passed on after that"
+            writer.write(b"two")
+            # Not a turn of the loop: it is sent, and nobody reads it.
+            patience = time.monotonic() + PATIENCE_S
+            while not gate.gate.has_unread(name, read_at):
+                assert time.monotonic() < patience
+            assert await reader.readexactly(3) == b"two"
+            assert gate.gate.has_unread(name, read_at), "passed on, and for all that the gate knows not read"
+            assert not gate.gate.has_unread(name, time.monotonic())
+            writer.close()
+            await until(lambda: not gate.gate.has_unread(name, before))
 
     asyncio.run(run())

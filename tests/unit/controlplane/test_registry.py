@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from controlplane.core import registry as registry_module
-from controlplane.core.registry import Admission, Refusal, Registry
+from controlplane.core.registry import MAX_POSTPONED, POSTPONE_S, Admission, Refusal, Registry
 from protos.model import CandidateSet, NodeName, RemovalReason, Role, ServiceSet
 from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 
@@ -187,3 +187,39 @@ def test_coming_and_going_leaves_nothing_behind(registry: Registry) -> None:
     assert len(registry._ends) == 1
     registry.expire(100.0)
     assert registry.next_expiry() is None
+
+
+@pytest.mark.audit("ops-16")
+def test_who_has_unread_bytes_is_judged_later_but_not_for_ever(registry: Registry) -> None:
+    registry.register(registration("robot"), stream(1), 0.0)
+    registry.register(registration("other"), stream(2), 0.0)
+    late = LEASE_S + 7.0
+    assert set(registry.due(late)) == {ROBOT, "other"}
+    assert [gone.name for gone in registry.expire(late, {ROBOT})] == ["other"]
+    for count in range(1, MAX_POSTPONED):
+        assert registry.due(late + (count - 0.1) * POSTPONE_S) == []
+        assert registry.expire(late + count * POSTPONE_S, {ROBOT}) == []
+    assert registry.counters.postponed == MAX_POSTPONED
+    assert [gone.name for gone in registry.expire(late + MAX_POSTPONED * POSTPONE_S, {ROBOT})] == [ROBOT]
+
+
+@pytest.mark.audit("ops-16")
+def test_a_word_that_was_read_late_renews_the_lease(registry: Registry) -> None:
+    registry.register(registration("robot"), stream(1), 0.0)
+    assert registry.expire(LEASE_S + 7.0, {ROBOT}) == []
+    assert registry.touch(ROBOT, stream(1), LEASE_S + 7.5)
+    assert registry.due(2 * LEASE_S + 7.4) == []
+    for count in range(MAX_POSTPONED):
+        assert registry.expire(2 * LEASE_S + 7.5 + count * POSTPONE_S, {ROBOT}) == [], "counted from then on"
+    assert len(registry.expire(2 * LEASE_S + 7.5 + MAX_POSTPONED * POSTPONE_S, {ROBOT})) == 1
+
+
+@pytest.mark.audit("ops-16")
+def test_looking_at_what_is_due_changes_nothing(registry: Registry) -> None:
+    registry.register(registration("robot"), stream(1), 0.0)
+    registry.touch(ROBOT, stream(1), 2.0)
+    assert registry.due(LEASE_S) == []
+    assert registry.next_expiry() == 2.0 + LEASE_S
+    assert registry.due(2.0 + LEASE_S) == registry.due(2.0 + LEASE_S) == [ROBOT]
+    assert [gone.name for gone in registry.expire(2.0 + LEASE_S)] == [ROBOT]
+    assert registry.due(100.0) == []
