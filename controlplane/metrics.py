@@ -55,6 +55,7 @@ REFUSAL_REASONS = (
     handshakes.HANDSHAKE_FAILED,
     tls_gate.TOO_MANY_HANDSHAKES,
     tls_gate.TOO_MANY_CONNECTIONS,
+    tls_gate.GAVE_UP,
     limits.TOO_MANY_STREAMS,
     limits.TOO_FAST,
 )

@@ -17,6 +17,7 @@ import ipaddress
 import logging
 import math
 import secrets
+import select
 import socket
 import ssl
 from collections import OrderedDict
@@ -24,6 +25,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
+from controlplane.core.admission import Admission
 from controlplane.gate_pipe import PipeEnd
 from controlplane.half_open import HalfOpen
 from controlplane.handshakes import server_context, why_failed
@@ -53,12 +55,22 @@ of the same address."""
 TURN_TIMEOUT_S = 15.0
 """Longest wait for the turn to begin a handshake: as long as a sidecar of a large fleet waits."""
 
-BEGUN_AT_ONCE = 4
-"""Handshakes begun in one turn of the loop, some milliseconds each."""
+MAX_ON_THE_WAY = 64
+"""Connections at once between the beginning of their handshakes and their first calls. Half a second of work: what more
+began meanwhile would wait behind these. Enough for a hundred a second from networks as slow as cellular ones."""
+
+ON_THE_WAY_S = 1.0
+"""For how long one counts as such: three round trips over a slow network. Who takes longer keeps nobody waiting."""
+
+MAX_WAITING = 4096 + 256
+"""Connections at once that wait for their turn: the largest fleet. No TLS stands behind them; each costs a descriptor
+and a few kB."""
+
+ACCEPTED_AT_ONCE = 16
+"""In one turn of the loop."""
 
 MAX_SILENT = 2048
-"""Connections at once that have said nothing yet, or wait for their turn: no TLS stands behind them, and each costs a
-descriptor only."""
+"""Connections at once that have said nothing yet."""
 
 MAX_SILENT_PER_SOURCE = 1024
 """Of these, from one address."""
@@ -81,6 +93,9 @@ a small fleet. There is no other way to say it."""
 
 TOO_MANY_HANDSHAKES = "too_many_handshakes"
 TOO_MANY_CONNECTIONS = "too_many_connections"
+GAVE_UP = "gave_up"
+"""The client went while it waited for its turn."""
+
 TELL_AGAIN_S = 60.0
 """A member that is refused again for the same reason is logged again after so long."""
 
@@ -105,6 +120,8 @@ class _Connection:
     caller: Caller
     outside: PipeEnd
     inside: PipeEnd
+    admitted: asyncio.Task[None] | None
+    """The task that let it in."""
 
 
 class TlsGate:
@@ -121,13 +138,18 @@ class TlsGate:
         self._on_refused = on_refused
         self._loop = asyncio.get_running_loop()
         self._socket: socket.socket | None = None
-        self._accepting: asyncio.Task[None] | None = None
+        self._working: list[asyncio.Task[None]] = []
         self._unread: set[socket.socket] = set()
         """Of the silent ones."""
         self._silent = HalfOpen(MAX_SILENT, MAX_SILENT_PER_SOURCE)
         self._handshakes = HalfOpen(MAX_HANDSHAKES, MAX_HANDSHAKES_PER_SOURCE)
-        self._turn = asyncio.Semaphore(BEGUN_AT_ONCE)
-        """Fair: who waits longest is next."""
+        self._admission: Admission[asyncio.Task[None]] = Admission(
+            most_waiting=MAX_WAITING, most_on_the_way=MAX_ON_THE_WAY, on_the_way_s=ON_THE_WAY_S
+        )
+        self._turns: dict[asyncio.Task[None], asyncio.Future[None]] = {}
+        """Of those that wait."""
+        self._room = asyncio.Event()
+        """Somebody waits, or is through."""
         self._connections: OrderedDict[str, _Connection] = OrderedDict()
         self._of_name: dict[NodeName, OrderedDict[str, None]] = {}
         """The same by the certificate's name, oldest first."""
@@ -146,16 +168,24 @@ class TlsGate:
         """Accept connections from now on; returns the port. Raises OSError if the address cannot be had."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         dual = family == socket.AF_INET6 and host == "::" and socket.has_dualstack_ipv6()
-        self._socket = socket.create_server((host, port), family=family, backlog=1024, dualstack_ipv6=dual)
+        self._socket = socket.create_server((host, port), family=family, backlog=MAX_WAITING, dualstack_ipv6=dual)
         self._socket.setblocking(False)
-        self._accepting = self._loop.create_task(self._accept(self._socket))
+        self._working = [
+            self._loop.create_task(self._accept(self._socket)),
+            self._loop.create_task(self._give_turns()),
+        ]
         taken: int = self._socket.getsockname()[1]
         return taken
 
     def caller(self, peer: str) -> Caller | None:
-        """Who is behind the connection that gRPC calls `peer`; None if there is no such connection (any more)."""
+        """Who calls over the connection that gRPC calls `peer`; None if there is no such connection (any more)."""
         connection = self._connections.get(peer)
-        return None if connection is None else connection.caller
+        if connection is None:
+            return None
+        if connection.admitted is not None:
+            self._is_through(connection.admitted)
+            connection.admitted = None
+        return connection.caller
 
     def has_unread(self, name: NodeName, since: float) -> bool:
         """Whether a member has sent something, over any connection, that nobody can have read by `since`, in monotonic
@@ -184,9 +214,7 @@ class TlsGate:
 
     async def close(self) -> None:
         """End everything."""
-        tasks = [*self._silent.tasks(), *self._handshakes.tasks()]
-        if self._accepting is not None:
-            tasks.append(self._accepting)
+        tasks = [*self._working, *self._silent.tasks(), *self._turns, *self._handshakes.tasks()]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -199,6 +227,7 @@ class TlsGate:
     # ── accepting ──
 
     async def _accept(self, listening: socket.socket) -> None:
+        count = 0
         while True:
             try:
                 accepted, address = await self._loop.sock_accept(listening)
@@ -213,33 +242,82 @@ class TlsGate:
             task.add_done_callback(self._handshakes.remove)
             self._unread.add(accepted)
             task.add_done_callback(partial(self._close_unread, accepted))
+            count += 1
+            if count % ACCEPTED_AT_ONCE == 0:
+                await asyncio.sleep(0)
 
     async def _greet(self, accepted: socket.socket, address: str, source: str) -> None:
         """Wait for the client's first bytes: who says nothing must not keep others from their handshakes.
 
-        Then for its turn: few begin in each turn of the loop. So whatever else is due, as the messages of those who
-        are let in already, is done between two, and who began ends before more begin.
+        Then for its turn, and let it in.
         """
         accepted.setblocking(False)
-        spoke = False
-        try:
-            async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
-                await _readable(self._loop, accepted)
-            spoke = True
-            async with asyncio.timeout(TURN_TIMEOUT_S), self._turn:
-                await asyncio.sleep(0)
-        except TimeoutError as error:
-            if spoke:
-                self._on_refused(TOO_MANY_HANDSHAKES)
-            else:
-                self._refused(address, *why_failed(error))
-            return
         task = asyncio.current_task()
         assert task is not None
+        if not _look(accepted):
+            try:
+                async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
+                    await _readable(self._loop, accepted)
+            except TimeoutError as error:
+                self._refused(address, *why_failed(error))
+                return
         self._silent.remove(task)
+        try:
+            async with asyncio.timeout(TURN_TIMEOUT_S):
+                await self._turn(task, source)
+        except TimeoutError:
+            self._on_refused(TOO_MANY_HANDSHAKES)
+            return
+        if _look(accepted) & _GONE:
+            # Before anything was spent on it.
+            self._on_refused(GAVE_UP)
+            self._is_through(task)
+            return
         self._note(self._handshakes, task, source)
         self._unread.discard(accepted)
-        await self._admit(accepted, address)
+        through = False
+        try:
+            through = await self._admit(accepted, address, task)
+        finally:
+            if not through:
+                self._is_through(task)
+
+    async def _turn(self, task: asyncio.Task[None], source: str) -> None:
+        turn = self._turns[task] = self._loop.create_future()
+        pushed_out = self._admission.wait(task, source)
+        if pushed_out is not None:
+            self._on_refused(TOO_MANY_HANDSHAKES)
+            pushed_out.cancel()
+        self._room.set()
+        try:
+            await turn
+        except BaseException:
+            # Perhaps just after its turn had come.
+            self._admission.leave(task)
+            self._is_through(task)
+            raise
+        finally:
+            del self._turns[task]
+
+    async def _give_turns(self) -> None:
+        """One in each turn of the loop: whatever else is due, as the messages of those who are in already, is done
+        between two."""
+        while True:
+            task = self._admission.next(self._loop.time())
+            if task is not None:
+                turn = self._turns[task]
+                if not turn.done():
+                    turn.set_result(None)
+                await asyncio.sleep(0)
+                continue
+            self._room.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout_at(self._admission.next_at()):
+                    await self._room.wait()
+
+    def _is_through(self, task: asyncio.Task[None]) -> None:
+        if self._admission.over(task):
+            self._room.set()
 
     def _note(self, line: HalfOpen, task: asyncio.Task[None], source: str) -> None:
         # Counted here: one that is pushed out before it came to run could not.
@@ -252,7 +330,8 @@ class TlsGate:
             self._unread.discard(accepted)
             accepted.close()
 
-    async def _admit(self, accepted: socket.socket, address: str) -> None:
+    async def _admit(self, accepted: socket.socket, address: str, task: asyncio.Task[None]) -> bool:
+        """Returns whether the connection stands."""
         outside = PipeEnd()
         try:
             transport, _ = await self._loop.connect_accepted_socket(
@@ -266,21 +345,21 @@ class TlsGate:
             self._refused(address, *why_failed(error))
             # In a cycle with asyncio's TLS buffers: without this, strangers take 100 MB before they are collected.
             error.__traceback__ = None
-            return
+            return False
         try:
             certificate = transport.get_extra_info("ssl_object").getpeercert(binary_form=True)
             caller = self._check(certificate or b"")
         except CertificateError as error:
             self._refused(address, error.reason, str(error))
             outside.abort()
-            return
-        await self._connect(outside, caller, address)
+            return False
+        return await self._connect(outside, caller, address, task)
 
-    async def _connect(self, outside: PipeEnd, caller: Caller, address: str) -> None:
+    async def _connect(self, outside: PipeEnd, caller: Caller, address: str, task: asyncio.Task[None]) -> bool:
         if len(self._connections) >= MAX_CONNECTIONS:
             self._refused(address, TOO_MANY_CONNECTIONS, f"{MAX_CONNECTIONS} connections are open")
             outside.abort()
-            return
+            return False
         self._make_room(caller.identity.name)
         self._count += 1
         name = f"{self._prefix}-{self._count}"
@@ -290,10 +369,11 @@ class TlsGate:
 
         def lost() -> None:
             self._forget(peer, owner)
+            self._is_through(task)
 
         inside = PipeEnd(lost)
         # Before gRPC can know of it.
-        self._connections[peer] = _Connection(caller, outside, inside)
+        self._connections[peer] = _Connection(caller, outside, inside, task)
         self._of_name.setdefault(owner, OrderedDict())[peer] = None
         if caller.refusal is not None:
             # It may hear from gRPC why, in words that its operator reads.
@@ -305,8 +385,9 @@ class TlsGate:
             log.warning("no connection to the gRPC server: %s", error)
             lost()
             outside.abort()
-            return
+            return False
         PipeEnd.join(outside, inside)
+        return True
 
     async def _connect_inside(self, name: str, inside: PipeEnd) -> None:
         unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -382,6 +463,16 @@ class TlsGate:
         # A stranger must not fill the disk.
         if self._log_lines.take(self._loop.time()):
             log.warning("refused a connection of %s: %s: %s", who, reason, text)
+
+
+_GONE = select.POLLRDHUP | select.POLLHUP | select.POLLERR
+
+
+def _look(sock: socket.socket) -> int:
+    """Return what there is of it now: bytes to read, or its end (`_GONE`)."""
+    looking = select.poll()
+    looking.register(sock, select.POLLIN | select.POLLRDHUP)
+    return next((found for _, found in looking.poll(0)), 0)
 
 
 async def _readable(loop: asyncio.AbstractEventLoop, sock: socket.socket) -> None:
