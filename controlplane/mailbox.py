@@ -43,14 +43,19 @@ class Mailbox:
         self._close_reason = reason
         self._changed.set()
 
+    def take(self) -> ControlMessage | CloseReason | None:
+        """Return the next message to write, or the reason to close; None while there is nothing to do."""
+        if self._close_reason is not None:
+            return self._close_reason
+        for kind in _ORDER:
+            message = self._waiting.pop(kind, None)
+            if message is not None:
+                return message
+        return None
+
     async def get(self) -> ControlMessage | CloseReason:
         """Wait for the next message to write, or the reason to close."""
-        while True:
-            if self._close_reason is not None:
-                return self._close_reason
-            for kind in _ORDER:
-                message = self._waiting.pop(kind, None)
-                if message is not None:
-                    return message
+        while (next_one := self.take()) is None:
             self._changed.clear()
             await self._changed.wait()
+        return next_one

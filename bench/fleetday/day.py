@@ -1,0 +1,474 @@
+"""The day: who comes, goes, moves and breaks when, drawn from a seed, and the looks at it in between."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from bench.fleetday.checks import Checker, is_healthy
+from bench.fleetday.member import Measurements, Member
+from bench.fleetday.plane import Plane
+from bench.fleetday.sizes import Sizes, measure
+from bench.fleetday.timeline import Timeline
+from controlplane.core.control_events import Settings
+from controlplane.core.policy import CallRule, OfferRule, Policy
+from protos.model import InterfaceName, NodeName, RemovalReason, Role, ServiceName, ServiceOffer, ServiceSet, ServiceUse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from pathlib import Path
+
+    from protos.model import Address
+
+HOUR_S = 3600.0
+START = 1000.0
+"""Simulated time begins here."""
+
+QUIET_S = 240.0
+"""Before each measurement nothing new happens for so long: longer than any spell, lease and settling together."""
+
+SPELL_S = (20.0, 100.0)
+"""How long somebody refuses, reads slowly or has no network."""
+
+SERVICES = tuple(ServiceName(name) for name in ("/plan", "/detect", "/grasp", "/map"))
+TYPE = "nav_msgs/srv/GetPlan"
+DEADLINES_S = (0.125, 0.25, 0.5)
+WLAN, WWAN, WIRED = (InterfaceName(name) for name in ("wlan0", "wwan0", "eth0"))
+
+POLICIES: tuple[Policy | None, ...] = (
+    None,
+    Policy((CallRule(("*",), ("*",), ("*",)),), (OfferRule(("*",), ("*",)),)),
+    Policy((CallRule(("robot-*[02468]",), ("*",), ("*",)),), (OfferRule(("*",), ("*",)),)),
+    Policy((CallRule(("*",), ("/plan", "/detect"), ("*",)),), (OfferRule(("*",), ("/[pdg]*",)),)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """How large and how long."""
+
+    members: int = 1000
+    hours: float = 24.0
+    every_hours: float = 4.0
+    """From one measurement of all tables to the next."""
+    moment_s: float = 15.0
+    """From one moment, with one to four events, to the next, in the mean."""
+    look_s: float = 300.0
+    """From one comparison of the two sides to the next."""
+    measures_s: float = 300.0
+    """From one measurement of a robot to its next; what else it reports is that paths went up or down."""
+    restarts: int = 6
+    """Of the control plane."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The control plane at one time, after a quiet while."""
+
+    at_h: float
+    registered: int
+    judged: int
+    sizes: Sizes
+    sidecars: Sizes
+    events_kept: int
+    log_bytes: int
+
+
+class Day:
+    """A fleet and its control plane."""
+
+    def __init__(self, seed: int, scale: Scale, folder: Path, *, matcher_settings: Settings | None = None) -> None:
+        self.rng = random.Random(seed)
+        self.scale = scale
+        self.timeline = Timeline(START)
+        self._folder = folder
+        settings = matcher_settings or Settings(report_interval_s=0.8)
+        self.plane = Plane(self.timeline, settings, folder, self.rng)
+        self.members: dict[NodeName, Member] = {}
+        self.checker = Checker(self.plane, self.members)
+        self.happened: Counter[str] = Counter()
+        self.samples: list[Sample] = []
+        self.on_sample: Callable[[Sample], None] = lambda sample: None
+        self._measurements = Measurements(self.rng)
+        self._numbers = 0
+        self._address = 0
+        self._quiet = False
+        self._crls = 0
+        self._leaving: set[NodeName] = set()
+        weights: tuple[tuple[int, Callable[[], None]], ...] = (
+            (25, self.rebinds),
+            (15, self.loses_an_interface),
+            (20, self.path_goes_dark),
+            (10, self.breaks),
+            (6, self.goes_half_open),
+            (5, self.loses_its_network),
+            (5, self.crashes),
+            (5, self.leaves),
+            (3, self.server_dies),
+            (2, self.server_leaves),
+            (4, self.changes_services),
+            (3, self.refuses),
+            (3, self.reads_slowly),
+            (3, self.stalls),
+            (2, self.renews),
+            (1, self.is_revoked),
+        )
+        self._kinds = [kind for _, kind in weights]
+        self._weights = [weight for weight, _ in weights]
+
+    # ── the fleet ──
+
+    @property
+    def clouds_wanted(self) -> int:
+        """Servers of the fleet."""
+        return max(4, self.scale.members // 80)
+
+    def _join(self, role: Role) -> Member:
+        self._numbers += 1
+        name = NodeName(f"{role.value}-{self._numbers:05d}")
+        member = Member(
+            name,
+            role,
+            self._numbers,
+            self.rng.choice(("", "eu", "us")) if role is Role.CLOUD else "",
+            timeline=self.timeline,
+            plane=self.plane,
+            rng=self.rng,
+            measurements=self._measurements,
+            measures_every_s=self.scale.measures_s,
+        )
+        names = [WIRED] if role is Role.CLOUD else [WLAN, WWAN]
+        member.set_interfaces({name: self._addresses() for name in names})
+        member.set_services(self._services(role))
+        self.members[name] = member
+        member.start(keeps_disk=False)
+        return member
+
+    def _addresses(self) -> tuple[Address, Address]:
+        """A new host address, and where a NAT shows it."""
+        self._address += 1
+        number = self._address
+        inside = f"10.{number >> 16 & 255}.{number >> 8 & 255}.{number & 255}"
+        outside = f"198.18.{number >> 8 & 255}.{number & 255}"
+        return (inside, 40_000), (outside, 1024 + number % 60_000)
+
+    def _services(self, role: Role) -> ServiceSet:
+        rng = self.rng
+        if role is Role.CLOUD:
+            offered = [SERVICES[0], *rng.sample(SERVICES[1:], rng.randint(1, 3))]
+            return ServiceSet(tuple(ServiceOffer(name, TYPE) for name in sorted(offered)))
+        used = sorted(rng.sample(SERVICES, rng.choice((1, 1, 2))))
+        uses = (ServiceUse(name, TYPE, rng.choice(DEADLINES_S), idempotent=rng.random() < 0.8) for name in used)
+        unmet = (ServiceName("/nobody"),) if rng.random() < 0.1 else ()
+        return ServiceSet((), tuple(uses), unmet)
+
+    def _alive(self, role: Role | None = None) -> list[Member]:
+        return [
+            member
+            for member in self.members.values()
+            if member.alive and not member.draining and role in (None, member.role)
+        ]
+
+    def _someone(self, role: Role | None = None) -> Member:
+        return self.rng.choice(self._alive(role))
+
+    def _later(self, least_s: float, most_s: float, action: Callable[[], None]) -> None:
+        self.timeline.after(self.rng.uniform(least_s, most_s), action)
+
+    # ── what happens to a member ──
+
+    def rebinds(self) -> None:
+        """A NAT forgets a binding: another address and port, as STUN tells a moment later."""
+        robot = self._someone(Role.ROBOT)
+        if robot.interfaces:
+            interface = self.rng.choice(list(robot.interfaces))
+            inside, _ = robot.interfaces[interface]
+            robot.set_interfaces({**robot.interfaces, interface: (inside, self._addresses()[1])})
+
+    def loses_an_interface(self) -> None:
+        """An interface vanishes, and is back some time later with another address."""
+        robot = self._someone(Role.ROBOT)
+        if len(robot.interfaces) < 2:
+            return
+        lost = self.rng.choice(list(robot.interfaces))
+        robot.set_interfaces({name: at for name, at in robot.interfaces.items() if name != lost})
+
+        def back() -> None:
+            robot.set_interfaces({**robot.interfaces, lost: self._addresses()})
+
+        self._later(5.0, 600.0, back)
+
+    def path_goes_dark(self) -> None:
+        """An interface, or one path of it, carries nothing for a while."""
+        robot = self._someone(Role.ROBOT)
+        if not robot.interfaces:
+            return
+        interface = self.rng.choice(list(robot.interfaces))
+        servers = list(robot.held.peers.table)
+        dark = interface if self.rng.random() < 0.7 or not servers else (interface, self.rng.choice(servers))
+        robot.dark.add(dark)
+        robot.paths_changed()
+
+        def lit() -> None:
+            robot.dark.discard(dark)
+            if robot.alive:
+                robot.paths_changed()
+
+        self._later(2.0, 300.0, lit)
+
+    def breaks(self) -> None:
+        """A stream is reset."""
+        self._someone().break_line(half_open=False)
+
+    def goes_half_open(self) -> None:
+        """A stream dies without a word."""
+        self._someone().break_line(half_open=True)
+
+    def loses_its_network(self) -> None:
+        """Neither the stream nor a new one gets through."""
+        member = self._someone()
+        member.network_down = True
+        member.break_line(half_open=True)
+
+        def back() -> None:
+            member.network_down = False
+
+        self._later(*SPELL_S, back)
+
+    def crashes(self) -> None:
+        """A robot's sidecar, or all of it, dies and is back soon."""
+        self._down(self._someone(Role.ROBOT), 1.0, 1800.0)
+
+    def _down(self, member: Member, least_s: float, most_s: float) -> None:
+        member.crash(silently=self.rng.random() < 0.5)
+        self._later(least_s, most_s, lambda: self._up(member))
+
+    def _up(self, member: Member) -> None:
+        if not member.alive and member.name in self.members:
+            member.start(keeps_disk=self.rng.random() < 0.7)
+
+    def leaves(self) -> None:
+        """A robot says goodbye; it is back for its next shift, or another one comes for it."""
+        self._goes(self._someone(Role.ROBOT))
+
+    def _goes(self, member: Member) -> None:
+        member.drain()
+        self._later(1.0, 5.0, lambda: self._gone(member))
+
+    def _gone(self, member: Member) -> None:
+        member.crash(silently=False)
+        if self.rng.random() < 0.5:
+            self._later(30.0, 3600.0, lambda: self._up(member))
+        else:
+            self._replaced(member)
+
+    def _replaced(self, member: Member) -> None:
+        """It never comes back, and another one comes for it."""
+        self._later(30.0, 1200.0, lambda: self._join_for(member))
+
+    def _join_for(self, gone: Member) -> None:
+        # Kept until now for those who look who is gone.
+        self.members.pop(gone.name, None)
+        self._join(gone.role)
+
+    def server_dies(self) -> None:
+        """A server and its host die."""
+        clouds = self._alive(Role.CLOUD)
+        if 3 * len(clouds) > 2 * self.clouds_wanted:
+            self._down(self.rng.choice(clouds), 5.0, 900.0)
+
+    def server_leaves(self) -> None:
+        """A server is taken out of service; often another one, of another name, comes for it."""
+        clouds = self._alive(Role.CLOUD)
+        if 3 * len(clouds) > 2 * self.clouds_wanted:
+            self._goes(self.rng.choice(clouds))
+
+    def changes_services(self) -> None:
+        """A robot carries others, or a server offers others."""
+        member = self._someone(Role.CLOUD if self.rng.random() < 0.2 else Role.ROBOT)
+        member.set_services(self._services(member.role))
+
+    def _spell(self, member: Member, name: str) -> None:
+        setattr(member, name, True)
+
+        def over() -> None:
+            setattr(member, name, False)
+            member.ill_at = self.timeline.now
+
+        self._later(*SPELL_S, over)
+
+    def refuses(self) -> None:
+        """A sidecar takes nothing for a while, as its driver hangs."""
+        self._spell(self._someone(), "refuses")
+
+    def reads_slowly(self) -> None:
+        """A sidecar behind a bad link takes seconds for a message."""
+        member = self._someone()
+        self._spell(member, "slow")
+        if member.line is not None:
+            line = member.line
+            line.slow_s = self.rng.uniform(0.5, 5.0)
+
+            def over() -> None:
+                line.slow_s = 0.0
+
+            self._later(*SPELL_S, over)
+
+    def stalls(self) -> None:
+        """A sidecar reads nothing for a minute, and is heard all the while."""
+        member = self._someone()
+        member.stall(60.0)
+        self._spell(member, "slow")
+
+    def renews(self) -> None:
+        """A new certificate, with which the stream begins anew."""
+        self._someone().renew_credential()
+
+    def is_revoked(self) -> None:
+        """A certificate is revoked, or has ended."""
+        member = self._someone(Role.ROBOT)
+        ended = self.rng.random() < 0.5
+        self._crls += not ended
+        reason = RemovalReason.EXPIRED if ended else RemovalReason.REVOKED
+        self.plane.revoke(member.name, reason, b"list %d" % self._crls)
+        self._later(5.0, 30.0, lambda: self._sorted_out(member, ended))
+
+    def _sorted_out(self, member: Member, ended: bool) -> None:
+        if ended:
+            self.plane.barred.discard(member.name)
+            if member.alive:
+                member.renew_credential()
+        elif member.alive:
+            member.crash(silently=False)
+            self._replaced(member)
+
+    # ── what happens to all ──
+
+    def restart_plane(self) -> None:
+        """The control plane stops or dies, and is back soon; now and then with a clock that was set back."""
+        if self._quiet:
+            self._later(QUIET_S, 2 * QUIET_S, self.restart_plane)
+            return
+        self.happened["restart_plane"] += 1
+        self.plane.stop(orderly=self.rng.random() < 0.5)
+        if self.rng.random() < 0.4:
+            self.plane.clock_error_s = self.rng.choice((-7200.0, -600.0, 0.0, 3600.0))
+        self._later(0.5, 40.0, self.plane.start)
+
+    def change_policy(self) -> None:
+        """Another policy is in force for a while; then none."""
+        if self._quiet:
+            self._later(QUIET_S, 2 * QUIET_S, self.change_policy)
+            return
+        self.happened["change_policy"] += 1
+        self._set_policy(self.rng.choice(POLICIES[1:]))
+        self._later(300.0, 900.0, lambda: self._set_policy(None))
+
+    def _set_policy(self, policy: Policy | None) -> None:
+        self.checker.policy_at = self.timeline.now
+        self.plane.set_policy(policy)
+
+    def outage(self) -> None:
+        """The network in front of the control plane dies for a minute: all streams at once, without a word."""
+        if self._quiet:
+            self._later(QUIET_S, 2 * QUIET_S, self.outage)
+            return
+        self.happened["outage"] += 1
+        members = self._alive()
+        for member in members:
+            member.network_down = True
+            member.break_line(half_open=True)
+
+        def over() -> None:
+            for member in members:
+                member.network_down = False
+
+        self._later(*SPELL_S, over)
+
+    # ── the day ──
+
+    def begin(self) -> None:
+        """Start the control plane and the fleet, and draw when what concerns all happens."""
+        self.plane.start()
+        for number in range(self.scale.members):
+            role = Role.CLOUD if number < self.clouds_wanted else Role.ROBOT
+            self._later(0.0, 60.0, lambda role=role: self._join(role))  # type: ignore[misc]  # bound in its own turn
+        length_s = self.scale.hours * HOUR_S
+        spread = self.scale.restarts
+        for kind, count in ((self.restart_plane, spread), (self.change_policy, spread), (self.outage, spread // 2)):
+            for _ in range(count):
+                self.timeline.at(START + self.rng.uniform(0.02, 0.97) * length_s, kind)
+        self.timeline.after(300.0 if self.scale.hours > 2.0 else 100.0, self._moment)
+        self.timeline.after(self.scale.look_s, self._look)
+        self._busy()
+
+    def _moment(self) -> None:
+        if not self._quiet:
+            for _ in range(self.rng.randint(1, 4)):
+                kind = self.rng.choices(self._kinds, self._weights)[0]
+                self.happened[kind.__name__] += 1
+                kind()
+        self._later(0.0, 2 * self.scale.moment_s, self._moment)
+
+    def _look(self) -> None:
+        self.checker.look(self.timeline.now)
+        if self.plane.up:
+            self._operator_looks()
+        self.timeline.after(self.scale.look_s, self._look)
+
+    def _operator_looks(self) -> None:
+        core, now = self.plane.core, self.timeline.now
+        names = [*(sidecar.name for sidecar in core.registry), *(gone.name for gone in core.departed)]
+        for name in self.rng.sample(names, min(3, len(names))):
+            core.view(name, now)
+            member = self.members.get(name)
+            known = core.registry.get(name)
+            if member is not None and known is not None and known.uses:
+                core.explain(name, known.uses[0].name, now)
+
+    def _busy(self) -> None:
+        """What the control plane's processor does: more by day than by night, and too much for some minutes."""
+        hour = (self.timeline.now - START) / HOUR_S
+        self.plane.busy = 0.3 - 0.25 * math.cos(hour / 24.0 * 2 * math.pi) + (0.4 if self.rng.random() < 0.2 else 0.0)
+        self.timeline.after(300.0, self._busy)
+
+    def run(self) -> None:
+        """The whole day, with a measurement at the end of each part of it."""
+        self.begin()
+        parts = round(self.scale.hours / self.scale.every_hours)
+        for part in range(1, parts + 1):
+            ends = START + part * self.scale.every_hours * HOUR_S
+            self.timeline.run(ends - QUIET_S)
+            self._quiet = True
+            self.timeline.run(ends)
+            self._quiet = False
+            self._sample()
+
+    def _sample(self) -> None:
+        now = self.timeline.now
+        judged = self.checker.look(now)
+        events = self.plane.events
+        assert events is not None
+        sample = Sample(
+            at_h=(now - START) / HOUR_S,
+            registered=len(self.plane.core.registry),
+            judged=judged,
+            sizes=measure(self.plane.core),
+            sidecars=measure(_Sidecars([member.session for member in self.members.values() if member.session])),
+            events_kept=len(events.events()),
+            log_bytes=sum(path.stat().st_size for path in self._folder.iterdir()),
+        )
+        self.samples.append(sample)
+        self.on_sample(sample)
+
+    def healthy(self) -> int:
+        """Sidecars that have no reason to lag."""
+        return sum(is_healthy(member, self.timeline.now) for member in self.members.values())
+
+
+class _Sidecars:
+    def __init__(self, sessions: Iterable[object]) -> None:
+        self.sessions = list(sessions)

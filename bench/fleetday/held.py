@@ -1,0 +1,46 @@
+"""What a sidecar holds after it has applied what it was sent: its peers and its mapping.
+
+How a message changes that stands in `HeldPeers.apply` alone; whoever checks asks for the table.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from protos.model import PeerSet, Version
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from protos.model import NodeName, Peer, ServiceMapping
+
+
+class HeldPeers:
+    """The peers in force at one sidecar."""
+
+    def __init__(self) -> None:
+        self.version = Version(0)
+        self._told: Sequence[Peer] = ()
+        self._table: dict[NodeName, Peer] | None = {}
+
+    def apply(self, message: PeerSet) -> None:
+        """Put it in force. A set is whole, and read when somebody asks: few sets of a large fleet ever are."""
+        self.version = message.version
+        self._told = message.peers
+        self._table = None
+
+    @property
+    def table(self) -> Mapping[NodeName, Peer]:
+        """The peers by name."""
+        if self._table is None:
+            self._table = {peer.name: peer for peer in self._told}
+        return self._table
+
+
+class Held:
+    """Everything that is in force at one sidecar; survives its restarts if its disk does."""
+
+    def __init__(self) -> None:
+        self.peers = HeldPeers()
+        self.mapping: tuple[ServiceMapping, ...] = ()
+        self.mapping_version = Version(0)

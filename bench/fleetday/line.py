@@ -1,0 +1,152 @@
+"""One control stream in simulated time: it delays, stalls, breaks, and dies without a word."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+from controlplane.core.control_events import CloseReason
+from controlplane.core.registry import Refusal
+from controlplane.mailbox import Mailbox
+from protos.convert import (
+    control_message_to_proto,
+    parse_control_message,
+    parse_sidecar_message,
+    sidecar_message_to_proto,
+)
+from protos.model import Heartbeat, PeerSet, Registration
+
+if TYPE_CHECKING:
+    import random
+
+    from bench.fleetday.member import Member
+    from bench.fleetday.plane import Plane
+    from bench.fleetday.timeline import Timeline
+    from controlplane.core.registry import StreamId
+    from protos.model import ControlMessage, SidecarMessage
+
+IN_FLIGHT = 2
+"""Messages that a connection's buffers hold; what else is to be written waits in the mailbox, where newer ones come in
+the place of older ones."""
+
+CONVERTED_ONE_IN = 20
+"""Messages that take the way through protobuf; the others are handed over as they are."""
+
+FEW_PEERS, LARGE_CONVERTED_ONE_IN = 50, 400
+"""Sets of more peers take some milliseconds."""
+
+_NOT_ANSWERED_SOON = frozenset({CloseReason.REPLACED, CloseReason.REVOKED, CloseReason.CERTIFICATE_ENDED})
+"""Endings whose gRPC status is among the sidecar's REFUSALS."""
+
+
+class Line:
+    """A stream between one sidecar and the control plane; each end has its own belief of whether it is there."""
+
+    def __init__(self, timeline: Timeline, plane: Plane, member: Member, rng: random.Random) -> None:
+        self._timeline = timeline
+        self._plane = plane
+        self._member = member
+        self._rng = rng
+        self._delay_s = rng.uniform(0.005, 0.08)
+        self._mailbox = Mailbox()
+        self._in_flight = 0
+        self._read_at = 0.0
+        """When the sidecar reads what was written last."""
+        self._stream: StreamId | None = None
+        self.dead = False
+        """Nothing arrives any more, at either end."""
+        self.slow_s = 0.0
+        """What the sidecar takes to read a message, in seconds beside the delay."""
+        self.stalled_until = 0.0
+        """The sidecar reads nothing before."""
+
+    # ── the sidecar's end ──
+
+    def say(self, message: SidecarMessage) -> None:
+        """The sidecar writes a message."""
+        if self.dead:
+            return
+        if isinstance(message, Heartbeat):
+            # One in a thousand would matter for its delay; they are most of what a fleet says.
+            if self._stream is not None and self._plane.up:
+                self._plane.beat(self._stream, message)
+            return
+        if self._rng.randrange(CONVERTED_ONE_IN) == 0:
+            message = parse_sidecar_message(sidecar_message_to_proto(message).SerializeToString())
+        self._timeline.after(self._delay_s, partial(self._heard, message))
+
+    def hang_up(self) -> None:
+        """The sidecar ends the stream; the control plane learns of it, if anything arrives there."""
+        if not self.dead:
+            self._timeline.after(self._delay_s, self._lost)
+        self.dead = True
+
+    def cut(self) -> None:
+        """The connection is reset: both ends learn of it now."""
+        self.dead = True
+        self._lost()
+        self._member.line_ended(self, refused=False)
+
+    # ── the control plane's end ──
+
+    def _heard(self, message: SidecarMessage) -> None:
+        if self.dead or not self._plane.up:
+            return
+        if isinstance(message, Registration):
+            result = self._plane.register(message, self)
+            if isinstance(result, Refusal):
+                self._end(refused=True)
+            else:
+                self._stream = result
+                self._write()
+        elif self._stream is not None:
+            self._plane.receive(self._stream, message)
+
+    def put(self, message: ControlMessage) -> None:
+        """The control plane has something to say."""
+        self._mailbox.put(message)
+        self._write()
+
+    def close(self, reason: CloseReason) -> None:
+        """The control plane ends the stream."""
+        self._mailbox.close(reason)
+        self._write()
+
+    def _write(self) -> None:
+        while self._stream is not None and self._in_flight < IN_FLIGHT and not self.dead:
+            message = self._mailbox.take()
+            if message is None:
+                return
+            if isinstance(message, CloseReason):
+                self._lost()
+                self._end(refused=message in _NOT_ANSWERED_SOON)
+                return
+            many = isinstance(message, PeerSet) and len(message.peers) > FEW_PEERS
+            if self._rng.randrange(LARGE_CONVERTED_ONE_IN if many else CONVERTED_ONE_IN) == 0:
+                message = parse_control_message(control_message_to_proto(message).SerializeToString())
+            self._in_flight += 1
+            arrives = self._timeline.now + self._delay_s
+            self._read_at = max(arrives, self._read_at, self.stalled_until) + self.slow_s
+            self._timeline.at(self._read_at, partial(self._arrive, message))
+
+    def _arrive(self, message: ControlMessage) -> None:
+        self._in_flight -= 1
+        if self.dead:
+            return
+        self._member.hear(self, message)
+        self._write()
+
+    def _end(self, *, refused: bool) -> None:
+        self._timeline.after(self._delay_s, partial(self._member.line_ended, self, refused=refused))
+        self.dead = True
+
+    def _lost(self) -> None:
+        """The control plane's end of it ends."""
+        if self._stream is not None:
+            self._plane.disconnected(self._stream)
+            self._stream = None
+
+    @property
+    def superseded(self) -> int:
+        """Messages that a newer one replaced before they were written."""
+        return self._mailbox.superseded

@@ -1,0 +1,428 @@
+"""One sidecar: what is true of it, its end of the control stream, and what it holds."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from bench.fleetday.held import Held
+from bench.fleetday.line import Line
+from protos.histogram import Histogram
+from protos.model import (
+    PROTOCOL_VERSION,
+    Candidate,
+    CandidateKind,
+    CandidateSet,
+    InterfaceId,
+    InterfaceName,
+    LatencyReport,
+    MappingSet,
+    OutcomeReport,
+    PathReport,
+    PeerSet,
+    Registration,
+    Report,
+    ResourceKind,
+    Role,
+    ServiceSet,
+    SessionId,
+    Version,
+    Welcome,
+)
+from sidecar.core.control_session import Apply, ControlSession, ControlState
+
+if TYPE_CHECKING:
+    import random
+
+    from bench.fleetday.plane import Plane
+    from bench.fleetday.timeline import Timeline
+    from protos.model import Address, ControlMessage, NodeName
+
+NOTICES_S = (10.0, 40.0)
+"""Keepalives find a connection that died without a word within this time."""
+
+NOTHING = Report()
+_EMPTY = Histogram()
+
+
+def _histograms(rng: random.Random, count: int, middle_s: float) -> list[Histogram]:
+    made = []
+    for _ in range(count):
+        histogram = Histogram()
+        for _ in range(5):
+            histogram.record(rng.lognormvariate(0.0, 0.4) * middle_s)
+        made.append(histogram)
+    return made
+
+
+class Measurements:
+    """What robots may measure, drawn once for all of them."""
+
+    def __init__(self, rng: random.Random) -> None:
+        self.round_trips = _histograms(rng, 64, 0.04)
+        self.network = _histograms(rng, 64, 0.05)
+        self.processing = _histograms(rng, 16, 0.02)
+
+
+class Member:
+    """A robot or a cloud, from its first start on; over its restarts it is the same one."""
+
+    def __init__(
+        self,
+        name: NodeName,
+        role: Role,
+        number: int,
+        region: str,
+        *,
+        timeline: Timeline,
+        plane: Plane,
+        rng: random.Random,
+        measurements: Measurements,
+        measures_every_s: float,
+    ) -> None:
+        self.name = name
+        self.role = role
+        self.number = number
+        self._region = region
+        self._timeline = timeline
+        self._plane = plane
+        self._rng = rng
+        self._measurements = measurements
+        self._measures_every_s = measures_every_s
+        self.token = number.to_bytes(16, "big")
+        self.incarnation = 0
+        self.session_id = SessionId(0)
+        self.credential = b""
+        self.interfaces: dict[InterfaceName, tuple[Address, ...]] = {}
+        """Those that are there, with the addresses under which each is reached."""
+        self._ids: dict[InterfaceName, InterfaceId] = {}
+        self.candidates = CandidateSet()
+        self.services = ServiceSet()
+        self.alive = False
+        self.draining = False
+        self.held = Held()
+        self.session: ControlSession | None = None
+        self.line: Line | None = None
+        self.network_down = False
+        """New streams get nowhere."""
+        self.refuses = False
+        """It takes nothing that it is sent."""
+        self.slow = False
+        self.changed_at = timeline.now
+        """When anything that others are to know of it changed last."""
+        self.ill_at = timeline.now
+        """When it last had a reason not to hold what it should."""
+        self.dark: set[InterfaceName | tuple[InterfaceName, NodeName]] = set()
+        """Interfaces and pairs over which nothing arrives."""
+        self.lost_at: dict[InterfaceName, float] = {}
+        """Interfaces that went away, and when."""
+        self._paths_due = False
+        self._measure_at = 0.0
+        self._wake_at = float("inf")
+        self.complaints: list[str] = []
+        """What no sidecar should ever see."""
+        self.applied = 0
+        self.refused = 0
+
+    # ── life ──
+
+    def start(self, *, keeps_disk: bool) -> None:
+        """The process starts: a new session, which holds what is on the disk."""
+        if not keeps_disk:
+            self.held = Held()
+        self.incarnation += 1
+        self.session_id = SessionId(self.number << 20 | self.incarnation)
+        self.credential = b"%s/%d" % (self.name.encode(), self.incarnation)
+        self.alive, self.draining, self.refuses, self.slow = True, False, False, False
+        self.session = ControlSession(self.registration(), self._rng)
+        self.session.set_candidates(self.candidates)
+        self.session.set_services(self.services)
+        self._changed()
+        self._fell_ill()
+        self._schedule()
+
+    def registration(self) -> Registration:
+        """What it says of itself first."""
+        return Registration(
+            PROTOCOL_VERSION,
+            self.name,
+            self.role,
+            self.session_id,
+            self.token,
+            self.incarnation,
+            "day",
+            self.held.peers.version,
+            self.held.mapping_version,
+            self.credential,
+            self._region,
+        )
+
+    def crash(self, *, silently: bool) -> None:
+        """The process ends; `silently`: its host does, so that nobody hears of it before the lease ends."""
+        self.alive = False
+        self._wake_at = float("inf")
+        line, self.line = self.line, None
+        if line is not None:
+            line.dead |= silently
+            line.hang_up()
+        self._changed()
+        self._fell_ill()
+
+    def drain(self) -> None:
+        """Say goodbye; `crash` follows when what was in flight is done."""
+        assert self.session is not None
+        self.draining = True
+        self.session.drain()
+        self._changed()
+        self._say()
+
+    def renew_credential(self) -> None:
+        """A new certificate: the stream is opened anew with it."""
+        self.credential += b"+"
+        if self.session is not None and self.alive:
+            self.session.set_credential(self.credential)
+        self._changed()
+        self.reconnect()
+
+    def reconnect(self) -> None:
+        """End the stream for a better one."""
+        line, self.line = self.line, None
+        if line is not None and self.session is not None:
+            line.hang_up()
+            self._fell_ill()
+            self.session.closed(self._timeline.now, moved=True)
+            self._schedule()
+
+    def _changed(self) -> None:
+        self.changed_at = self._timeline.now
+
+    def _fell_ill(self) -> None:
+        self.ill_at = self._timeline.now
+
+    # ── what it is like ──
+
+    def set_interfaces(self, interfaces: dict[InterfaceName, tuple[Address, ...]]) -> None:
+        """Its interfaces come, go or get other addresses."""
+        now = self._timeline.now
+        for gone in self.interfaces.keys() - interfaces.keys():
+            self.lost_at[gone] = now
+        for back in interfaces.keys() - self.interfaces.keys():
+            self.lost_at.pop(back, None)
+            self._ids.setdefault(back, InterfaceId(len(self._ids)))
+        self.interfaces = interfaces
+        kinds = (CandidateKind.HOST, CandidateKind.SERVER_REFLEXIVE)
+        candidates = tuple(
+            Candidate(self._ids[interface], interface, kind, address)
+            for interface, addresses in interfaces.items()
+            for kind, address in zip(kinds, addresses, strict=True)
+        )
+        self.candidates = CandidateSet(candidates, (), self.candidates.serial + 1)
+        self._changed()
+        if self.alive and self.session is not None:
+            self.session.set_candidates(self.candidates)
+            self.paths_changed()
+            refused = self.session.refused
+            if refused is not None and self._put_in_force(refused.content) is None:
+                self.session.applied_late()
+            self._say()
+
+    def set_services(self, services: ServiceSet) -> None:
+        """It offers or carries others."""
+        self.services = services
+        self._changed()
+        if self.alive and self.session is not None:
+            self.session.set_services(services)
+            self._say()
+
+    def paths_changed(self) -> None:
+        """A path went up or down, which is reported at once."""
+        if self.role is Role.ROBOT and self.session is not None:
+            self._paths_due = True
+            self.session.report_at_once(self._timeline.now)
+            self._schedule()
+
+    # ── its stream ──
+
+    @property
+    def online(self) -> bool:
+        """Whether it believes that it has a stream which the control plane accepted."""
+        return self.alive and self.session is not None and self.session.state is ControlState.ONLINE
+
+    def _schedule(self) -> None:
+        assert self.session is not None
+        when = self.session.next_timer()
+        if self.alive and when < self._wake_at:
+            self._wake_at = when
+            self._timeline.at(when, self._wake)
+
+    def _wake(self) -> None:
+        now = self._timeline.now
+        session = self.session
+        if not self.alive or now < self._wake_at or session is None:
+            return
+        self._wake_at = float("inf")
+        if session.state is ControlState.OFFLINE:
+            if now >= session.retry_at:
+                self._open(session)
+        elif session.welcome_overdue(now):
+            self._give_up()
+        else:
+            session.handle_timer(now)
+            if session.report_due(now):
+                session.send_report(self._measure(now), now)
+            self._say()
+        self._schedule()
+
+    def _open(self, session: ControlSession) -> None:
+        session.opened(self._timeline.now)
+        self.line = Line(self._timeline, self._plane, self, self._rng)
+        self._fell_ill()
+        if self.network_down:
+            self.line.dead = True
+        elif not self._plane.up:
+            line = self.line
+            self._timeline.after(0.05, lambda: self.line_ended(line, refused=False))
+            return
+        if self.slow:
+            self.line.slow_s = self._rng.uniform(0.5, 5.0)
+        self._say()
+
+    def _give_up(self) -> None:
+        line, self.line = self.line, None
+        if line is not None:
+            line.hang_up()
+        assert self.session is not None
+        self.session.closed(self._timeline.now)
+
+    def _say(self) -> None:
+        if self.line is None or self.session is None:
+            return
+        for message in self.session.messages_to_send(self._timeline.now):
+            self.line.say(message)
+        self._schedule()
+
+    def line_ended(self, line: Line, *, refused: bool) -> None:
+        """The stream is over, as far as this end can tell."""
+        if line is not self.line or self.session is None:
+            return
+        self.line = None
+        self._fell_ill()
+        self.session.closed(self._timeline.now, refused=refused)
+        self._wake_at = float("inf")
+        self._schedule()
+
+    def break_line(self, *, half_open: bool) -> None:
+        """The connection breaks; `half_open`: without a word, and each end finds out in its own time."""
+        line = self.line
+        if line is None:
+            return
+        self._fell_ill()
+        if half_open:
+            line.dead = True
+            notices_s = self._rng.uniform(*NOTICES_S)
+            self._timeline.after(notices_s, lambda: self.line_ended(line, refused=False))
+        else:
+            line.cut()
+
+    def stall(self, seconds: float) -> None:
+        """It reads nothing for a while."""
+        if self.line is not None:
+            self.line.stalled_until = self._timeline.now + seconds
+
+    def hear(self, line: Line, message: ControlMessage) -> None:
+        """A message of the control plane."""
+        if line is not self.line or self.session is None:
+            return
+        before = self.session.state
+        event = self.session.receive(message, self._timeline.now)
+        if isinstance(event, Welcome):
+            if before is not ControlState.ONLINE:
+                self._fell_ill()
+                self.paths_changed()
+            # It may wake sooner than was planned for the longer patience of a registration.
+        elif isinstance(event, Apply):
+            self._apply(event)
+        elif not isinstance(message, Welcome):
+            self.complaints.append(f"{self.name}: a version that is not newer: {message.version}")
+        self._say()
+        self._schedule()
+
+    def _apply(self, apply: Apply) -> None:
+        assert self.session is not None
+        error = "cannot hold it now" if self.refuses else self._put_in_force(apply.content)
+        self.session.applied(apply, error)
+        if error is not None:
+            self.refused += 1
+            return
+        self.applied += 1
+        if isinstance(apply.content, PeerSet):
+            self.paths_changed()
+            refused = self.session.refused
+            if refused is not None and not self.refuses and self._put_in_force(refused.content) is None:
+                self.session.applied_late()
+
+    def _put_in_force(self, content: PeerSet | MappingSet) -> str | None:
+        if isinstance(content, PeerSet):
+            if content.version <= self.held.peers.version:
+                self.complaints.append(f"{self.name}: peers {content.version} after {self.held.peers.version}")
+            self.held.peers.apply(content)
+            return None
+        for mapping in content.services:
+            for assignment in (*mapping.assignments, *((mapping.explore,) if mapping.explore else ())):
+                if assignment.interface not in self.interfaces:
+                    return f"no interface {assignment.interface}"
+                if assignment.server not in self.held.peers.table:
+                    return f"no peer {assignment.server}"
+        self.held.mapping = content.services
+        self.held.mapping_version = Version(max(content.version, self.held.mapping_version))
+        return None
+
+    # ── what it measures ──
+
+    def is_up(self, interface: InterfaceName, server: NodeName) -> bool:
+        """Whether datagrams arrive."""
+        return interface not in self.dark and (interface, server) not in self.dark
+
+    def _measure(self, now: float) -> Report:
+        if self.role is Role.CLOUD:
+            return NOTHING
+        measures = now >= self._measure_at
+        if not measures and not self._paths_due:
+            return NOTHING
+        self._paths_due = False
+        rng, made = self._rng, self._measurements
+        paths = tuple(
+            PathReport(
+                interface,
+                server,
+                self.is_up(interface, server),
+                rng.choice(made.round_trips) if measures else _EMPTY,
+            )
+            for server in self.held.peers.table
+            for interface in self.interfaces
+        )
+        if not measures:
+            return Report(paths=paths)
+        self._measure_at = now + rng.expovariate(1.0 / self._measures_every_s)
+        latencies = tuple(
+            LatencyReport(
+                assignment.interface,
+                assignment.server,
+                mapping.service,
+                0,
+                rng.choice(made.network),
+                _EMPTY,
+                rng.choice(made.processing),
+                requests=5,
+                missed=int(rng.random() < 0.02),
+            )
+            for mapping in self.held.mapping
+            for assignment in mapping.assignments
+            if self.is_up(assignment.interface, assignment.server)
+        )
+        outcomes = tuple(OutcomeReport(mapping.service, ok=5) for mapping in self.held.mapping)
+        return Report(latencies, paths, outcomes)
+
+    def registration_as_told(self) -> Registration:
+        """Its registration without what it holds."""
+        return dataclasses.replace(self.registration(), peers_version=Version(0), mapping_version=Version(0))

@@ -1,0 +1,254 @@
+"""The control plane: its core, its matcher, its log of events, and what its loop does around them. It can be killed."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import TYPE_CHECKING
+
+from controlplane.core.control import ControlCore
+from controlplane.core.control_events import (
+    Close,
+    CloseReason,
+    CutOffNotice,
+    DepartureNotice,
+    NackNotice,
+    OffersRefusedNotice,
+    Send,
+    StreamLostNotice,
+    UnmetNotice,
+)
+from controlplane.core.registry import Refusal
+from controlplane.event_log import EventLog
+from controlplane.matcher import Matcher
+from controlplane.remembered import departures
+from protos.fleet_events import EventKind
+
+if TYPE_CHECKING:
+    import random
+    from pathlib import Path
+
+    from bench.fleetday.line import Line
+    from bench.fleetday.timeline import Timeline
+    from controlplane.core.control_events import Settings
+    from controlplane.core.picture import Picture
+    from controlplane.core.plan import Plan
+    from controlplane.core.policy import Policy
+    from controlplane.core.registry import StreamId
+    from protos.model import Heartbeat, NodeName, Registration, RemovalReason, SidecarMessage
+
+TURN_S = 0.02
+"""From one turn of the loop to the next at least, while one follows the other."""
+
+SOLVING_S = 0.001
+"""What the matcher takes for each block, in simulated time."""
+
+SOLVER_LIMIT_S = 1.0
+"""In real time; problems of a day are solved in a part of that."""
+
+FAILS_ONE_IN = 500
+"""Solvings that raise."""
+
+LOAD_EVERY_S = 10.0
+
+WALL_S = 1_800_000_000.0
+"""Seconds since 1970 when simulated time was 0."""
+
+
+class Plane:
+    """One control plane after the other, at the same address and with the same disk."""
+
+    def __init__(self, timeline: Timeline, settings: Settings, folder: Path, rng: random.Random) -> None:
+        self._timeline = timeline
+        self._settings = settings
+        self._folder = folder
+        self._rng = rng
+        self._core: ControlCore | None = None
+        self._matcher = Matcher()
+        self._lines: dict[StreamId, Line] = {}
+        self._turn_at = float("inf")
+        self._turned_at = 0.0
+        self.events: EventLog | None = None
+        self.policy: Policy | None = None
+        self.crl = b""
+        self.barred: set[NodeName] = set()
+        """Whose certificates are revoked, or have ended: the gate in front of gRPC lets them not in."""
+        self.busy = 0.2
+        self.clock_error_s = 0.0
+        """Of its wall clock."""
+        self.started_at = 0.0
+        self.starts = 0
+        self.solved = 0
+        self.sent = 0
+        self.received = 0
+
+    @property
+    def up(self) -> bool:
+        """Whether it runs."""
+        return self._core is not None
+
+    @property
+    def core(self) -> ControlCore:
+        """That of the one that runs."""
+        assert self._core is not None
+        return self._core
+
+    def _wall(self) -> float:
+        return WALL_S + self._timeline.now + self.clock_error_s
+
+    # ── life ──
+
+    def start(self) -> None:
+        """Start anew, with nothing but its configuration and its log of events."""
+        now = self._timeline.now
+        settings = dataclasses.replace(self._settings, policy=self.policy)
+        self._core = ControlCore(settings, version_epoch=int(self._wall()) << 20, now=now)
+        self._matcher = Matcher()
+        self.events = EventLog(self._folder, wall=self._wall, clock=lambda: self._timeline.now)
+        self._core.remember(*departures(self.events.events(), now_wall=self._wall(), now=now), now)
+        self._core.relay_revocations(self.crl)
+        self.started_at = now
+        self.starts += 1
+        self.events.record(EventKind.STARTED)
+        self._timeline.after(LOAD_EVERY_S, partial(self._follow_load, self._core))
+        self._settle()
+
+    def stop(self, *, orderly: bool) -> None:
+        """End: in order, or at once and without a word."""
+        lines = list(self._lines.values())
+        assert self.events is not None
+        if orderly:
+            self.events.record(EventKind.STOPPED)
+            for line in lines:
+                line.close(CloseReason.STOPPING)
+        self.events.close()
+        self._core = None
+        self._lines.clear()
+        self._turn_at = float("inf")
+        for line in lines:
+            if not line.dead:
+                line.cut()
+
+    # ── streams ──
+
+    def register(self, registration: Registration, line: Line) -> StreamId | Refusal:
+        """A stream begins."""
+        if registration.name in self.barred:
+            return Refusal.BAD_CREDENTIAL
+        result = self.core.register(registration, self._timeline.now)
+        assert self.events is not None
+        if isinstance(result, Refusal):
+            self.events.record(EventKind.REFUSED, registration.name, result.value)
+            return result
+        self.events.record(EventKind.CONNECTED, registration.name, "software day", role=registration.role)
+        self._lines[result] = line
+        self._settle()
+        return result
+
+    def receive(self, stream: StreamId, message: SidecarMessage) -> None:
+        """A message of a stream."""
+        self.received += 1
+        self.core.receive(stream, message, self._timeline.now)
+        self._settle()
+
+    def beat(self, stream: StreamId, heartbeat: Heartbeat) -> None:
+        """The same for what changes nothing but the lease; a new Welcome may be due with it."""
+        self.received += 1
+        self.core.receive(stream, heartbeat, self._timeline.now)
+        self._dispatch()
+
+    def disconnected(self, stream: StreamId) -> None:
+        """A stream ended."""
+        self._lines.pop(stream, None)
+        if self._core is not None:
+            self._core.disconnected(stream, self._timeline.now)
+            self._settle()
+
+    # ── what the operator does ──
+
+    def set_policy(self, policy: Policy | None) -> None:
+        """Another policy is in force from now on, if it runs; else from its start on."""
+        self.policy = policy
+        if self._core is not None:
+            self._core.set_policy(policy, self._timeline.now)
+            self._settle()
+
+    def revoke(self, name: NodeName, reason: RemovalReason, crl: bytes) -> None:
+        """A certificate is not good any more."""
+        self.barred.add(name)
+        self.crl = crl
+        if self._core is not None:
+            self._core.relay_revocations(crl)
+            self._core.part_with(name, reason, self._timeline.now)
+            self._settle()
+
+    # ── its loop ──
+
+    def _follow_load(self, core: ControlCore) -> None:
+        if core is self._core:
+            core.follow_load(self.busy)
+            self._timeline.after(LOAD_EVERY_S, partial(self._follow_load, core))
+
+    def _settle(self) -> None:
+        """Carry out what the core asks for, and be there when it wants its next turn."""
+        self._dispatch()
+        due = self._core.next_timer() if self._core is not None else None
+        if due is not None:
+            due = max(due, self._turned_at + TURN_S)
+            if due < self._turn_at:
+                self._turn_at = due
+                self._timeline.at(due, self._turn)
+
+    def _turn(self) -> None:
+        now = self._timeline.now
+        if now < self._turn_at or self._core is None:
+            return
+        self._turn_at = float("inf")
+        self._turned_at = now
+        core = self._core
+        core.handle_timer(now)
+        picture = core.start_solving(now)
+        if picture is not None:
+            self.solved += 1
+            plan = None
+            if self._rng.randrange(FAILS_ONE_IN):
+                plan = self._matcher.solve(picture.problem, time_limit_s=SOLVER_LIMIT_S, hint=core.plan)
+            took_s = 0.01 + SOLVING_S * len(picture.problem.blocks)
+            self._timeline.after(took_s, partial(self._solved, core, picture, plan))
+        self._settle()
+
+    def _solved(self, core: ControlCore, picture: Picture, plan: Plan | None) -> None:
+        if core is not self._core:
+            return
+        if plan is None:
+            core.solving_failed(self._timeline.now)
+        else:
+            core.solved(picture, plan, self._timeline.now)
+        self._settle()
+
+    def _dispatch(self) -> None:
+        core, events = self._core, self.events
+        if core is None or events is None:
+            return
+        while (event := core.next_event()) is not None:
+            match event:
+                case Send(stream=stream, message=message):
+                    self.sent += 1
+                    if stream in self._lines:
+                        self._lines[stream].put(message)
+                case Close(stream=stream, reason=reason):
+                    line = self._lines.pop(stream, None)
+                    if line is not None:
+                        line.close(reason)
+                case NackNotice(sidecar=name, nack=nack):
+                    events.record(EventKind.NACK, name, nack.error)
+                case OffersRefusedNotice(sidecar=name, services=services):
+                    events.record(EventKind.OFFERS_REFUSED, name, services[0])
+                case UnmetNotice(sidecar=name, services=services):
+                    events.record(EventKind.UNMET, name, services[0])
+                case DepartureNotice(sidecar=name, departure=gone):
+                    events.record(EventKind.DEPARTED, name, gone.text, role=gone.role, why=gone.why)
+                case StreamLostNotice(sidecar=name, role=role):
+                    events.record(EventKind.STREAM_LOST, name, role=role)
+                case CutOffNotice(sidecar=name, role=role, lifted=lifted):
+                    events.record(EventKind.REJOINED if lifted else EventKind.CUT_OFF, name, role=role)

@@ -1,0 +1,95 @@
+"""How large the tables of an object are: everything reachable from its attributes is counted, once.
+
+A table is a dictionary, list, set or deque; it is named by the attributes that lead to it, with `[]` for what a table
+holds. So tables of one kind, such as those of every robot, are counted together.
+"""
+
+from __future__ import annotations
+
+import enum
+import sys
+from collections import deque
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+OURS = ("bench.", "controlplane.", "protos.", "sidecar.", "tests.")
+"""Modules whose objects are looked into."""
+
+
+@dataclass(slots=True)
+class Sizes:
+    """What was counted."""
+
+    entries: dict[str, int] = field(default_factory=dict)
+    """Of the tables of each name."""
+    bytes: dict[str, int] = field(default_factory=dict)
+    """Of everything below each attribute of the object itself."""
+
+    @property
+    def total_bytes(self) -> int:
+        """Of all."""
+        return sum(self.bytes.values())
+
+
+def measure(root: object) -> Sizes:
+    """Count what is reachable from an object."""
+    sizes = Sizes()
+    seen = {id(root)}
+    for attribute, value in _attributes(root):
+        below = 0
+        waiting: list[tuple[object, str]] = [(value, attribute)]
+        while waiting:
+            one, name = waiting.pop()
+            if id(one) in seen or _is_shared(one):
+                continue
+            seen.add(id(one))
+            below += sys.getsizeof(one)
+            if isinstance(one, dict):
+                sizes.entries[name] = sizes.entries.get(name, 0) + len(one)
+                inner = name + "[]"
+                waiting.extend((key, inner) for key in one)
+                waiting.extend((element, inner) for element in one.values())
+            elif isinstance(one, (list, set, frozenset, deque)):
+                if not isinstance(one, frozenset):
+                    sizes.entries[name] = sizes.entries.get(name, 0) + len(one)
+                waiting.extend((element, name + "[]") for element in one)
+            elif isinstance(one, tuple):
+                waiting.extend((element, name) for element in one)
+            elif type(one).__module__.startswith(OURS):
+                waiting.extend((element, f"{name}.{inner}") for inner, element in _attributes(one))
+        sizes.bytes[attribute] = below
+    return sizes
+
+
+def _is_shared(one: object) -> bool:
+    """Whether it belongs to the program and to no table."""
+    return one is None or isinstance(one, (bool, type, enum.Enum, ModuleType)) or callable(one)
+
+
+def _attributes(one: object) -> Iterator[tuple[str, object]]:
+    yield from getattr(one, "__dict__", {}).items()
+    for kind in type(one).__mro__:
+        slots = getattr(kind, "__slots__", ())
+        for slot in (slots,) if isinstance(slots, str) else slots:
+            if slot not in ("__dict__", "__weakref__") and hasattr(one, slot):
+                yield slot, getattr(one, slot)
+
+
+def grown(samples: list[Sizes], *, share: float, slack: int, capped: dict[str, int]) -> list[str]:
+    """Tables that grew from the first half of the samples to the second by more than a share and some slack, or are
+    above their cap; those with a cap may grow up to it."""
+    found = []
+    half = len(samples) // 2
+    for name in sorted({name for sizes in samples for name in sizes.entries}):
+        counts = [sizes.entries.get(name, 0) for sizes in samples]
+        cap = capped.get(name)
+        if cap is not None:
+            if max(counts) > cap:
+                found.append(f"{name} is above its cap of {cap}: {counts}")
+        elif half and min(counts[half:]) > max(counts[:half]) * (1.0 + share) + slack:
+            found.append(f"{name} grows: {counts}")
+    return found
