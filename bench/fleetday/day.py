@@ -54,8 +54,15 @@ class Scale:
     hours: float = 24.0
     every_hours: float = 4.0
     """From one measurement of all tables to the next."""
-    moment_s: float = 15.0
-    """From one moment, with one to four events, to the next, in the mean."""
+    moment_s: float = 60.0
+    """From one moment, at which something happens, to the next, in the mean."""
+    events: int = 16
+    """The most that begins at one moment; how it ends is drawn apart."""
+    grid_s: float = 20.0
+    """What ends does so within a second after a multiple of this: it costs less to solve and publish for it together;
+    0: at any time."""
+    solving_s: float = 0.004
+    """What the matcher takes for each block in simulated time: as if it had a small part of a processor."""
     look_s: float = 300.0
     """From one comparison of the two sides to the next."""
     measures_s: float = 300.0
@@ -85,8 +92,8 @@ class Day:
         self.scale = scale
         self.timeline = Timeline(START)
         self._folder = folder
-        settings = matcher_settings or Settings(report_interval_s=0.8)
-        self.plane = Plane(self.timeline, settings, folder, self.rng)
+        settings = matcher_settings or Settings(report_interval_s=0.9)
+        self.plane = Plane(self.timeline, settings, folder, self.rng, solving_s=scale.solving_s)
         self.members: dict[NodeName, Member] = {}
         self.checker = Checker(self.plane, self.members)
         self.happened: Counter[str] = Counter()
@@ -176,7 +183,10 @@ class Day:
         return self.rng.choice(self._alive(role))
 
     def _later(self, least_s: float, most_s: float, action: Callable[[], None]) -> None:
-        self.timeline.after(self.rng.uniform(least_s, most_s), action)
+        when = self.timeline.now + self.rng.uniform(least_s, most_s)
+        if self.scale.grid_s and most_s > self.scale.grid_s:
+            when = math.ceil(when / self.scale.grid_s) * self.scale.grid_s + self.rng.random()
+        self.timeline.at(when, action)
 
     # ── what happens to a member ──
 
@@ -407,7 +417,7 @@ class Day:
 
     def _moment(self) -> None:
         if not self._quiet:
-            for _ in range(self.rng.randint(1, 4)):
+            for _ in range(self.rng.randint(1, self.scale.events)):
                 kind = self.rng.choices(self._kinds, self._weights)[0]
                 self.happened[kind.__name__] += 1
                 kind()

@@ -40,9 +40,6 @@ if TYPE_CHECKING:
 TURN_S = 0.02
 """From one turn of the loop to the next at least, while one follows the other."""
 
-SOLVING_S = 0.001
-"""What the matcher takes for each block, in simulated time."""
-
 SOLVER_LIMIT_S = 1.0
 """In real time; problems of a day are solved in a part of that."""
 
@@ -58,7 +55,8 @@ WALL_S = 1_800_000_000.0
 class Plane:
     """One control plane after the other, at the same address and with the same disk."""
 
-    def __init__(self, timeline: Timeline, settings: Settings, folder: Path, rng: random.Random) -> None:
+    def __init__(self, timeline: Timeline, settings: Settings, folder: Path, rng: random.Random, *, solving_s: float) -> None:
+        self._solving_s = solving_s
         self._timeline = timeline
         self._settings = settings
         self._folder = folder
@@ -213,7 +211,7 @@ class Plane:
             plan = None
             if self._rng.randrange(FAILS_ONE_IN):
                 plan = self._matcher.solve(picture.problem, time_limit_s=SOLVER_LIMIT_S, hint=core.plan)
-            took_s = 0.01 + SOLVING_S * len(picture.problem.blocks)
+            took_s = 0.01 + self._solving_s * len(picture.problem.blocks)
             self._timeline.after(took_s, partial(self._solved, core, picture, plan))
         self._settle()
 
