@@ -12,7 +12,7 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test fuzz lint format protos interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-matcher clean distclean
+.PHONY: help setup demo test fuzz lint format protos interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
 
 help: ## this list
 	@echo 'usage: make TARGET'
@@ -68,6 +68,9 @@ bench-insiders: setup ## two members of the fleet attack the others in every way
 
 bench-control: setup ## the control plane with 500, 1,000, 2,000 and 4,000 sidecars: a restart, steady load, a dead server (15 minutes)
 	@$(PY) -m bench control $(BENCH_ARGS)
+
+bench-fleet-day: setup ## 24 simulated hours of a fleet of 1,000 that joins, leaves, roams and loses servers: nothing drifts, nothing grows
+	@$(PY) -m bench fleet-day $(BENCH_ARGS)
 
 bench-matcher: setup ## the matcher's predictions against recorded networks, and its speed, and the real system while two servers swap load (half an hour)
 	@$(PY) -m bench matcher $(BENCH_ARGS)

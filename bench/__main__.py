@@ -7,6 +7,7 @@ examples:
   make bench-insiders BENCH_ARGS='--minutes 2'              a robot and a cloud of the fleet attack the others
   make bench-control BENCH_ARGS='--size 500'                a fleet's control streams at one control plane
   python -m bench alerts                                   what a real Alertmanager says when one server of five dies
+  make bench-fleet-day BENCH_ARGS='--members 100 --hours 6'  does anything drift or grow in a day?
   make bench-quick                                         15 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
   python -m bench report --out bench/results               verdicts, page and summary anew from the records of runs
@@ -27,6 +28,7 @@ from bench.dataplane import command as dataplane
 from bench.evaluation import command as evaluate
 from bench.evaluation import report_command as report
 from bench.evaluation import scenarios_command as scenarios
+from bench.fleetday import command as fleet_day
 from bench.insiders import command as insiders
 from bench.matcher import command as matcher
 
@@ -46,6 +48,9 @@ def main() -> int:
         commands.add_parser("control", help="the control plane with 500 to 4,000 sidecars: starts, load, a dead server")
     )
     alerts.add_arguments(commands.add_parser("alerts", help="what a real Alertmanager says when a server dies"))
+    fleet_day.add_arguments(
+        commands.add_parser("fleet-day", help="24 simulated hours of a fleet of 1,000: nothing drifts, nothing grows")
+    )
     matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
     scenarios.add_arguments(commands.add_parser("scenarios", help="what is replayed; the generator beside traces"))
     evaluate.add_arguments(commands.add_parser("evaluate", help="the system beside others on replayed networks"))
@@ -53,7 +58,7 @@ def main() -> int:
     given = (
         [sys.argv[1:]]
         if sys.argv[1:]
-        else [[name] for name in ("dataplane", "churn", "insiders", "control", "matcher", "evaluate")]
+        else [[name] for name in ("dataplane", "churn", "insiders", "control", "fleet-day", "matcher", "evaluate")]
     )
     runs = {
         "alerts": alerts.run,
@@ -61,6 +66,7 @@ def main() -> int:
         "control": control.run,
         "dataplane": dataplane.run,
         "evaluate": evaluate.run,
+        "fleet-day": fleet_day.run,
         "insiders": insiders.run,
         "matcher": matcher.run,
         "report": report.run,

@@ -11,10 +11,16 @@ from typing import TYPE_CHECKING
 from bench.fleetday.checks import Checker, is_healthy
 from bench.fleetday.member import Measurements, Member
 from bench.fleetday.plane import Plane
-from bench.fleetday.sizes import Sizes, measure
+from bench.fleetday.sizes import Sizes, grown, measure
 from bench.fleetday.timeline import Timeline
+from controlplane.core.compute import MAX_PROCESSING
 from controlplane.core.control_events import Settings
+from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED
+from controlplane.core.mapping_history import MAX_HISTORIES
 from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.publisher import MAX_GONE_SNAPSHOTS
+from controlplane.core.registry import MAX_REMEMBERED_REMOVALS
+from controlplane.core.restlessness import MAX_MEMBERS
 from protos.model import InterfaceName, NodeName, RemovalReason, Role, ServiceName, ServiceOffer, ServiceSet, ServiceUse
 
 if TYPE_CHECKING:
@@ -30,6 +36,10 @@ START = 1000.0
 QUIET_S = 240.0
 """Before each measurement nothing new happens for so long: longer than any spell, lease and settling together."""
 
+RESTARTS_UNTIL = 0.3
+"""Of the day: one control plane runs through the rest of it, so that what grows does so for long; it is killed at the
+end once more."""
+
 SPELL_S = (20.0, 100.0)
 """How long somebody refuses, reads slowly or has no network."""
 
@@ -37,6 +47,21 @@ SERVICES = tuple(ServiceName(name) for name in ("/plan", "/detect", "/grasp", "/
 TYPE = "nav_msgs/srv/GetPlan"
 DEADLINES_S = (0.125, 0.25, 0.5)
 WLAN, WWAN, WIRED = (InterfaceName(name) for name in ("wlan0", "wwan0", "eth0"))
+
+GROWTH_SHARE, GROWTH_SLACK = 0.3, 20
+"""By which a table may be larger in the second half of a day than in the first, beside a fifth of an entry for each
+member: who is there differs from hour to hour."""
+
+CAPPED = {
+    "departed._departures": MAX_DEPARTED,
+    "departed._last_known": MAX_EXPLAINED,
+    "history._histories": MAX_HISTORIES,
+    "restlessness._shares": MAX_MEMBERS,
+    "registry._removals": MAX_REMEMBERED_REMOVALS,
+    "_publisher._gone": MAX_GONE_SNAPSHOTS,
+    "estimator._compute._servers": MAX_PROCESSING,
+}
+"""What is remembered of those who are gone, for as many."""
 
 POLICIES: tuple[Policy | None, ...] = (
     None,
@@ -76,6 +101,8 @@ class Sample:
     """The control plane at one time, after a quiet while."""
 
     at_h: float
+    run: int
+    """Of the control plane, which was started so often."""
     registered: int
     judged: int
     sizes: Sizes
@@ -104,7 +131,8 @@ class Day:
         self._address = 0
         self._quiet = False
         self._crls = 0
-        self._leaving: set[NodeName] = set()
+        self.judged_at_last = 0
+        """Sidecars judged after the control plane was killed at the end of the day."""
         weights: tuple[tuple[int, Callable[[], None]], ...] = (
             (25, self.rebinds),
             (15, self.loses_an_interface),
@@ -375,7 +403,13 @@ class Day:
             return
         self.happened["change_policy"] += 1
         self._set_policy(self.rng.choice(POLICIES[1:]))
-        self._later(300.0, 900.0, lambda: self._set_policy(None))
+        self._later(300.0, 900.0, self._end_policy)
+
+    def _end_policy(self) -> None:
+        if self._quiet:
+            self._later(QUIET_S, 2 * QUIET_S, self._end_policy)
+        else:
+            self._set_policy(None)
 
     def _set_policy(self, policy: Policy | None) -> None:
         self.checker.policy_at = self.timeline.now
@@ -408,9 +442,13 @@ class Day:
             self._later(0.0, 60.0, lambda role=role: self._join(role))  # type: ignore[misc]  # bound in its own turn
         length_s = self.scale.hours * HOUR_S
         spread = self.scale.restarts
-        for kind, count in ((self.restart_plane, spread), (self.change_policy, spread), (self.outage, spread // 2)):
+        for kind, count, last in (
+            (self.restart_plane, spread, RESTARTS_UNTIL),
+            (self.change_policy, spread, 1.0),
+            (self.outage, spread // 2, 1.0),
+        ):
             for _ in range(count):
-                self.timeline.at(START + self.rng.uniform(0.02, 0.97) * length_s, kind)
+                self.timeline.at(START + self.rng.uniform(0.02, last) * length_s, kind)
         self.timeline.after(300.0 if self.scale.hours > 2.0 else 100.0, self._moment)
         self.timeline.after(self.scale.look_s, self._look)
         self._busy()
@@ -456,6 +494,22 @@ class Day:
             self.timeline.run(ends)
             self._quiet = False
             self._sample()
+        self._quiet = True
+        self.plane.stop(orderly=False)
+        self.timeline.after(2.0, self.plane.start)
+        self.timeline.run(self.timeline.now + QUIET_S)
+        self.judged_at_last = self.checker.look(self.timeline.now)
+
+    def grown(self) -> list[str]:
+        """Tables of the control plane that ran longest which grew with time."""
+        run = self.plane.starts - 1
+        sizes = [sample.sizes for sample in self.samples if sample.run == run]
+        return grown(sizes, share=GROWTH_SHARE, slack=GROWTH_SLACK + self.scale.members // 5, capped=CAPPED)
+
+    @property
+    def last_members(self) -> int:
+        """Sidecars that are there at the end."""
+        return len(self._alive())
 
     def _sample(self) -> None:
         now = self.timeline.now
@@ -464,6 +518,7 @@ class Day:
         assert events is not None
         sample = Sample(
             at_h=(now - START) / HOUR_S,
+            run=self.plane.starts,
             registered=len(self.plane.core.registry),
             judged=judged,
             sizes=measure(self.plane.core),

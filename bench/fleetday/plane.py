@@ -235,9 +235,8 @@ class Plane:
                     if stream in self._lines:
                         self._lines[stream].put(message)
                 case Close(stream=stream, reason=reason):
-                    line = self._lines.pop(stream, None)
-                    if line is not None:
-                        line.close(reason)
+                    if stream in self._lines:
+                        self._lines[stream].close(reason)
                 case NackNotice(sidecar=name, nack=nack):
                     events.record(EventKind.NACK, name, nack.error)
                 case OffersRefusedNotice(sidecar=name, services=services):

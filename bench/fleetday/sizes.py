@@ -7,6 +7,7 @@ holds. So tables of one kind, such as those of every robot, are counted together
 from __future__ import annotations
 
 import enum
+import math
 import sys
 from collections import deque
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 OURS = ("bench.", "controlplane.", "protos.", "sidecar.", "tests.")
 """Modules whose objects are looked into."""
@@ -79,17 +80,23 @@ def _attributes(one: object) -> Iterator[tuple[str, object]]:
                 yield slot, getattr(one, slot)
 
 
-def grown(samples: list[Sizes], *, share: float, slack: int, capped: dict[str, int]) -> list[str]:
-    """Tables that grew from the first half of the samples to the second by more than a share and some slack, or are
-    above their cap; those with a cap may grow up to it."""
+def grown(samples: list[Sizes], *, share: float, slack: int, capped: Mapping[str, int]) -> list[str]:
+    """Tables that grew from the first half of the samples to the second by more than a share and some slack.
+
+    Those with a cap may grow up to it; of what they hold in turn it is judged how much that is for each entry.
+    """
     found = []
     half = len(samples) // 2
     for name in sorted({name for sizes in samples for name in sizes.entries}):
         counts = [sizes.entries.get(name, 0) for sizes in samples]
-        cap = capped.get(name)
-        if cap is not None:
-            if max(counts) > cap:
-                found.append(f"{name} is above its cap of {cap}: {counts}")
-        elif half and min(counts[half:]) > max(counts[:half]) * (1.0 + share) + slack:
-            found.append(f"{name} grows: {counts}")
+        outer = next((table for table in capped if name == table or name.startswith(table + "[]")), None)
+        if outer == name:
+            if max(counts) > capped[name]:
+                found.append(f"{name} is above its cap of {capped[name]}: {counts}")
+            continue
+        each = [sizes.entries[outer] if outer and sizes.entries.get(outer) else 1 for sizes in samples]
+        shares = [count / holders for count, holders in zip(counts, each, strict=True)]
+        most = max(shares[:half], default=math.inf) * (1.0 + share) + (slack if outer is None else 1.0)
+        if min(shares[half:]) > most:
+            found.append(f"{name} grows: {counts}" + ("" if outer is None else f", in {each} entries of {outer}"))
     return found
