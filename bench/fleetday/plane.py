@@ -221,7 +221,7 @@ class Plane:
         if plan is None:
             core.solving_failed(self._timeline.now)
         else:
-            core.solved(picture, plan, self._timeline.now)
+            core.solved(core.settle(picture, plan, self._timeline.now), self._timeline.now)
         self._settle()
 
     def _dispatch(self) -> None:
