@@ -342,7 +342,8 @@ class Member:
             # It may wake sooner than was planned for the longer patience of a registration.
         elif isinstance(event, Apply):
             self._apply(event)
-        elif not isinstance(message, Welcome):
+        elif not isinstance(message, Welcome) and message.version <= self.session.version(_resource_of(message)):
+            # What is newer and yet not taken are changes upon a set that it refused: it says so, and gets all of it.
             self.complaints.append(f"{self.name}: a version that is not newer: {message.version}")
         self._say()
         self._schedule()
@@ -426,3 +427,7 @@ class Member:
     def registration_as_told(self) -> Registration:
         """Its registration without what it holds."""
         return dataclasses.replace(self.registration(), peers_version=Version(0), mapping_version=Version(0))
+
+
+def _resource_of(message: PeerSet | MappingSet) -> ResourceKind:
+    return ResourceKind.PEERS if isinstance(message, PeerSet) else ResourceKind.MAPPING
