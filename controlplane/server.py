@@ -29,7 +29,6 @@ from controlplane.tls_gate import TlsGate
 from protos.clock_floor import ClockFloor
 from protos.fleet_events import EventKind
 from protos.host_port import split_host_port
-from protos.plr.v1 import admin_pb2_grpc
 from protos.version_option import describe
 
 if TYPE_CHECKING:

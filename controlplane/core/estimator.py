@@ -82,8 +82,16 @@ the least recently reported goes."""
 MAX_OUTCOMES_PER_ROBOT = 1024
 """Services kept of one robot, the least recently reported goes: as many as it can carry."""
 
-MAX_HISTOGRAMS = 65_536
-"""Histograms kept of all robots (3 kB each): beyond that, the robot that reported least recently is forgotten."""
+MAX_HISTOGRAMS = 131_072
+"""Histograms kept of all robots: 4,096 robots with 3 interfaces and 5 servers need 122,880. Beyond that, robots are
+forgotten that have not reported for `LIVE_S`, the longest silent first; where there are none, robots that have their
+equal share get no new ones. So nobody who reports loses what another one brings."""
+
+MAX_ROBOTS = 8192
+"""Robots kept, those gone for a while among them: twice as many as may be registered."""
+
+LIVE_S = 60.0
+"""A robot that has reported within this time is not forgotten for another one: several of the longest intervals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +140,7 @@ class _Robot:
             "network",
             "outcomes",
             "penalties",
+            "reported_at",
             "services",
             "trials",
             "troubles",
@@ -152,6 +161,7 @@ class _Robot:
         """Worked out, by service and deadline ..."""
         self.troubles_at = (0, 0.0)
         """... from so many reports of all robots, at this time."""
+        self.reported_at = 0.0
 
 
 def _usual_sizes(tables: _Robot, service: ServiceName) -> tuple[tuple[int, float], ...]:
@@ -191,7 +201,10 @@ class Estimator:
         if tables is None:
             tables = self._robots[robot] = _Robot(self._half_life_s)
         self._robots.move_to_end(robot)
+        tables.reported_at = now
         network = tables.network
+        self._forget_silent(robot, now)
+        network.most = MAX_HISTOGRAMS // len(self._robots) if self._histograms >= MAX_HISTOGRAMS else MAX_HISTOGRAMS
         self._histograms -= len(network)
         dropped_before = network.dropped
         changed = tables.penalties.replace(report.penalties, now)
@@ -214,11 +227,17 @@ class Estimator:
             self._late_fate(tables, outcome.service, now).add_requests(outcome.ok + bad, bad, now)
         self._dropped += network.dropped - dropped_before
         self._histograms += len(network)
-        while self._histograms > MAX_HISTOGRAMS and len(self._robots) > 1:
-            _, forgotten = self._robots.popitem(last=False)
-            self._histograms -= len(forgotten.network)
-            self._dropped += len(forgotten.network)
         return changed
+
+    def _forget_silent(self, robot: NodeName, now: float) -> None:
+        """Make room for this robot's report, as far as there are robots that have been silent for long."""
+        while self._histograms >= MAX_HISTOGRAMS or len(self._robots) > MAX_ROBOTS:
+            name, silent = next(iter(self._robots.items()))
+            if name == robot or now - silent.reported_at < LIVE_S:
+                return
+            del self._robots[name]
+            self._histograms -= len(silent.network)
+            self._dropped += len(silent.network)
 
     def _merge_latency(self, robot: NodeName, tables: _Robot, latency: LatencyReport, now: float) -> bool:
         tables.network.merge_requests(latency, now)

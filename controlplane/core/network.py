@@ -125,8 +125,10 @@ class RobotNetwork:
         self._size_costs: dict[tuple[InterfaceName, int], float] = {}
         self._fresh = False
         """Whether these three follow from what was merged."""
+        self.most = MAX_PATHS + MAX_CELLS
+        """No new ones beyond so many histograms."""
         self.dropped = 0
-        """Entries evicted because a table was full."""
+        """Entries evicted, or not taken, because a table was full."""
 
     def __len__(self) -> int:
         """Histograms kept."""
@@ -138,6 +140,8 @@ class RobotNetwork:
         key = (path.interface, path.server)
         state = known = self.paths.get(key)
         if state is None:
+            if not self._has_room():
+                return False
             state = PathState(path.up, FadedHistogram(self._half_life_s, now), FadedCount(self._half_life_s, now), path)
         self._keep(self.paths, key, state, MAX_PATHS)
         changed = known is None or known.up != path.up
@@ -158,9 +162,20 @@ class RobotNetwork:
         if clock is None:
             clock = self._clocks[report.size_class] = HeardClock(now)
         clock.hear(now)
-        cell = self._cells.get(key) or FadedHistogram(self._half_life_s, now, clock)
+        cell = self._cells.get(key)
+        if cell is None:
+            if not self._has_room():
+                return
+            cell = FadedHistogram(self._half_life_s, now, clock)
         self._keep(self._cells, key, cell, MAX_CELLS)
         cell.add(report.network, now, report.called_off)
+
+    def _has_room(self) -> bool:
+        """Whether one more histogram may be kept; counted if not."""
+        if len(self) < self.most:
+            return True
+        self.dropped += 1
+        return False
 
     def _keep(self, table: OrderedDict[K, V], key: K, value: V, limit: int) -> None:
         table[key] = value
@@ -182,9 +197,7 @@ class RobotNetwork:
         cell = self._cells.get((interface, server, size_class))
         return cell.scaled(now, sample) if cell is not None else Histogram()
 
-    def witnesses(
-        self, interface: InterfaceName, server: NodeName, size_class: int, now: float
-    ) -> Iterator[Witness]:
+    def witnesses(self, interface: InterfaceName, server: NodeName, size_class: int, now: float) -> Iterator[Witness]:
         """All that tells what requests of the class would take from the interface to the server."""
         self._refresh(now)
         key = (interface, server)

@@ -10,7 +10,7 @@ import pytest
 from controlplane.core import compute as compute_module
 from controlplane.core import estimator as estimator_module
 from controlplane.core import network as network_module
-from controlplane.core.estimator import Estimator
+from controlplane.core.estimator import LIVE_S, Estimator
 from protos.model import (
     Assignment,
     InterfaceJointReport,
@@ -246,14 +246,37 @@ def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypa
     assert estimator.path_up(ROBOT, WLAN, NodeName("cloud-5")) is True
 
 
-def test_the_robot_that_reported_least_recently_is_forgotten_first(
+@pytest.mark.audit("ops-17")
+def test_of_a_full_table_silent_robots_are_forgotten_the_longest_silent_first(
     estimator: Estimator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(estimator_module, "MAX_HISTOGRAMS", 3)
-    for name in ("one", "two", "three"):
-        estimator.merge(NodeName(name), Report(paths=(path("wlan0", "cloud-a"),)), 0.0)
-    estimator.merge(NodeName("one"), Report(paths=(path("wwan0", "cloud-a"),)), 1.0)
+    for number, name in enumerate(("one", "two", "three")):
+        estimator.merge(NodeName(name), Report(paths=(path("wlan0", "cloud-a"),)), float(number))
+    estimator.merge(NodeName("one"), Report(), 50.0)
+    now = 2.0 + LIVE_S
+    estimator.merge(NodeName("one"), Report(paths=(path("wwan0", "cloud-a"),)), now)
     assert estimator.path_up(NodeName("two"), WLAN, A) is None
-    assert estimator.path_up(NodeName("one"), WLAN, A) is True
+    assert estimator.path_up(NodeName("one"), InterfaceName("wwan0"), A) is True
     assert estimator.path_up(NodeName("three"), WLAN, A) is True
     assert estimator.dropped == 1
+
+
+@pytest.mark.audit("ops-17")
+def test_a_full_table_forgets_nobody_in_turn(estimator: Estimator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimator_module, "MAX_HISTOGRAMS", 40)
+    robots = [NodeName(f"robot-{number}") for number in range(8)]
+    servers = [f"cloud-{number}" for number in range(20)]
+    for turn in range(5):
+        # One of them reports on more than all the others together.
+        for number, robot in enumerate(robots):
+            told = servers if number == 0 else servers[:3]
+            estimator.merge(robot, Report(paths=tuple(path("wlan0", server) for server in told)), float(turn))
+    for robot in robots:
+        assert estimator.path_up(robot, WLAN, NodeName("cloud-2")) is True
+    assert estimator._histograms == sum(len(tables.network) for tables in estimator._robots.values()) <= 2 * 40
+    # A newcomer gets its share.
+    estimator.merge(NodeName("new"), Report(paths=tuple(path("wlan0", server) for server in servers)), 5.0)
+    assert estimator.path_up(NodeName("new"), WLAN, NodeName("cloud-3")) is True
+    assert estimator.path_up(NodeName("new"), WLAN, NodeName("cloud-4")) is None
+    assert estimator.dropped
