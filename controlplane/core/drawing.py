@@ -34,6 +34,9 @@ SLICE_PAIRS = 40
 KEPT_PAIRS = 8
 """Pairs whose estimates are kept take as long as one that is estimated."""
 
+LOOKED_AT_ONCE = 200
+"""Robots of which it is found out in one go who could serve them: some milliseconds."""
+
 FEW_ROBOTS = 16
 """Robots that are all estimated anew when they are to be drawn at once: of more, those only that have to be."""
 
@@ -83,6 +86,21 @@ class _Drawn:
 
 
 @dataclass(frozen=True, slots=True)
+class _LookedAt:
+    """What a robot, as it was, could call where."""
+
+    robot: Sidecar
+    uses: tuple[tuple[BlockKey, _Inputs], ...]
+
+    def holds_for(self, robot: Sidecar) -> bool:
+        """Whether nothing of this has changed with the robot; who is equal but not the same is looked at again."""
+        was = self.robot
+        return robot is was or (
+            robot.services is was.services and robot.candidates is was.candidates and robot.labels is was.labels
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class _Frame:
     """Who is there, and what each robot could call where."""
 
@@ -100,6 +118,12 @@ class Drawing:
         self._capacity = default_capacity_interfaces
         self._objective = objective
         self._frame: _Frame | None = None
+        self._looking: Iterator[None] | None = None
+        """Makes the next frame."""
+        self._around: list[object] = []
+        """The policy, and what matters of the clouds, when ..."""
+        self._looked_at: dict[NodeName, _LookedAt] = {}
+        """... these robots were looked at last."""
         self._drawn: dict[BlockKey, _Drawn] = {}
         self._at: dict[NodeName, float] = {}
         """When each robot was drawn last."""
@@ -117,7 +141,7 @@ class Drawing:
 
     def members_changed(self) -> None:
         """A sidecar, its addresses or services, or the policy changed."""
-        self._frame = None
+        self._frame = self._looking = None
 
     def robot_changed(self, robot: NodeName, *, anew: bool = True) -> None:
         """Draw this robot in the next picture whatever it costs.
@@ -154,8 +178,13 @@ class Drawing:
         `sidecars` are those ready. To be called again until it returns True, with other work in between.
         """
         if self._frame is None:
-            self._put_back()
-            self._frame = self._look_around(sidecars, permits)
+            if self._looking is None:
+                self._put_back()
+                self._looking = self._look_around(sidecars, permits)
+            for _ in self._looking:
+                return False
+            self._looking = None
+        assert self._frame is not None
         if self._queue is None:
             routine = self._next_routine(self._frame, now) if self._routine else []
             self._queue = [(name, True) for name in routine]
@@ -192,23 +221,38 @@ class Drawing:
         notes = {key: self._drawn[key].notes for key in keys}
         return Picture(Problem(blocks, frame.fleet_capacity, self._objective), notes)
 
-    def _look_around(self, sidecars: Iterable[Sidecar], permits: Permits) -> _Frame:
+    def _look_around(self, sidecars: Iterable[Sidecar], permits: Permits) -> Iterator[None]:
+        """Find out who could call what where, in several goes; at last it is the frame.
+
+        Of robots that are as before, while clouds and policy are, what was found out before holds. So who is
+        interrupted by the next change has got on.
+        """
         clouds: dict[tuple[ServiceName, str], list[Sidecar]] = {}
         fleet_capacity: dict[FleetKey, int] = {}
         robots: list[Sidecar] = []
-        for sidecar in sorted(sidecars, key=lambda sidecar: sidecar.name):
+        around: list[object] = [permits]
+        for sidecar in sorted(sidecars, key=lambda sidecar: sidecar.registration.name):
             if sidecar.role is Role.ROBOT:
                 robots.append(sidecar)
                 continue
             if sidecar.draining:
                 continue
+            around.append((sidecar.registration, sidecar.services, sidecar.offered))
             for offer in sidecar.offers:
                 clouds.setdefault((offer.name, offer.type), []).append(sidecar)
                 if offer.capacity:
                     fleet_capacity[FleetKey(sidecar.name, offer.name)] = offer.capacity
+        if around != self._around:
+            self._around = around
+            self._looked_at.clear()
         callable_by: dict[tuple[Group, ServiceName, str], tuple[Sidecar, ...]] = {}
         uses: dict[NodeName, tuple[tuple[BlockKey, _Inputs], ...]] = {}
+        looked_at = 0
         for robot in robots:
+            known = self._looked_at.get(robot.name)
+            if known is not None and known.holds_for(robot):
+                uses[robot.name] = known.uses
+                continue
             group = permits.group(robot.name)
             found = []
             for use in robot.uses:
@@ -220,17 +264,24 @@ class Drawing:
                     (BlockKey(robot.name, use.name), _inputs(robot, use, offering, callable_by[kind], self._path_rules))
                 )
             uses[robot.name] = tuple(found)
+            self._looked_at[robot.name] = _LookedAt(robot, uses[robot.name])
+            if any(key not in self._drawn or self._drawn[key].inputs != inputs for key, inputs in found):
+                self.robot_changed(robot.name, anew=False)
+            looked_at += 1
+            if looked_at % LOOKED_AT_ONCE == 0:
+                yield
         self._forget_others(uses)
-        for name, wanted in uses.items():
-            if any(key not in self._drawn or self._drawn[key].inputs != inputs for key, inputs in wanted):
-                self.robot_changed(name, anew=False)
-        return _Frame(uses, fleet_capacity)
+        self._frame = _Frame(uses, fleet_capacity)
 
     def _forget_others(self, uses: Mapping[NodeName, tuple[tuple[BlockKey, _Inputs], ...]]) -> None:
         keys = {key for wanted in uses.values() for key, _ in wanted}
-        self._drawn = {key: drawn for key, drawn in self._drawn.items() if key in keys}
-        self._at = {name: at for name, at in self._at.items() if name in uses}
-        self._surprise = {name: surprise for name, surprise in self._surprise.items() if name in uses}
+        for drawn in [key for key in self._drawn if key not in keys]:
+            del self._drawn[drawn]
+        tables: tuple[dict[NodeName, float] | dict[NodeName, _LookedAt], ...]
+        tables = self._at, self._surprise, self._looked_at
+        for table in tables:
+            for gone in [name for name in table if name not in uses]:
+                del table[gone]
 
     def _next_routine(self, frame: _Frame, now: float) -> list[NodeName]:
         """Robots to draw because of reports, those last that are drawn first."""
