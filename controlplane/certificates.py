@@ -14,12 +14,14 @@ from protos.revocation_views import revocation_set
 from protos.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from controlplane.loop import ControlLoop
     from controlplane.metrics import Metrics
     from controlplane.tls_gate import TlsGate
     from protos.clock_floor import ClockFloor
+    from protos.model import NodeName
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +37,12 @@ def load_own_files(directory: Path) -> TlsFiles:
 
 
 class CertificateKeeper:
-    """Looks for new files and for the end of certificates, and tells the gate and the loop."""
+    """Looks for new files and for the end of certificates, and has the gate and the loop judge members anew.
+
+    To check a certificate takes some tenth of a millisecond, and a change concerns everybody: members are judged in
+    turns of the loop, those first whom a list names. With each its stream first: who is revoked shall hear so from
+    gRPC before its connections are cut. Who comes meanwhile is judged by the new files already.
+    """
 
     def __init__(self, files: TlsFiles, gate: TlsGate, loop: ControlLoop, metrics: Metrics, clock: ClockFloor) -> None:
         """`clock` is the gate's too."""
@@ -44,36 +51,68 @@ class CertificateKeeper:
         self._gate = gate
         self._loop = loop
         self._metrics = metrics
+        self._unjudged: dict[NodeName, None] = {}
+        """In the order in which they will be."""
+        self._something_to_judge = asyncio.Event()
         metrics.own_certificate(files.identity, files.trust.lists())
         self._relay_revocations(files)
 
     async def run(self) -> NoReturn:
         """Run until cancelled."""
-        while True:
-            files = self._watch.poll()
-            if files is not None:
-                self._take(files)
-            self._clock.note_lists(self._watch.current.trust)
-            self._clock.note(self._watch.current.identity.not_before)
-            now = self._clock.now()
-            self._loop.end_expired(self._watch.current.trust, now)
-            self._gate.end_expired(now)
-            await asyncio.sleep(POLL_INTERVAL_S)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._review())
+            while True:
+                files = self._watch.poll()
+                if files is not None:
+                    self._take(files)
+                trust = self._watch.current.trust
+                self._clock.note_lists(trust)
+                self._clock.note(self._watch.current.identity.not_before)
+                now = self._clock.now()
+                self._judge(dict.fromkeys([*self._loop.ended(now), *self._gate.ended(now)]))
+                await asyncio.sleep(POLL_INTERVAL_S)
+        raise AssertionError("it ends by being cancelled")
 
     def _take(self, files: TlsFiles) -> None:
         if files.identity.role is not IdentityRole.CONTROL_PLANE:
             log.error("the new certificate is a %s's: the old one stays in use", files.identity.role.value)
             return
-        # The streams first: who is revoked shall hear so from gRPC before the connection is cut.
-        self._loop.review(files.trust, self._clock.now())
         self._relay_revocations(files)
         try:
             self._gate.use(files)
         except ssl.SSLError as error:
             log.error("the new certificate is not used, the old one stays: %s", error)
-            return
-        self._metrics.own_certificate(files.identity, files.trust.lists())
-        log.info("took new certificate files from %s", files.directory)
+        else:
+            self._metrics.own_certificate(files.identity, files.trust.lists())
+            log.info("took new certificate files from %s", files.directory)
+        everybody = [*self._loop.serials(), *self._gate.serials()]
+        named = dict.fromkeys(name for name, serial in everybody if files.trust.revokes(serial))
+        # Those whom the change before still concerns come before those who are judged already: however often the files
+        # change, everybody's turn comes.
+        self._judge(named | self._unjudged | dict.fromkeys(name for name, _ in everybody))
+
+    def _judge(self, names: dict[NodeName, None]) -> None:
+        """Judge these, and then whoever else is still to be judged."""
+        if names:
+            self._unjudged = names | self._unjudged
+            self._something_to_judge.set()
+
+    async def _review(self) -> NoReturn:
+        while True:
+            await self._something_to_judge.wait()
+            self._something_to_judge.clear()
+            async for _ in self._loop.turns.each(self._next_unjudged(), self._review_one):
+                pass
+
+    def _next_unjudged(self) -> Iterator[NodeName]:
+        while self._unjudged:
+            name = next(iter(self._unjudged))
+            del self._unjudged[name]
+            yield name
+
+    def _review_one(self, name: NodeName) -> None:
+        self._loop.review(name, self._watch.current.trust, self._clock.now())
+        self._gate.review(name)
 
     def _relay_revocations(self, files: TlsFiles) -> None:
         crl = files.crl_pem or b""

@@ -27,6 +27,7 @@ from controlplane.core.plan import Plan
 from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
+from controlplane.earliest_end import EarliestEnd
 from controlplane.fleet_metrics import MAX_GONE, Fleet
 from controlplane.mailbox import Mailbox
 from controlplane.remembered import departures
@@ -130,6 +131,7 @@ class ControlLoop:
         self._core.remember(*departures(events.events(), now_wall=time.time(), now=now), now)
         self._mailboxes: dict[StreamId, Mailbox] = {}
         self._callers: dict[NodeName, Caller] = {}
+        self._earliest_end = EarliestEnd()
         self._superseded = 0
         self.turns = Turns()
         """For whatever takes long."""
@@ -161,6 +163,7 @@ class ControlLoop:
             return result
         if caller is not None:
             self._callers[registration.name] = caller
+            self._earliest_end.note(caller.identity.not_after)
         log.info(
             "%s (%s, incarnation %d, software %s) connected",
             registration.name,
@@ -299,25 +302,31 @@ class ControlLoop:
 
     # ── for who watches the certificates ──
 
-    def review(self, trust: Trust, now_wall: float) -> None:
-        """Part with the sidecars whose certificates are not good any more; `now_wall` is seconds since 1970."""
-        for name, caller in list(self._callers.items()):
-            try:
-                trust.check(caller.certificate, now_wall)
-            except CertificateError as error:
-                self._part_with(name, error)
-        self._dispatch()
+    def serials(self) -> list[tuple[NodeName, int]]:
+        """Who has proved who it is, and the serial number of the certificate that did."""
+        return [(name, caller.identity.serial) for name, caller in self._callers.items()]
+
+    def review(self, name: NodeName, trust: Trust, now_wall: float) -> None:
+        """Part with a sidecar whose certificate is not good any more; `now_wall` is seconds since 1970."""
+        caller = self._callers.get(name)
+        if caller is None:
+            return
+        try:
+            trust.check(caller.certificate, now_wall)
+        except CertificateError as error:
+            self._part_with(name, error)
+            self._dispatch()
 
     def relay_revocations(self, crl: bytes, held: RevocationSet) -> None:
         """Tell every sidecar, now and later, what is revoked (PEM), and the operator which lists these are."""
         self.revocations = held
-        self._core.relay_revocations(crl)
+        self._core.relay_revocations(crl, self._loop.time())
         self._dispatch()
 
-    def end_expired(self, trust: Trust, now_wall: float) -> None:
-        """The same for those whose time is over, at next to no cost while there are none."""
-        if any(caller.identity.not_after < now_wall for caller in self._callers.values()):
-            self.review(trust, now_wall)
+    def ended(self, now_wall: float) -> list[NodeName]:
+        """Whose certificates have ended."""
+        in_use = ((name, caller.identity.not_after) for name, caller in self._callers.items())
+        return self._earliest_end.ended(in_use, now_wall)
 
     def _part_with(self, name: NodeName, error: CertificateError) -> None:
         del self._callers[name]

@@ -26,6 +26,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from controlplane.core.admission import Admission
+from controlplane.earliest_end import EarliestEnd
 from controlplane.gate_pipe import PipeEnd
 from controlplane.half_open import HalfOpen
 from controlplane.handshakes import server_context, why_failed
@@ -153,6 +154,7 @@ class TlsGate:
         self._connections: OrderedDict[str, _Connection] = OrderedDict()
         self._of_name: dict[NodeName, OrderedDict[str, None]] = {}
         """The same by the certificate's name, oldest first."""
+        self._earliest_end = EarliestEnd()
         # Never the same name twice, in this process or another of this host: a stale one must not become somebody else.
         self._prefix = f"plr-{secrets.token_hex(8)}"
         self._count = 0
@@ -196,21 +198,34 @@ class TlsGate:
         )
 
     def use(self, files: TlsFiles) -> None:
-        """Take these files from now on; connections of certificates that they do not believe end.
+        """Take these files from now on; connections that are open stay so until `review`.
 
         Raises:
             ssl.SSLError: OpenSSL refuses the files; the ones before stay in use.
         """
         self._context = server_context(files)
         self._trust = files.trust
-        for connection in list(self._connections.values()):
-            self._review(connection)
 
-    def end_expired(self, now_wall: float) -> None:
-        """End the connections whose certificates have ended."""
-        for connection in list(self._connections.values()):
-            if connection.caller.identity.not_after < now_wall:
-                self._review(connection)
+    def serials(self) -> list[tuple[NodeName, int]]:
+        """Whose certificates stand behind the connections, with their serial numbers."""
+        return [
+            (connection.caller.identity.name, connection.caller.identity.serial)
+            for connection in self._connections.values()
+        ]
+
+    def ended(self, now_wall: float) -> list[NodeName]:
+        """Whose certificates have ended."""
+        in_use = (
+            (connection.caller.identity.name, connection.caller.identity.not_after)
+            for connection in self._connections.values()
+            if connection.caller.refusal is None
+        )
+        return self._earliest_end.ended(in_use, now_wall)
+
+    def review(self, name: NodeName) -> None:
+        """End a member's connections whose certificates are not believed any more."""
+        for peer in list(self._of_name.get(name, ())):
+            self._review(self._connections[peer])
 
     async def close(self) -> None:
         """End everything."""
@@ -375,6 +390,7 @@ class TlsGate:
         # Before gRPC can know of it.
         self._connections[peer] = _Connection(caller, outside, inside, task)
         self._of_name.setdefault(owner, OrderedDict())[peer] = None
+        self._earliest_end.note(caller.identity.not_after)
         if caller.refusal is not None:
             # It may hear from gRPC why, in words that its operator reads.
             self._refused_member(caller.identity.name, address, caller.refusal)

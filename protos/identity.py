@@ -172,6 +172,10 @@ class Trust:
             authority.digest() for authority in self._authorities if _list_age_s(authority, now_wall) > max_age_s
         )
 
+    def revokes(self, serial: int) -> bool:
+        """Whether some list has this serial number: a quick look, which may mean another CA's certificate."""
+        return any(serial in authority.revoked for authority in self._authorities)
+
     def identify(self, certificate_der: bytes) -> Identity:
         """Return whom a certificate of these CAs names, whatever its age and revocation; raises CertificateError."""
         return self._identify(certificate_der)[0]

@@ -92,6 +92,9 @@ PUBLISH_DELAY_EACH_S = 50e-6
 PUBLISHED_AT_ONCE = 200
 """Sidecars looked at for news in one go: some milliseconds, for which streams wait."""
 
+TOLD_AT_ONCE = 64
+"""Sidecars told of a new revocation list in one go."""
+
 _CLOSED_FOR = {
     RemovalReason.REVOKED: CloseReason.REVOKED,
     RemovalReason.EXPIRED: CloseReason.CERTIFICATE_ENDED,
@@ -140,6 +143,9 @@ class ControlCore:
         self._streams: dict[StreamId, NodeName] = {}
         self._last_stream = 0
         self._crl = b""
+        self._untold: deque[NodeName] = deque()
+        """Who does not have it yet."""
+        self._untold_since = now
         self._refused_offers = RefusedOffers()
         self.restlessness = Restlessness()
         self._publish_at: float | None = None
@@ -271,13 +277,21 @@ class ControlCore:
         self.pacing.follow(len(self.registry), busy)
         self.registry.lease_s = self.pacing.lease_s
 
-    def relay_revocations(self, crl: bytes) -> None:
+    def relay_revocations(self, crl: bytes, now: float) -> None:
         """Pass this list (PEM) on to all: a sidecar may know peers that this run of ours has never heard of."""
         if crl == self._crl:
             return
         self._crl = crl
-        for sidecar in self.registry:
-            if sidecar.stream is not None:
+        # Who comes from now on is told in its own welcome.
+        self._untold = deque(sidecar.name for sidecar in self.registry)
+        self._untold_since = now
+        self._tell_revocations()
+
+    def _tell_revocations(self) -> None:
+        """Tell some of those who do not have the list yet; `next_timer` is past until all have been told."""
+        for _ in range(min(TOLD_AT_ONCE, len(self._untold))):
+            sidecar = self.registry.get(self._untold.popleft())
+            if sidecar is not None and sidecar.stream is not None:
                 self._welcome(sidecar.name, sidecar.stream)
 
     def refuse(self, refusal: Refusal) -> Refusal:
@@ -286,7 +300,8 @@ class ControlCore:
         return refusal
 
     def part_with(self, name: NodeName, reason: RemovalReason, now: float) -> None:
-        """This sidecar must not be talked to any more: it goes at once, and its peers are told so at once."""
+        """This sidecar must not be talked to any more: it goes at once, and its peers are told so from now on, some
+        with each call of `handle_timer`."""
         sidecar = self.registry.remove(name, reason)
         if sidecar is None:
             return
@@ -294,9 +309,7 @@ class ControlCore:
         self._forget(sidecar, reason, now)
         self._drawing.members_changed()
         self._debounce.note(Change.MEMBERS, now)
-        self._publish(now)
-        while self._publications:
-            self._go_on_publishing(now)
+        self._publish_at = now
 
     def end_stream(self, name: NodeName, reason: CloseReason, now: float) -> None:
         """End a sidecar's stream; unless it was about to go, it stays registered until its lease ends."""
@@ -371,6 +384,7 @@ class ControlCore:
             self._publisher.resend_at,
             self.restlessness.next_time(),
             self._publishing_since if self._publications else None,
+            self._untold_since if self._untold else None,
             self._returning.until,
         )
         return min((time for time in times if time is not None), default=None)
@@ -401,6 +415,7 @@ class ControlCore:
             self._publish(now)
         elif self._publications:
             self._go_on_publishing(now)
+        self._tell_revocations()
 
     def remember(self, departures: Iterable[Departure], present: Iterable[Departure], now: float) -> None:
         """What an earlier run knew: who was gone, and who was there; of these who does not come back is gone."""

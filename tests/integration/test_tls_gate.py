@@ -234,6 +234,8 @@ def test_a_revoked_certificates_connections_end_and_no_others(tmp_path: Path) ->
             control = gate.fleet.tls_dir("control")
             (control / "crl.pem").write_bytes(gate.fleet.authority.crl_pem())
             gate.gate.use(load_tls_files(control))
+            for name, _ in gate.gate.serials():
+                gate.gate.review(name)
             judged = [gate.gate.caller(peer) for peer in gate.peers]
             assert [(c.identity.name, c.refusal and c.refusal.reason) for c in judged if c] == [
                 ("robot-1", "revoked"),

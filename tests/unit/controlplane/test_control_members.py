@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 
+from controlplane.core import control
 from controlplane.core.control_events import CloseReason
 from controlplane.core.registry import Refusal
 from protos.errors import DecodeError
@@ -142,7 +143,7 @@ def test_a_server_that_must_not_be_talked_to_goes_at_once_and_its_peers_are_told
     world.run(SETTLED_S)
     assert set(robot.pairs().values()) == {"a", "b"}
     world.core.part_with(NodeName("b"), reason, world.now)
-    world.dispatch()
+    world.step()
     assert b.closed == [closed]
     assert robot.peer_names == {"a"}
     assert robot.removed == {"b": reason}
@@ -200,7 +201,32 @@ def test_the_revocation_list_goes_to_all_at_once_and_to_who_comes_later(world: W
     world.run(SETTLED_S)
     assert [welcome.crl for welcome in robot.welcomes] == [b""]
     for crl in (b"first", b"first", b"second"):
-        world.core.relay_revocations(crl)
+        world.core.relay_revocations(crl, world.now)
         world.dispatch()
     assert [welcome.crl for welcome in robot.welcomes] == [b"", b"first", b"second"]
     assert world.cloud("a").welcomes[0].crl == b"second"
+
+
+@pytest.mark.audit("ops-19")
+def test_a_large_fleet_is_told_of_a_revocation_list_in_turns_and_nobody_is_left_out(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "TOLD_AT_ONCE", 3)
+    robots = [world.robot(f"robot-{number}") for number in range(10)]
+    world.run(SETTLED_S)
+
+    def told(crl: bytes) -> int:
+        return sum(robot.welcomes[-1].crl == crl for robot in robots)
+
+    world.core.relay_revocations(b"first", world.now)
+    world.dispatch()
+    assert told(b"first") == 3
+    timer = world.core.next_timer()
+    assert timer is not None
+    assert timer <= world.now, "it goes on at once"
+    world.step()
+    assert told(b"first") == 6
+    world.core.relay_revocations(b"second", world.now)
+    for _ in range(4):
+        world.step()
+    assert told(b"second") == 10
