@@ -61,6 +61,11 @@ GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
     ("grpc.so_reuseport", 0),
 )
 
+SERVERS = 8
+"""gRPC servers behind the gate, which gives each connection to the next one. One takes a single new call in two turns of
+the event loop: when a fleet comes back and turns are long, a dozen sidecars a second, who then wait with all of TLS
+done. There is no option for it."""
+
 MAX_CALLS = 2 * MAX_SIDECARS
 """Calls served at once: a stream for each sidecar, and room for those that replace one and for the operator."""
 
@@ -104,24 +109,26 @@ async def serve(
         loop = ControlLoop(config, metrics, events)
         # Nobody but this user gets at the socket behind the gate.
         folder = cleanup.enter_context(tempfile.TemporaryDirectory(prefix="plr-controlplane-"))
-        upstream = f"{folder}/grpc"
+        upstreams = [f"{folder}/grpc-{number}" for number in range(SERVERS)]
         clock = ClockFloor(time.time, alert=log.error)
-        gate = TlsGate(files, upstream, metrics.refused_connection, clock) if files is not None else None
+        gate = TlsGate(files, upstreams, metrics.refused_connection, clock) if files is not None else None
         if gate is not None:
             loop.has_unread = gate.has_unread
             gate.on_member_refused = lambda name, text: events.record(EventKind.REFUSED, name, text)
-        server, health_service = _make_server(config, loop, metrics, gate)
+        servers, health_service = _make_servers(config, loop, metrics, gate)
         stun = await _start_stun(config, loop, cleanup)
         metrics.watch_fleet(loop.ask_fleet)
         metrics_address = _start_metrics(config, metrics)
         if gate is None:
-            grpc_address = _add_port(config, server)
+            grpc_address = _add_port(config, servers[0])
         else:
-            server.add_insecure_port(f"unix:{upstream}")
+            for server, upstream in zip(servers, upstreams, strict=True):
+                server.add_insecure_port(f"unix:{upstream}")
             grpc_address = _open_gate(config, gate)
             cleanup.push_async_callback(gate.close)
-        await server.start()
-        cleanup.push_async_callback(server.stop, 0.0)
+        for server in servers:
+            await server.start()
+            cleanup.push_async_callback(server.stop, 0.0)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(loop.run())
             keeper = None
@@ -139,7 +146,7 @@ async def serve(
             events.record(EventKind.STOPPED)
             await health_service.enter_graceful_shutdown()
             loop.close_streams()
-            await server.stop(STOP_GRACE_S)
+            await asyncio.gather(*(server.stop(STOP_GRACE_S) for server in servers))
             loop.stop()
             reloading.cancel()
             telling.cancel()
@@ -153,19 +160,24 @@ async def _tell_status(loop: ControlLoop, tell: Callable[[str], None]) -> None:
         await asyncio.sleep(STATUS_EVERY_S)
 
 
-def _make_server(
+def _make_servers(
     config: ControlPlaneConfig, loop: ControlLoop, metrics: Metrics, gate: TlsGate | None
-) -> tuple[grpc.aio.Server, health.aio.HealthServicer]:
+) -> tuple[list[grpc.aio.Server], health.aio.HealthServicer]:
+    """The servers, which serve the same; without a gate one, since only the gate can divide connections."""
     guards = () if gate is None else (AccessGuard(gate.caller, metrics.refused_connection),)
-    server = grpc.aio.server(interceptors=guards, options=GRPC_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
-    caller = None if gate is None else gate.caller
-    service.ControlPlaneService(loop, config.report_interval_ms / 1000, caller).add_to(server)
-    admin.AdminService(loop).add_to(server)
+    control_plane = service.ControlPlaneService(loop, config.report_interval_ms / 1000, gate)
+    admin_service = admin.AdminService(loop)
     health_service = health.aio.HealthServicer()
-    health_pb2_grpc.add_HealthServicer_to_server(health_service, server)
     reflected = (service.SERVICE_NAME, admin.SERVICE_NAME, health.SERVICE_NAME, reflection.SERVICE_NAME)
-    reflection.enable_server_reflection(reflected, server)
-    return server, health_service
+    servers = []
+    for _ in range(1 if gate is None else SERVERS):
+        server = grpc.aio.server(interceptors=guards, options=GRPC_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
+        control_plane.add_to(server)
+        admin_service.add_to(server)
+        health_pb2_grpc.add_HealthServicer_to_server(health_service, server)
+        reflection.enable_server_reflection(reflected, server)
+        servers.append(server)
+    return servers, health_service
 
 
 def _open_gate(config: ControlPlaneConfig, gate: TlsGate) -> str:

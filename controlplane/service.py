@@ -20,12 +20,10 @@ from protos.plr.v1 import control_pb2
 from protos.protocol_versions import Spoken, refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from controlplane.core.registry import StreamId
     from controlplane.loop import ControlLoop
     from controlplane.mailbox import Mailbox
-    from controlplane.tls_gate import Caller
+    from controlplane.tls_gate import Caller, TlsGate
     from protos.model import SidecarMessage
 
     Context = grpc.aio.ServicerContext[bytes, bytes]
@@ -70,15 +68,13 @@ class ControlPlaneService:
     """Serves `Connect`. Bytes are parsed here, not by gRPC, so that bad ones get a clear status.
 
     `report_interval_s` is what the sidecars are told.
-    `caller` tells who is behind a peer of gRPC's; None in insecure mode, where a sidecar is who it says.
+    `gate` knows who is behind a peer of gRPC's; None in insecure mode, where a sidecar is who it says.
     """
 
-    def __init__(
-        self, loop: ControlLoop, report_interval_s: float, caller: Callable[[str], Caller | None] | None
-    ) -> None:
+    def __init__(self, loop: ControlLoop, report_interval_s: float, gate: TlsGate | None) -> None:
         self._loop = loop
         self._report_interval_s = report_interval_s
-        self._caller = caller
+        self._gate = gate
         self._streams = StreamCount()
         self._turn = asyncio.Semaphore(REGISTERED_AT_ONCE)
         self._encoder = StreamEncoder()
@@ -110,7 +106,11 @@ class ControlPlaneService:
                 await context.abort(end.code, end.details)
 
     async def _serve(self, context: Context, caller: Caller | None) -> NoReturn:
-        stream, mailbox, incremental = await self._register(context, caller)
+        try:
+            stream, mailbox, incremental = await self._register(context, caller)
+        finally:
+            if self._gate is not None:
+                self._gate.is_served(context.peer())
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._write(mailbox, context, incremental=incremental))
@@ -144,9 +144,9 @@ class ControlPlaneService:
         return *result, registration.incremental
 
     def _caller_of(self, context: Context) -> Caller | None:
-        if self._caller is None:
+        if self._gate is None:
             return None
-        caller = self._caller(context.peer())
+        caller = self._gate.caller(context.peer())
         # The guard saw one a moment ago; a connection that has ended since must not count as insecure mode.
         if caller is None or caller.refusal is not None:
             raise _StreamEndError(grpc.StatusCode.UNAUTHENTICATED, "the connection has ended")

@@ -1,5 +1,8 @@
 """What is left of an assignment problem after its decomposition, in CP-SAT; the only file that imports OR-Tools.
 
+It is imported when it is first needed: that takes more than a second of processor time, and after a restart, when a
+whole fleet comes back, most problems do without.
+
 Columns are whole choices of a block, so that every objective is linear. One worker and a fixed seed: the same columns
 give the same answer with the same version of OR-Tools. It releases the interpreter while it searches, hence a thread
 suffices to run it.
@@ -9,8 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
-
-from ortools.sat.python import cp_model
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,6 +44,8 @@ def pick_columns(
 
     Returns the hint if nothing better is found in time, and whether the answer is proven to be the best.
     """
+    from ortools.sat.python import cp_model
+
     model: Any = cp_model.CpModel()
     chosen: list[list[Any]] = []
     objective: list[Any] = []

@@ -30,11 +30,11 @@ from controlplane.earliest_end import EarliestEnd
 from controlplane.gate_pipe import PipeEnd
 from controlplane.half_open import HalfOpen
 from controlplane.handshakes import server_context, why_failed
-from protos.identity import CertificateError
+from protos.identity import CertificateError, IdentityRole
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from protos.clock_floor import ClockFloor
     from protos.identity import Identity, Trust
@@ -57,15 +57,19 @@ TURN_TIMEOUT_S = 15.0
 """Longest wait for the turn to begin a handshake: as long as a sidecar of a large fleet waits."""
 
 MAX_ON_THE_WAY = 64
-"""Connections at once between the beginning of their handshakes and their first calls. Half a second of work: what more
+"""Connections at once between the beginning of their handshakes and their registration. Half a second of work: what more
 began meanwhile would wait behind these. Enough for a hundred a second from networks as slow as cellular ones."""
 
 ON_THE_WAY_S = 1.0
-"""For how long one counts as such: three round trips over a slow network. Who takes longer keeps nobody waiting."""
+"""For how long one counts as such without a certificate: three round trips over a slow network. A stranger who takes
+longer keeps nobody waiting."""
 
 MAX_WAITING = 4096 + 256
 """Connections at once that wait for their turn: the largest fleet. No TLS stands behind them; each costs a descriptor
 and a few kB."""
+
+LOOK_EVERY_S = 0.1
+"""Between two looks for those that wait no more."""
 
 ACCEPTED_AT_ONCE = 16
 """In one turn of the loop."""
@@ -107,6 +111,9 @@ _LOG_LINES_PER_S = 1.0
 _LOG_BURST = 20.0
 
 
+_REGISTERS = frozenset({IdentityRole.ROBOT, IdentityRole.CLOUD})
+
+
 @dataclass(frozen=True, slots=True)
 class Caller:
     """Whose certificate stands behind a connection; `refusal` tells why it is not believed (any more)."""
@@ -121,21 +128,23 @@ class _Connection:
     caller: Caller
     outside: PipeEnd
     inside: PipeEnd
-    admitted: asyncio.Task[None] | None
+    admitted: asyncio.Task[None]
     """The task that let it in."""
 
 
 class TlsGate:
-    """Accepts connections for the gRPC server at the Unix socket `upstream`; for one event loop.
+    """Accepts connections for the gRPC servers at the Unix sockets `upstreams`, in turn; for one event loop.
 
     `on_refused` is told the reason of every connection that is refused or ended; certificates are judged by `clock`.
     """
 
-    def __init__(self, files: TlsFiles, upstream: str, on_refused: Callable[[str], None], clock: ClockFloor) -> None:
+    def __init__(
+        self, files: TlsFiles, upstreams: Sequence[str], on_refused: Callable[[str], None], clock: ClockFloor
+    ) -> None:
         self._clock = clock
         self._trust: Trust = files.trust
         self._context = server_context(files)
-        self._upstream = upstream
+        self._upstreams = upstreams
         self._on_refused = on_refused
         self._loop = asyncio.get_running_loop()
         self._socket: socket.socket | None = None
@@ -145,10 +154,17 @@ class TlsGate:
         self._silent = HalfOpen(MAX_SILENT, MAX_SILENT_PER_SOURCE)
         self._handshakes = HalfOpen(MAX_HANDSHAKES, MAX_HANDSHAKES_PER_SOURCE)
         self._admission: Admission[asyncio.Task[None]] = Admission(
-            most_waiting=MAX_WAITING, most_on_the_way=MAX_ON_THE_WAY, on_the_way_s=ON_THE_WAY_S
+            most_waiting=MAX_WAITING,
+            most_on_the_way=MAX_ON_THE_WAY,
+            stranger_s=ON_THE_WAY_S,
+            member_s=HANDSHAKE_TIMEOUT_S,
         )
         self._turns: dict[asyncio.Task[None], asyncio.Future[None]] = {}
         """Of those that wait."""
+        self._waiting: dict[int, asyncio.Task[None]] = {}
+        """The same by their sockets' numbers."""
+        self._ends = select.poll()
+        """Tells which of them have gone."""
         self._room = asyncio.Event()
         """Somebody waits, or is through."""
         self._connections: OrderedDict[str, _Connection] = OrderedDict()
@@ -180,14 +196,15 @@ class TlsGate:
         return taken
 
     def caller(self, peer: str) -> Caller | None:
-        """Who calls over the connection that gRPC calls `peer`; None if there is no such connection (any more)."""
+        """Who is behind the connection that gRPC calls `peer`; None if there is no such connection (any more)."""
         connection = self._connections.get(peer)
-        if connection is None:
-            return None
-        if connection.admitted is not None:
-            self._is_through(connection.admitted)
-            connection.admitted = None
-        return connection.caller
+        return None if connection is None else connection.caller
+
+    def is_served(self, peer: str) -> None:
+        """This one has what it came for, registered or refused: the next one may come."""
+        connection = self._connections.get(peer)
+        if connection is not None:
+            self._is_through(connection.admitted, connection.caller.identity.name)
 
     def has_unread(self, name: NodeName, since: float) -> bool:
         """Whether a member has sent something, over any connection, that nobody can have read by `since`, in monotonic
@@ -269,7 +286,7 @@ class TlsGate:
         accepted.setblocking(False)
         task = asyncio.current_task()
         assert task is not None
-        if not _look(accepted):
+        if not _has_spoken(accepted):
             try:
                 async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
                     await _readable(self._loop, accepted)
@@ -279,14 +296,12 @@ class TlsGate:
         self._silent.remove(task)
         try:
             async with asyncio.timeout(TURN_TIMEOUT_S):
-                await self._turn(task, source)
+                await self._turn(task, accepted, source)
         except TimeoutError:
             self._on_refused(TOO_MANY_HANDSHAKES)
             return
-        if _look(accepted) & _GONE:
-            # Before anything was spent on it.
+        except ConnectionError:
             self._on_refused(GAVE_UP)
-            self._is_through(task)
             return
         self._note(self._handshakes, task, source)
         self._unread.discard(accepted)
@@ -297,8 +312,11 @@ class TlsGate:
             if not through:
                 self._is_through(task)
 
-    async def _turn(self, task: asyncio.Task[None], source: str) -> None:
+    async def _turn(self, task: asyncio.Task[None], accepted: socket.socket, source: str) -> None:
+        """Wait for it; raises ConnectionError as soon as the client goes."""
         turn = self._turns[task] = self._loop.create_future()
+        self._waiting[accepted.fileno()] = task
+        self._ends.register(accepted, select.POLLRDHUP)
         pushed_out = self._admission.wait(task, source)
         if pushed_out is not None:
             self._on_refused(TOO_MANY_HANDSHAKES)
@@ -312,13 +330,19 @@ class TlsGate:
             self._is_through(task)
             raise
         finally:
-            del self._turns[task]
+            self._ends.unregister(accepted)
+            del self._turns[task], self._waiting[accepted.fileno()]
 
     async def _give_turns(self) -> None:
         """One in each turn of the loop: whatever else is due, as the messages of those who are in already, is done
         between two."""
+        looked_at = self._loop.time()
         while True:
-            task = self._admission.next(self._loop.time())
+            now = self._loop.time()
+            if now >= looked_at + LOOK_EVERY_S:
+                looked_at = now
+                self._drop_gone()
+            task = self._admission.next(now)
             if task is not None:
                 turn = self._turns[task]
                 if not turn.done():
@@ -326,12 +350,21 @@ class TlsGate:
                 await asyncio.sleep(0)
                 continue
             self._room.clear()
+            next_at = self._admission.next_at()
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout_at(self._admission.next_at()):
+                async with asyncio.timeout_at(None if next_at is None else min(next_at, looked_at + LOOK_EVERY_S)):
                     await self._room.wait()
 
-    def _is_through(self, task: asyncio.Task[None]) -> None:
-        if self._admission.over(task):
+    def _drop_gone(self) -> None:
+        """Who gave up frees its place at once, and nothing is spent on it."""
+        for number, _ in self._ends.poll(0):
+            turn = self._turns[self._waiting[number]]
+            if not turn.done():
+                self._admission.leave(self._waiting[number])
+                turn.set_exception(ConnectionAbortedError())
+
+    def _is_through(self, task: asyncio.Task[None], name: NodeName | None = None) -> None:
+        if self._admission.over(task, name):
             self._room.set()
 
     def _note(self, line: HalfOpen, task: asyncio.Task[None], source: str) -> None:
@@ -375,6 +408,10 @@ class TlsGate:
             self._refused(address, TOO_MANY_CONNECTIONS, f"{MAX_CONNECTIONS} connections are open")
             outside.abort()
             return False
+        if caller.refusal is None and caller.identity.role in _REGISTERS:
+            self._admission.proven(task, caller.identity.name, self._loop.time())
+        else:
+            self._is_through(task)
         self._make_room(caller.identity.name)
         self._count += 1
         name = f"{self._prefix}-{self._count}"
@@ -384,7 +421,7 @@ class TlsGate:
 
         def lost() -> None:
             self._forget(peer, owner)
-            self._is_through(task)
+            self._is_through(task, owner)
 
         inside = PipeEnd(lost)
         # Before gRPC can know of it.
@@ -410,7 +447,7 @@ class TlsGate:
         try:
             unix.setblocking(False)
             unix.bind(f"\0{name}")
-            await self._loop.sock_connect(unix, self._upstream)
+            await self._loop.sock_connect(unix, self._upstreams[self._count % len(self._upstreams)])
             await self._loop.create_unix_connection(lambda: inside, sock=unix)
         except BaseException:
             unix.close()
@@ -481,14 +518,11 @@ class TlsGate:
             log.warning("refused a connection of %s: %s: %s", who, reason, text)
 
 
-_GONE = select.POLLRDHUP | select.POLLHUP | select.POLLERR
-
-
-def _look(sock: socket.socket) -> int:
-    """Return what there is of it now: bytes to read, or its end (`_GONE`)."""
+def _has_spoken(sock: socket.socket) -> bool:
+    """Whether there is something to read now, its end included."""
     looking = select.poll()
-    looking.register(sock, select.POLLIN | select.POLLRDHUP)
-    return next((found for _, found in looking.poll(0)), 0)
+    looking.register(sock, select.POLLIN)
+    return bool(looking.poll(0))
 
 
 async def _readable(loop: asyncio.AbstractEventLoop, sock: socket.socket) -> None:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from bench.control.member import Member
     from protos.model import NodeName
     from protos.plr.v1 import control_pb2
+    from sidecar.core.control_session import ControlSession
 
     Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
 
@@ -104,14 +105,13 @@ class Crowd:
         channel = grpc.aio.secure_channel(self._target, credentials, options=OPTIONS)
         try:
             call = control_pb2_grpc.ControlPlaneStub(channel).Connect()
-            writing = asyncio.create_task(self._write(member, call))
+            tasks = [asyncio.create_task(self._write(member, call)), asyncio.create_task(self._give_up(session, call))]
             try:
                 async for message in call:
                     self._take(member, message)
             finally:
                 call.cancel()
-                writing.cancel()
-                await asyncio.gather(writing, return_exceptions=True)
+                await self._cancel(tasks)
             self.ended["closed"] += 1
         except asyncio.CancelledError:
             # The call was cancelled, not we.
@@ -119,12 +119,19 @@ class Crowd:
             if task is None or task.cancelling():
                 raise
         except grpc.aio.AioRpcError as error:
-            self.ended[f"{error.code().name}: {error.details()}"[:80]] += 1
+            self.ended[f"{error.code().name}: {error.details()}"[:240]] += 1
             refused = error.code() in REFUSALS
         finally:
             # Its own close looks at every task of the loop for calls of the channel: a minute for a thousand channels.
             channel._channel.close()  # type: ignore[attr-defined]
             session.closed(time.monotonic(), refused=refused)
+
+    async def _give_up(self, session: ControlSession, call: Call) -> None:
+        """As the sidecar does: the first write waits for the connection, so this is not for who writes."""
+        await asyncio.sleep(max(session.next_timer() - time.monotonic(), 0.0))
+        if session.welcome_overdue(time.monotonic()):
+            self.ended["no welcome"] += 1
+            call.cancel()
 
     async def _write(self, member: Member, call: Call) -> None:
         session, wake = member.session, self._wake[member.name]
@@ -132,10 +139,6 @@ class Crowd:
         while True:
             wake.clear()
             now = time.monotonic()
-            if session.welcome_overdue(now):
-                self.ended["no welcome"] += 1
-                call.cancel()
-                return
             session.handle_timer(now)
             if session.report_due(now):
                 session.send_report(member.report(now - reported_at), now)

@@ -5,13 +5,14 @@ up: nobody gets in although the server is busy, and that lasts (a metastable fai
 served first: who is served has waited least, and is still there. The sources are served in turn, so that one that sends
 more than all others together keeps none of them out.
 
-Only so many are on their way at once between their turn and their first call: what is begun is ended before more is
-begun. Who is on the way for longer than any healthy network takes (a stranger who stops in the middle) does not count
-any more.
+Only so many are on their way at once between their turn and their registration: what is begun is ended before more is
+begun. A stranger who stops in the middle counts for as long as a healthy network takes; one who has proven to be a
+member counts for longer, since it is most likely we who have not come to it yet, but each member only once.
 """
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -27,24 +28,28 @@ class Admission(Generic[T]):
     Args:
         most_waiting: items in the line; of more, the source that has most of them loses its oldest.
         most_on_the_way: items that have had their turn and are not over.
-        on_the_way_s: for how long one counts as such.
+        stranger_s: for how long one counts as such.
+        member_s: the same from the proof of being a member.
     """
 
     __slots__ = (
         "_by_length",
         "_longest",
+        "_member_s",
+        "_members",
         "_most_on_the_way",
         "_most_waiting",
-        "_on_the_way",
-        "_on_the_way_s",
         "_sources",
+        "_stranger_s",
+        "_strangers",
         "_waiting",
     )
 
-    def __init__(self, *, most_waiting: int, most_on_the_way: int, on_the_way_s: float) -> None:
+    def __init__(self, *, most_waiting: int, most_on_the_way: int, stranger_s: float, member_s: float) -> None:
         self._most_waiting = most_waiting
         self._most_on_the_way = most_on_the_way
-        self._on_the_way_s = on_the_way_s
+        self._stranger_s = stranger_s
+        self._member_s = member_s
         self._waiting: dict[T, str] = {}
         """All in the line, with their sources."""
         self._sources: OrderedDict[str, OrderedDict[T, None]] = OrderedDict()
@@ -52,8 +57,10 @@ class Admission(Generic[T]):
         self._by_length: dict[int, dict[str, None]] = {}
         """The sources by the length of their lines."""
         self._longest = 0
-        self._on_the_way: OrderedDict[T, float] = OrderedDict()
-        """Since when, oldest first."""
+        self._strangers: OrderedDict[T, float] = OrderedDict()
+        """On the way and not proven yet; since when, oldest first."""
+        self._members: OrderedDict[str, tuple[T, float]] = OrderedDict()
+        """On the way, by the names that are proven; since when, oldest first."""
 
     def __len__(self) -> int:
         """Return how many wait."""
@@ -85,33 +92,48 @@ class Admission(Generic[T]):
     def next(self, now: float) -> T | None:
         """Return whose turn it is, who is on the way from now on; None if nobody waits or too many are on the way."""
         self._forget_stuck(now)
-        if not self._sources or len(self._on_the_way) >= self._most_on_the_way:
+        if not self._sources or self.on_the_way >= self._most_on_the_way:
             return None
         source, line = next(iter(self._sources.items()))
         self._sources.move_to_end(source)
         item = next(reversed(line))
         self.leave(item)
-        self._on_the_way[item] = now
+        self._strangers[item] = now
         return item
 
-    def over(self, item: T) -> bool:
-        """It has come through, or never will; returns whether it was on the way."""
-        return self._on_the_way.pop(item, None) is not None
+    @property
+    def on_the_way(self) -> int:
+        """How many have had their turn and are not over, as far as they count."""
+        return len(self._strangers) + len(self._members)
+
+    def proven(self, item: T, name: str, now: float) -> None:
+        """It is this member, on its way yet; whoever was under the same name does not count any more."""
+        self._strangers.pop(item, None)
+        self._members.pop(name, None)
+        self._members[name] = item, now
+
+    def over(self, item: T, name: str | None = None) -> bool:
+        """It has come through, or never will; `name` if it is proven. Returns whether there is more room now."""
+        if name is not None and name in self._members and self._members[name][0] == item:
+            del self._members[name]
+            return True
+        return self._strangers.pop(item, None) is not None
 
     def next_at(self) -> float | None:
         """When to ask for the next one at the latest, although nobody was over; None if nobody waits."""
         if not self._waiting:
             return None
-        if len(self._on_the_way) < self._most_on_the_way:
+        if self.on_the_way < self._most_on_the_way:
             return 0.0
-        return next(iter(self._on_the_way.values())) + self._on_the_way_s
+        strangers = (since + self._stranger_s for since in self._strangers.values())
+        members = (since + self._member_s for _, since in self._members.values())
+        return min(next(strangers, math.inf), next(members, math.inf))
 
     def _forget_stuck(self, now: float) -> None:
-        while self._on_the_way:
-            item, since = next(iter(self._on_the_way.items()))
-            if now < since + self._on_the_way_s:
-                return
-            del self._on_the_way[item]
+        while self._strangers and now >= next(iter(self._strangers.values())) + self._stranger_s:
+            self._strangers.popitem(last=False)
+        while self._members and now >= next(iter(self._members.values()))[1] + self._member_s:
+            self._members.popitem(last=False)
 
     def _relist(self, source: str, before: int, after: int) -> None:
         if before:

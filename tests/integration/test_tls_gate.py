@@ -80,7 +80,7 @@ async def opened(folder: Path) -> AsyncIterator[Gate]:
     upstream = str(folder / "upstream")
     server = await asyncio.start_unix_server(echo, upstream)
     files = load_tls_files(fleet.tls_dir("control", IdentityRole.CONTROL_PLANE))
-    gate = TlsGate(files, upstream, lambda reason: refused.update([reason]), ClockFloor(time.time))
+    gate = TlsGate(files, [upstream], lambda reason: refused.update([reason]), ClockFloor(time.time))
     try:
         yield Gate(fleet, gate.listen("127.0.0.1", 0), gate, refused, peers)
     finally:
@@ -221,6 +221,91 @@ def test_who_never_says_anything_is_ended(tmp_path: Path, monkeypatch: pytest.Mo
             await ended(await asyncio.open_connection("127.0.0.1", gate.port))
             assert gate.refused == {"handshake_timeout": 1}
             assert len(gate.gate._silent) == len(gate.gate._handshakes) == len(gate.gate._unread) == 0
+
+    asyncio.run(run())
+
+
+@contextlib.asynccontextmanager
+async def busy(gate: Gate) -> AsyncIterator[None]:
+    """All places on the way are taken by one who stops within his handshake; needs MAX_ON_THE_WAY = 1."""
+    _, writer = await asyncio.open_connection("127.0.0.1", gate.port)
+    writer.write(CLIENT_HELLO)
+    await until(lambda: gate.gate._admission.on_the_way == 1)
+    yield
+    writer.close()
+
+
+@pytest.mark.audit("ops-16")
+def test_who_came_last_is_let_in_first_and_the_next_when_that_one_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tls_gate, "MAX_ON_THE_WAY", 1)
+    monkeypatch.setattr(tls_gate, "ON_THE_WAY_S", PATIENCE_S)
+    names = ["robot-1", "robot-2", "robot-3"]
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            for name in names:
+                gate.fleet.tls_dir(name)
+            async with busy(gate):
+                tasks = []
+                for place, name in enumerate(names, 1):
+                    tasks.append(asyncio.create_task(gate.connect(name)))
+                    await until(lambda place=place: len(gate.gate._admission) == place)  # type: ignore[misc]
+            for place in range(1, 4):
+                await until(lambda place=place: len(gate.peers) == place)  # type: ignore[misc]
+                assert len(gate.gate._admission) == 3 - place
+                gate.gate.is_served(gate.peers[-1])
+            callers = [gate.gate.caller(peer) for peer in gate.peers]
+            assert [caller and caller.identity.name for caller in callers] == names[::-1]
+            for task in tasks:
+                (await task)[1].close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.audit("ops-16")
+def test_who_leaves_while_he_waits_costs_no_handshake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tls_gate, "MAX_ON_THE_WAY", 1)
+    monkeypatch.setattr(tls_gate, "ON_THE_WAY_S", PATIENCE_S)
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            async with busy(gate):
+                waiting = [await asyncio.open_connection("127.0.0.1", gate.port) for _ in range(20)]
+                for _, writer in waiting:
+                    writer.write(CLIENT_HELLO)
+                await until(lambda: len(gate.gate._admission) == 20)
+                for _, writer in waiting[1:]:
+                    writer.close()
+                await until(lambda: gate.refused["gave_up"] == 19)
+                assert len(gate.gate._admission) == 1
+                assert len(gate.gate._handshakes) == 1
+            waiting[0][1].close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.audit("ops-16")
+def test_of_more_than_may_wait_the_oldest_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tls_gate, "MAX_ON_THE_WAY", 1)
+    monkeypatch.setattr(tls_gate, "ON_THE_WAY_S", PATIENCE_S)
+    monkeypatch.setattr(tls_gate, "MAX_WAITING", 3)
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate, busy(gate):
+            waiting = []
+            for number in range(5):
+                waiting.append(await asyncio.open_connection("127.0.0.1", gate.port))
+                waiting[-1][1].write(CLIENT_HELLO)
+                await until(
+                    lambda number=number: len(gate.gate._admission) + gate.refused["too_many_handshakes"] == number + 1  # type: ignore[misc]
+                )
+            assert (len(gate.gate._admission), gate.refused["too_many_handshakes"]) == (3, 2)
+            for oldest in waiting[:2]:
+                await ended(oldest)
+            for _, writer in waiting[2:]:
+                writer.close()
 
     asyncio.run(run())
 
