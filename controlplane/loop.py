@@ -101,14 +101,22 @@ class Used:
         return share
 
 
-class _LateMatcher:
-    """The matcher, for the solver's thread alone.
+QUIET_SHARE, QUIET_LOOKS = 0.5, 5
+"""The loop's share of one core, and how many looks in a row it is below, until there is time for what can wait."""
 
-    OR-Tools takes one to two seconds to import: the streams need not wait for it after a restart.
-    """
+
+class _LateMatcher:
+    """The matcher, for the solver's thread alone: after a restart the streams need not wait for its modules."""
 
     def __init__(self) -> None:
         self._matcher: Matcher | None = None
+
+    @staticmethod
+    def prepare() -> None:
+        """Import what few problems need."""
+        from controlplane import solver
+
+        solver.prepare()
 
     def solve(self, problem: Problem, time_limit_s: float, hint: Plan) -> Plan:
         from controlplane.matcher import Matcher
@@ -143,6 +151,8 @@ class ControlLoop:
         self._closing = False
         """Whether streams end since the control plane does."""
         self._matcher = _LateMatcher()
+        self._quiet_looks = 0
+        """Since the loop was last busy; at QUIET_LOOKS the solver is ready."""
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
         self.stun_servers: list[StunServer] = []
         self.has_unread: Callable[[NodeName, float], bool] = lambda name, since: False
@@ -372,7 +382,9 @@ class ControlLoop:
                     solving.create_task(self._solve(picture))
                 drawn_s = self._loop.time() - now
                 if now >= metrics_at:
-                    self._core.follow_load(used.share(time.thread_time(), now))
+                    share = used.share(time.thread_time(), now)
+                    self._core.follow_load(share)
+                    self._prepare_if_quiet(share)
                     self._update_metrics()
                     metrics_at = now + METRICS_INTERVAL_S
                 self._dispatch_quietly()
@@ -385,6 +397,14 @@ class ControlLoop:
         """Of those whose lease has ended, whose bytes have arrived: a late loop must cost nobody the lease."""
         registry = self._core.registry
         return {name for name in registry.due(now) if self.has_unread(name, registry.heard_at(name, now))}
+
+    def _prepare_if_quiet(self, share: float | None) -> None:
+        """Not at the start at once: a fleet that comes back needs the processor."""
+        if share is None or self._quiet_looks >= QUIET_LOOKS:
+            return
+        self._quiet_looks = self._quiet_looks + 1 if share < QUIET_SHARE else 0
+        if self._quiet_looks == QUIET_LOOKS:
+            self._executor.submit(self._matcher.prepare)
 
     def _dispatch_quietly(self) -> None:
         """Dispatch what the loop itself caused, without waking it for that."""

@@ -62,9 +62,8 @@ GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
 )
 
 SERVERS = 8
-"""gRPC servers behind the gate, which gives each connection to the next one. One takes a single new call in two turns of
-the event loop: when a fleet comes back and turns are long, a dozen sidecars a second, who then wait with all of TLS
-done. There is no option for it."""
+"""gRPC servers behind the gate, which gives each connection to the next one. One server takes one new call in two turns
+of the event loop: few a second when a fleet comes back and turns are long. There is no option for it."""
 
 MAX_CALLS = 2 * MAX_SIDECARS
 """Calls served at once: a stream for each sidecar, and room for those that replace one and for the operator."""

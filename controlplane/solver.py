@@ -1,7 +1,7 @@
 """What is left of an assignment problem after its decomposition, in CP-SAT; the only file that imports OR-Tools.
 
-It is imported when it is first needed: that takes more than a second of processor time, and after a restart, when a
-whole fleet comes back, most problems do without.
+It is imported when it is first needed, or once there is time for it (`prepare`): that takes more than a second of
+processor time, and after a restart, when a whole fleet comes back, most problems do without.
 
 Columns are whole choices of a block, so that every objective is linear. One worker and a fixed seed: the same columns
 give the same answer with the same version of OR-Tools. It releases the interpreter while it searches, hence a thread
@@ -35,6 +35,11 @@ class Column:
     """By how many interfaces the block's own capacity is exceeded."""
     limits: tuple[int, ...]
     """For each interface that falls under a limit over all robots the number of that limit."""
+
+
+def prepare() -> None:
+    """Import OR-Tools, so that the first problem that needs it does not wait for that."""
+    import ortools.sat.python.cp_model  # noqa: F401
 
 
 def pick_columns(

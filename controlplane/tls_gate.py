@@ -57,8 +57,8 @@ TURN_TIMEOUT_S = 15.0
 """Longest wait for the turn to begin a handshake: as long as a sidecar of a large fleet waits."""
 
 MAX_ON_THE_WAY = 64
-"""Connections at once between the beginning of their handshakes and their registration. Half a second of work: what more
-began meanwhile would wait behind these. Enough for a hundred a second from networks as slow as cellular ones."""
+"""Connections at once between the beginning of their handshakes and their registration: half a second of work, behind
+which whatever else began would wait. Enough for a hundred a second from networks as slow as cellular ones."""
 
 ON_THE_WAY_S = 1.0
 """For how long one counts as such without a certificate: three round trips over a slow network. A stranger who takes
@@ -92,9 +92,15 @@ LAST_WORDS_S = 0.5
 ACCEPT_PAUSE_S = 0.1
 """After the system refused to accept: it is out of descriptors, and will be for a moment."""
 
-asyncio.sslproto.SSLProtocol.max_size = 16 * 1024
-"""Each TLS connection holds a buffer of so many bytes, of 256 kB by default: a TLS record, and more than any message of
-a small fleet. There is no other way to say it."""
+READ_SIZE = 16 * 1024
+"""Bytes read at once: a TLS record, and more than any message of a small fleet."""
+
+asyncio.sslproto.SSLProtocol.max_size = READ_SIZE
+"""256 kB by default. There is no other way to say it."""
+
+_READ = bytearray(READ_SIZE)
+"""What all TLS connections read into. asyncio gives each a buffer of its own, though what is in it goes on to OpenSSL
+before the next connection is looked at."""
 
 TOO_MANY_HANDSHAKES = "too_many_handshakes"
 TOO_MANY_CONNECTIONS = "too_many_connections"
@@ -394,6 +400,7 @@ class TlsGate:
             # In a cycle with asyncio's TLS buffers: without this, strangers take 100 MB before they are collected.
             error.__traceback__ = None
             return False
+        _share_buffer(transport)
         try:
             certificate = transport.get_extra_info("ssl_object").getpeercert(binary_form=True)
             caller = self._check(certificate or b"")
@@ -516,6 +523,14 @@ class TlsGate:
         # A stranger must not fill the disk.
         if self._log_lines.take(self._loop.time()):
             log.warning("refused a connection of %s: %s: %s", who, reason, text)
+
+
+def _share_buffer(transport: asyncio.BaseTransport) -> None:
+    """Let a TLS connection read into `_READ`; asyncio has no option for it."""
+    protocol = transport._ssl_protocol  # type: ignore[attr-defined]
+    assert len(protocol._ssl_buffer) == READ_SIZE
+    protocol._ssl_buffer = _READ
+    protocol._ssl_buffer_view = memoryview(_READ)
 
 
 def _has_spoken(sock: socket.socket) -> bool:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 SERVERS = 3
 SETTLE_S = 20.0
 """From the registration of all to what counts as steady: the first mappings are solved and have gone out."""
+READY_S = 12.0
+"""From the start to what counts as empty: the solver's modules are loaded once nobody has come for some seconds."""
 STATUS_LOOKS = 3
 LEASES = 'plr_departures_total{reason="lease_expired"}'
 LOOK_EVERY_S = 0.02
@@ -109,7 +111,7 @@ class Fleet:
 
     async def _measure(self) -> None:
         self._plane.start()
-        await asyncio.sleep(5.0)
+        await asyncio.sleep(READY_S)
         empty_kb = self._plane.resident_kb()
         self._crowd.start()
         began = time.monotonic()
