@@ -139,7 +139,7 @@ def _room(robot: MemberView, share: int) -> _Room:
     for count in wanted:
         given.append(min(count, left))
         left -= given[-1]
-    return _Room(*given, left_out=sum(wanted) - sum(given))
+    return _Room(given[0], given[1], given[2], given[3], given[4], left_out=sum(wanted) - sum(given))
 
 
 def _gauge(name: str, text: str, labels: Labels, rows: Rows) -> Metric:

@@ -89,13 +89,12 @@ def view_of(
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
         return MemberView(sidecar.name, sidecar.role, connected, seen_at)
-    # Whatever a robot reports: it makes no series of interfaces that it has not announced, nor of servers that are gone.
+    # Whatever a robot reports: it makes no series of interfaces that it has not announced, nor of servers that are
+    # gone.
     carriers = dict.fromkeys(interfaces_of(sidecar)[:MAX_VIEWED], "")
     carriers |= {label.interface: label.carrier for label in sidecar.labels if label.interface in carriers}
     paths = (
-        path
-        for path in estimator.path_views(sidecar.name)
-        if path.interface in carriers and is_there(path.server)
+        path for path in estimator.path_views(sidecar.name) if path.interface in carriers and is_there(path.server)
     )
     return MemberView(
         name=sidecar.name,
