@@ -72,8 +72,9 @@ class _Inputs:
 
     @property
     def pairs(self) -> int:
-        """Pairs to estimate."""
-        return len(self.interfaces) * len(self.clouds)
+        """Pairs to estimate; where second copies leave late, each takes half as long again."""
+        pairs = len(self.interfaces) * len(self.clouds)
+        return pairs + pairs // 2 if self.use.redundancy.sends_late else pairs
 
 
 @dataclass(slots=True)
