@@ -23,6 +23,7 @@ from protos.fleet_events import DepartedSidecar, Why
 from protos.histogram import BUCKETS
 from protos.model import (
     Assignment,
+    CandidateSet,
     InterfaceName,
     NodeName,
     OutcomeReport,
@@ -32,8 +33,9 @@ from protos.model import (
     ServiceName,
     ServiceSet,
 )
+from protos.preferences import InterfaceLabel
 from tests.sim.control_world import SETTLED_S, World
-from tests.unit.controlplane.samples import PLAN, histogram, path, registration, use
+from tests.unit.controlplane.samples import PLAN, histogram, interfaces, path, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -101,6 +103,46 @@ def test_what_is_known_of_a_robot_is_exported() -> None:
     assert value(found, "plr_sidecar_certificate_expiry_timestamp_seconds", **member) == 1.8e9
     seen = value(found, "plr_sidecar_last_seen_timestamp_seconds", **member)
     assert seen == pytest.approx(1.7e9, abs=world.settings.lease_s)
+
+
+def test_whose_network_an_interface_uses_is_told_by_the_robot_or_by_the_interfaces_name() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    robot = world.robot()
+    labels = (InterfaceLabel(InterfaceName("wwan0"), "telekom"), InterfaceLabel(InterfaceName("not0"), "announced"))
+    world.say(robot, CandidateSet(interfaces("wlan0", "wwan0"), labels))
+    found = series(families(fleet_of(world)))
+    told = [dict(key[1]) for key in found if key[0] == "plr_robot_interface_info"]
+    assert told == [
+        {"robot": "robot", "interface": "wlan0", "carrier": "wlan0"},
+        {"robot": "robot", "interface": "wwan0", "carrier": "telekom"},
+    ]
+
+
+def test_paths_to_a_server_that_is_gone_have_no_series() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    server = world.cloud("a")
+    world.cloud("b")
+    robot = world.robot()
+    world.say(robot, Report(paths=(path("wlan0", "a", up=False), path("wlan0", "b"))))
+    world.run(SETTLED_S)
+
+    def servers() -> set[str]:
+        return {dict(key[1])["server"] for key in series(families(fleet_of(world))) if key[0] == "plr_robot_path_up"}
+
+    assert servers() == {"a", "b"}
+    world.drop_stream(server)
+    world.run(world.settings.lease_s + 1.0)
+    assert servers() == {"b"}
+
+
+def test_who_does_not_confirm_its_mapping_is_told_of() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    world.cloud("a")
+    robot = world.robot()
+    assert value(series(families(fleet_of(world))), "plr_robot_mapping_synced", robot="robot") == 1.0
+    robot.silent = True
+    world.run(SETTLED_S)
+    assert value(series(families(fleet_of(world))), "plr_robot_mapping_synced", robot="robot") == 0.0
 
 
 def test_who_is_gone_has_series_that_say_so() -> None:

@@ -70,6 +70,7 @@ from protos.model import (
     Welcome,
 )
 from protos.preferences import Copies, InterfaceLabel
+from protos.redundancy_mode import RedundancyMode
 from protos.size_class import SIZE_CLASSES
 from protos.status import ResourceStatus, SidecarStatus, SyncState
 
@@ -146,6 +147,9 @@ uses = st.builds(
     copies.map(lambda pair: Copies(*pair)),
     probabilities,
     st.none() | st.booleans(),
+    st.sampled_from(RedundancyMode),
+    st.floats(0.5, 0.99),
+    st.booleans(),
 )
 permits = st.just(ALL_CALLS) | st.builds(CallPermit, st.frozensets(service_names, max_size=3))
 peers = st.builds(

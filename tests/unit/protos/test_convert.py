@@ -52,12 +52,14 @@ from protos.model import (
     ResourceKind,
     RevocationSet,
     Role,
+    ServiceSet,
     SessionId,
     SidecarMessage,
     Version,
 )
 from protos.names import MAX_STRING_BYTES, clean_text
 from protos.plr.v1 import admin_pb2, control_pb2, types_pb2
+from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from protos.status import SidecarStatus
 from tests.unit.protos import message_strategies as some
 
@@ -108,6 +110,24 @@ def test_an_explanation_says_who_is_gone(explanation: Explanation, gone: Departe
 @settings(max_examples=30)
 def test_explanations_round_trip(explanation: Explanation) -> None:
     assert explanation_from_proto(explanation_to_proto(explanation)) == explanation
+
+
+@pytest.mark.audit("ops-12")
+@pytest.mark.parametrize(
+    ("told", "mode"),
+    [
+        ({}, RedundancyMode.REPLICATE),
+        ({"redundancy": types_pb2.REDUNDANCY_MODE_HEDGE}, RedundancyMode.HEDGE),
+        ({"redundancy": 77}, RedundancyMode.SINGLE),
+    ],
+    ids=["an older sidecar tells none", "hedge", "a newer sidecar's"],
+)
+def test_a_mode_that_is_not_known_promises_the_least(told: dict[str, int], mode: RedundancyMode) -> None:
+    found = sidecar_message_from_proto(services(uses=[use(**told)]))
+    assert isinstance(found, ServiceSet)
+    assert found.uses[0].redundancy is mode
+    assert found.uses[0].hedge_quantile == DEFAULT_HEDGE_QUANTILE
+    assert not found.uses[0].budgeted
 
 
 @pytest.mark.parametrize(

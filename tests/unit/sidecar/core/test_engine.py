@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from protos.model import (
@@ -17,6 +19,8 @@ from protos.model import (
     SessionId,
     Version,
 )
+from protos.redundancy_mode import RedundancyMode
+from sidecar.core.budgets import Budget
 from sidecar.core.engine import SWEEP_EVERY_S, Engine, EngineConfig
 from sidecar.core.events import (
     AbandonExecution,
@@ -259,6 +263,19 @@ def test_the_robot_offers_what_a_reachable_cloud_offers_and_says_what_it_carries
     assert engine.uses() == (ServiceUse(ECHO, TYPE, 0.1, idempotent=True),)
     engine.set_carried({ECHO: True})
     assert engine.uses() == (ServiceUse(ECHO, TYPE, 0.1, idempotent=True, fallback_up=True),)
+
+
+@pytest.mark.audit("ops-12")
+def test_the_robot_says_how_its_copies_are_sent() -> None:
+    hedged = replace(rule(ECHO), redundancy=RedundancyMode.HEDGE, hedge_quantile=0.9)
+    for budget, limited in ((Budget("w*"), False), (Budget("w*", extra_load=0.1), True)):
+        engine = Engine(EngineConfig(Role.ROBOT, (hedged,), (budget,)), session_of("me", Role.ROBOT, 99), 0.0)
+        engine.set_interfaces([WLAN], 0.0)
+        engine.apply_peers(PeerSet(Version(1), 1, (peer(A),)), 0.0)
+        engine.on_link_event(PathChanged(path(), PathState.UP, ""), 0.1)
+        engine.set_carried({ECHO: None})
+        (told,) = engine.uses()
+        assert (told.redundancy, told.hedge_quantile, told.budgeted) == (RedundancyMode.HEDGE, 0.9, limited)
 
 
 @pytest.mark.audit("dp-14")
