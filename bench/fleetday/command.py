@@ -27,7 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--members", type=int, default=whole.members, help="sidecars (default %(default)s)")
     parser.add_argument("--hours", type=float, default=whole.hours, help="simulated hours (default %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="what happens is drawn from it (default %(default)s)")
-    parser.add_argument("--trace-memory", action="store_true", help="count the memory by tracemalloc, at half the speed")
+    parser.add_argument(
+        "--trace-memory", action="store_true", help="count the memory by tracemalloc, at half the speed"
+    )
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for fleet-day.json (default %(default)s)"
     )
@@ -84,7 +86,9 @@ def run(options: argparse.Namespace) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "fleet-day.json"
     path.write_text(json.dumps({"machine": machine(), **figures}, indent=2, default=str) + "\n")
-    console.print(f"{day.timeline.done} actions in {took_s:.0f} s of processor: {day.timeline.done / took_s:.0f} a second")
+    console.print(
+        f"{day.timeline.done} actions in {took_s:.0f} s of processor: {day.timeline.done / took_s:.0f} a second"
+    )
     console.print(f"figures: {path}")
     return 1 if day.checker.complaints_in_all or growing else 0
 

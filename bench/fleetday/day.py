@@ -387,7 +387,7 @@ class Day:
 
     def restart_plane(self) -> None:
         """The control plane stops or dies, and is back soon; now and then with a clock that was set back."""
-        if self._quiet:
+        if self._quiet or not self.plane.up:
             self._later(QUIET_S, 2 * QUIET_S, self.restart_plane)
             return
         self.happened["restart_plane"] += 1

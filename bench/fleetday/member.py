@@ -22,7 +22,6 @@ from protos.model import (
     PeerSet,
     Registration,
     Report,
-    ResourceKind,
     Role,
     ServiceSet,
     SessionId,

@@ -55,7 +55,9 @@ WALL_S = 1_800_000_000.0
 class Plane:
     """One control plane after the other, at the same address and with the same disk."""
 
-    def __init__(self, timeline: Timeline, settings: Settings, folder: Path, rng: random.Random, *, solving_s: float) -> None:
+    def __init__(
+        self, timeline: Timeline, settings: Settings, folder: Path, rng: random.Random, *, solving_s: float
+    ) -> None:
         self._solving_s = solving_s
         self._timeline = timeline
         self._settings = settings

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.distribution import Distribution
 from controlplane.core.fading import FadedCount, FadedHistogram
+from controlplane.core.forgetting import forget_after_s
 from controlplane.core.regime import ChangeWatch
 from controlplane.core.silence import HeardClock
 from controlplane.core.witnesses import COUNTS_ANYWAY, Witnesses
@@ -127,9 +128,10 @@ class ComputeTimes:
         kept[service] = None
         kept.move_to_end(service)
         if len(kept) > MAX_PROCESSING_OF_SERVER:
-            self._forget(server, next(iter(kept)))
+            self._drop(server, next(iter(kept)))
         elif len(self._servers) > MAX_PROCESSING:
-            self._forget(*next(iter(self._servers)))
+            self._drop(*next(iter(self._servers)))
+        self._forget_old(now)
         # No more than a robot may count for: what it says of one moment shall not pass for minutes.
         of_server.lately.add(min(samples, int(COUNTS_ANYWAY)), 0.0, now)
         processing = of_server.witnesses.weigh(robot, processing, now)
@@ -154,6 +156,19 @@ class ComputeTimes:
                 of_server.before = times.distribution()
                 times.forget(DOUBTED_REQUESTS / max(times.weight(now), DOUBTED_REQUESTS))
 
+    def _forget_old(self, now: float) -> None:
+        """Servers that nobody has heard of for long: there may be ever new ones, and all count for the usual times."""
+        since = now - forget_after_s(self._half_life_s)
+        while True:
+            oldest, of_server = next(iter(self._servers.items()))
+            if of_server.lately.at >= since:
+                return
+            self._forget(*oldest)
+
+    def _drop(self, server: NodeName, service: ServiceName) -> None:
+        self._forget(server, service)
+        self.dropped += 1
+
     def _forget(self, server: NodeName, service: ServiceName) -> None:
         del self._servers[server, service]
         del self._kept[server][service]
@@ -163,7 +178,8 @@ class ComputeTimes:
         del of_service.servers[server]
         if not of_service.servers:
             del self._services[service]
-        self.dropped += 1
+        else:
+            of_service.usual = None
 
     def changes(self, server: NodeName, service: ServiceName) -> tuple[int, Distribution | None]:
         """How often a server changed, and what it needed before it did so last."""

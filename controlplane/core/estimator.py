@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 from controlplane.core.compute import ComputeTimes, ServerTimes
 from controlplane.core.fading import FadedCount, FadedShares
 from controlplane.core.fleet_view import PathView
+from controlplane.core.forgetting import forget_after_s, forget_before
 from controlplane.core.interface_trouble import InterfaceTrouble
 from controlplane.core.late_fate import LateFate
 from controlplane.core.network import RobotNetwork
@@ -135,12 +136,12 @@ class _Robot:
     __slots__ = (
         *(
             "fates",
+            "heard_at",
             "joints",
             "late",
             "network",
             "outcomes",
             "penalties",
-            "reported_at",
             "services",
             "trials",
             "troubles",
@@ -149,6 +150,7 @@ class _Robot:
     )
 
     def __init__(self, half_life_s: float) -> None:
+        self.heard_at = 0.0
         self.network = RobotNetwork(half_life_s)
         self.trials: OrderedDict[Pair, _Pair] = OrderedDict()
         self.joints: OrderedDict[JointKey, FadedTrials] = OrderedDict()
@@ -161,7 +163,6 @@ class _Robot:
         """Worked out, by service and deadline ..."""
         self.troubles_at = (0, 0.0)
         """... from so many reports of all robots, at this time."""
-        self.reported_at = 0.0
 
 
 def _usual_sizes(tables: _Robot, service: ServiceName) -> tuple[tuple[int, float], ...]:
@@ -201,7 +202,7 @@ class Estimator:
         if tables is None:
             tables = self._robots[robot] = _Robot(self._half_life_s)
         self._robots.move_to_end(robot)
-        tables.reported_at = now
+        tables.heard_at = now
         network = tables.network
         self._forget_silent(robot, now)
         network.most = MAX_HISTOGRAMS // len(self._robots) if self._histograms >= MAX_HISTOGRAMS else MAX_HISTOGRAMS
@@ -225,15 +226,29 @@ class Estimator:
             self._keep(tables.outcomes, outcome.service, count, MAX_OUTCOMES_PER_ROBOT)
             count.add(outcome.ok + bad, bad, now)
             self._late_fate(tables, outcome.service, now).add_requests(outcome.ok + bad, bad, now)
+        self._forget_old(tables, now)
         self._dropped += network.dropped - dropped_before
         self._histograms += len(network)
         return changed
+
+    def _forget_old(self, tables: _Robot, now: float) -> None:
+        """Robots, and paths of this robot, that nobody has reported on for long: most of them never come back."""
+        since = now - forget_after_s(self._half_life_s)
+        tables.network.forget_before(since)
+        forget_before(tables.trials, since, lambda pair: pair.trials.at)
+        forget_before(tables.joints, since, lambda together: together.at)
+        forget_before(tables.fates, since, lambda fate: fate.at)
+        forget_before(tables.services, since, lambda of_service: of_service.sizes.at)
+        forget_before(tables.outcomes, since, lambda count: count.at)
+        while (oldest := next(iter(self._robots.values()))).heard_at < since:
+            self._robots.popitem(last=False)
+            self._histograms -= len(oldest.network)
 
     def _forget_silent(self, robot: NodeName, now: float) -> None:
         """Make room for this robot's report, as far as there are robots that have been silent for long."""
         while self._histograms >= MAX_HISTOGRAMS or len(self._robots) > MAX_ROBOTS:
             name, silent = next(iter(self._robots.items()))
-            if name == robot or now - silent.reported_at < LIVE_S:
+            if name == robot or now - silent.heard_at < LIVE_S:
                 return
             del self._robots[name]
             self._histograms -= len(silent.network)

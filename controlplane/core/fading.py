@@ -33,6 +33,11 @@ class FadedCount:
         self._all = 0.0
         self._bad = 0.0
 
+    @property
+    def at(self) -> float:
+        """When something was added last."""
+        return self._at
+
     def add(self, total: float, bad: float, now: float) -> None:
         """Count `total` events, `bad` of them wrong."""
         factor = math.exp2((self._at - now) / self._half_life_s)
@@ -62,6 +67,11 @@ class FadedShares:
         self._half_life_s = half_life_s
         self._at = now
         self._counts = [0.0] * kinds
+
+    @property
+    def at(self) -> float:
+        """When something was added last."""
+        return self._at
 
     def add(self, kind: int, count: float, now: float) -> None:
         """Count more of one kind."""
@@ -106,6 +116,11 @@ class FadedHistogram:
         self._total = 0.0
         self._distribution: Distribution | None = None
         self._answered: Distribution | None = None
+
+    @property
+    def at(self) -> float:
+        """When something was added last."""
+        return self._at
 
     def add(self, histogram: Histogram, now: float, called_off: Histogram | None = None) -> None:
         """Merge new samples, and of those called off when they were."""

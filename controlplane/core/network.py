@@ -16,6 +16,7 @@ from statistics import median
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from controlplane.core.fading import FadedCount, FadedHistogram
+from controlplane.core.forgetting import forget_before
 from controlplane.core.silence import HeardClock
 from protos.histogram import Histogram
 
@@ -183,6 +184,13 @@ class RobotNetwork:
         if len(table) > limit:
             table.popitem(last=False)
             self.dropped += 1
+
+    def forget_before(self, since: float) -> None:
+        """Forget what was not reported since."""
+        kept = len(self)
+        forget_before(self.paths, since, lambda path: path.rtt.at)
+        forget_before(self._cells, since, lambda cell: cell.at)
+        self._fresh = self._fresh and len(self) == kept
 
     def forget_paths(self) -> None:
         """Whether paths are up is not known any more, nor what they take by now; requests still tell."""

@@ -147,6 +147,11 @@ class FadedTrials:
         self._memories = tuple(_Memory(half_life_s * part, share) for part, share in MEMORIES)
         self._streaks = _Streaks(now)
 
+    @property
+    def at(self) -> float:
+        """When something was added last."""
+        return self._at
+
     def add(self, trials: float, misses: float, now: float) -> None:
         """Count trials, `misses` of them missed."""
         passed_s = now - self._at

@@ -101,7 +101,8 @@ class Publisher:
         self.changed(name, role)
         self._held_back.pop(name, None)
         self._known_peers.forget(name)
-        self._gone[name] = self._snapshots.pop(name)
+        gone = self._gone[name] = self._snapshots.pop(name)
+        gone.peers.sent = None  # a server's holds all robots as they were then
         if len(self._gone) > MAX_GONE_SNAPSHOTS:
             self._gone.popitem(last=False)
 

@@ -108,6 +108,11 @@ class SharedFate:
         self._batch_since = now
         self._batch_requests = self._batch_missed = 0.0
 
+    @property
+    def at(self) -> float:
+        """When something was added last."""
+        return self._at
+
     def add(self, report: InterfaceJointReport, now: float) -> None:
         """Count what a report tells."""
         kept = math.exp2((self._at - now) / HALF_LIFE_S)
