@@ -27,9 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--members", type=int, default=whole.members, help="sidecars (default %(default)s)")
     parser.add_argument("--hours", type=float, default=whole.hours, help="simulated hours (default %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="what happens is drawn from it (default %(default)s)")
-    parser.add_argument(
-        "--trace-memory", action="store_true", help="count the memory by tracemalloc, at half the speed"
-    )
+    parser.add_argument("--trace-memory", action="store_true", help="count all memory by tracemalloc; slow")
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for fleet-day.json (default %(default)s)"
     )

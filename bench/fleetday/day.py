@@ -48,9 +48,9 @@ TYPE = "nav_msgs/srv/GetPlan"
 DEADLINES_S = (0.125, 0.25, 0.5)
 WLAN, WWAN, WIRED = (InterfaceName(name) for name in ("wlan0", "wwan0", "eth0"))
 
-GROWTH_SHARE, GROWTH_SLACK = 0.3, 20
-"""By which a table may be larger in the second half of a day than in the first, beside a fifth of an entry for each
-member: who is there differs from hour to hour."""
+GROWTH_SHARE = 0.3
+"""By which a table may be larger in the second half of a day than in the first, beside some slack: who is there differs
+from hour to hour."""
 
 CAPPED = {
     "departed._departures": MAX_DEPARTED,
@@ -92,6 +92,8 @@ class Scale:
     """From one comparison of the two sides to the next."""
     measures_s: float = 300.0
     """From one measurement of a robot to its next; what else it reports is that paths went up or down."""
+    slack: int = 200
+    """Entries by which a table may differ."""
     restarts: int = 6
     """Of the control plane."""
 
@@ -456,6 +458,8 @@ class Day:
     def _moment(self) -> None:
         if not self._quiet:
             for _ in range(self.rng.randint(1, self.scale.events)):
+                if not (self._alive(Role.ROBOT) and self._alive(Role.CLOUD)):
+                    break
                 kind = self.rng.choices(self._kinds, self._weights)[0]
                 self.happened[kind.__name__] += 1
                 kind()
@@ -504,7 +508,7 @@ class Day:
         """Tables of the control plane that ran longest which grew with time."""
         run = self.plane.starts - 1
         sizes = [sample.sizes for sample in self.samples if sample.run == run]
-        return grown(sizes, share=GROWTH_SHARE, slack=GROWTH_SLACK + self.scale.members // 5, capped=CAPPED)
+        return grown(sizes, share=GROWTH_SHARE, slack=self.scale.slack, capped=CAPPED)
 
     @property
     def last_members(self) -> int:

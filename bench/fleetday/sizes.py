@@ -96,7 +96,7 @@ def grown(samples: list[Sizes], *, share: float, slack: int, capped: Mapping[str
             continue
         each = [sizes.entries[outer] if outer and sizes.entries.get(outer) else 1 for sizes in samples]
         shares = [count / holders for count, holders in zip(counts, each, strict=True)]
-        most = max(shares[:half], default=math.inf) * (1.0 + share) + (slack if outer is None else 1.0)
-        if min(shares[half:]) > most:
+        many = min(counts[half:]) > max(counts[:half], default=math.inf) * (1.0 if outer else 1.0 + share) + slack
+        if many and min(shares[half:]) > max(shares[:half]) * (1.0 + share):
             found.append(f"{name} grows: {counts}" + ("" if outer is None else f", in {each} entries of {outer}"))
     return found

@@ -17,26 +17,29 @@ from controlplane.core.drawing import Drawing
 from controlplane.core.registry import Registry
 from controlplane.core.snapshots import Track
 from controlplane.core.views import Views
+from protos.status import SyncState
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.model import PeerSet
+    from controlplane.core.snapshots import VersionSource
+    from protos.model import PeerSet, Version
 
 pytestmark = pytest.mark.audit("ops-24h")
 
 SMALL = Scale(
     members=24,
-    hours=0.6,
-    every_hours=0.1,
-    moment_s=12.0,
+    hours=0.5,
+    every_hours=0.25,
+    moment_s=10.0,
     events=3,
     grid_s=0.0,
     look_s=60.0,
     measures_s=120.0,
+    slack=120,
     restarts=2,
 )
-SHORT = dataclasses.replace(SMALL, members=10, hours=0.2, every_hours=0.1, restarts=0)
+SHORT = dataclasses.replace(SMALL, members=12, hours=0.2, every_hours=0.2, moment_s=5.0, restarts=0)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -71,15 +74,12 @@ def test_a_set_that_is_taken_and_not_applied_is_seen(tmp_path: Path, monkeypatch
     assert any("holds" in complaint for complaint in complaints(tmp_path))
 
 
-def test_a_removal_that_nobody_is_told_of_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    expire = Registry.expire
-
-    def forgetful(self: Registry, now: float) -> list[object]:
-        expire(self, now)
-        return []
-
-    monkeypatch.setattr(Registry, "expire", forgetful)
-    assert any("gone" in complaint for complaint in complaints(tmp_path))
+def test_a_lease_that_never_ends_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Registry, "expire", lambda self, now: [])
+    monkeypatch.setattr(Registry, "next_expiry", lambda self: None)
+    found = complaints(tmp_path)
+    assert any("is registered, and gone" in complaint for complaint in found)
+    assert any("still holds" in complaint for complaint in found)
 
 
 def test_a_version_that_is_never_sent_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,16 +89,26 @@ def test_a_version_that_is_never_sent_is_seen(tmp_path: Path, monkeypatch: pytes
 
 
 def test_what_is_taken_for_synced_without_being_so_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Track, "nack", Track.ack)
-    assert any("believed to hold" in complaint for complaint in complaints(tmp_path))
+    send = Track.send
+
+    def believing(self: Track[object], content: object, versions: VersionSource) -> Version:
+        version = send(self, content, versions)
+        self.state = SyncState.SYNCED
+        return version
+
+    monkeypatch.setattr(Track, "send", believing)
+    day = Day(7, SHORT, tmp_path)
+    day.timeline.after(300.0, lambda: [setattr(member, "refuses", True) for member in day.members.values()])
+    day.run()
+    assert any("believed to hold" in complaint for complaint in day.checker.complaints)
 
 
 def test_a_table_that_is_never_pruned_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Drawing, "_forget_others", lambda self, uses: None)
-    scale = dataclasses.replace(SHORT, hours=1.2, every_hours=0.2, moment_s=6.0)
-    day = Day(7, scale, tmp_path)
+    day = Day(7, dataclasses.replace(SHORT, hours=0.6, every_hours=0.3), tmp_path)
     day.run()
-    assert any(line.startswith("_drawing._drawn grows") for line in day.grown())
+    first, second = (sample.sizes.entries["_drawing._drawn"] for sample in day.samples)
+    assert second > 1.3 * first
 
 
 def test_sizes_are_counted_once_and_by_table() -> None:
