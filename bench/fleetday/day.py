@@ -16,7 +16,7 @@ from bench.fleetday.timeline import Timeline
 from controlplane.core.compute import MAX_PROCESSING
 from controlplane.core.control_events import Settings
 from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED
-from controlplane.core.mapping_history import MAX_HISTORIES
+from controlplane.core.mapping_history import MAX_CHANGES, MAX_HISTORIES
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.publisher import MAX_GONE_SNAPSHOTS
 from controlplane.core.registry import MAX_REMEMBERED_REMOVALS
@@ -56,6 +56,7 @@ CAPPED = {
     "departed._departures": MAX_DEPARTED,
     "departed._last_known": MAX_EXPLAINED,
     "history._histories": MAX_HISTORIES,
+    "history._histories[].changes": MAX_HISTORIES * MAX_CHANGES,
     "restlessness._shares": MAX_MEMBERS,
     "registry._removals": MAX_REMEMBERED_REMOVALS,
     "_publisher._gone": MAX_GONE_SNAPSHOTS,

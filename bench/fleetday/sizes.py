@@ -89,8 +89,8 @@ def grown(samples: list[Sizes], *, share: float, slack: int, capped: Mapping[str
     half = len(samples) // 2
     for name in sorted({name for sizes in samples for name in sizes.entries}):
         counts = [sizes.entries.get(name, 0) for sizes in samples]
-        outer = next((table for table in capped if name == table or name.startswith(table + "[]")), None)
-        if outer == name:
+        outer = next((table for table in capped if name.startswith(table + "[]")), None)
+        if name in capped:
             if max(counts) > capped[name]:
                 found.append(f"{name} is above its cap of {capped[name]}: {counts}")
             continue
