@@ -19,7 +19,7 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from controlplane.certificates import load_own_files
 from controlplane.config import load_config, refuse_exposed
@@ -40,7 +40,17 @@ EXIT_OK = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 
+_NO_STUN_SERVERS = (
+    "stun_servers is empty: sidecars are told no STUN server, and robots behind a NAT stay unreachable unless their "
+    "own configuration names one"
+)
+
 log = logging.getLogger("controlplane")
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        self.exit(EXIT_USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -64,6 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stderr.write(f"plr-controlplane: {'warning: ' if problem.in_force else ''}{problem.text}\n")
             if not problem.in_force:
                 return EXIT_USAGE
+        _warn_of_what_is_legal(config)
         sys.stdout.write(f"{arguments.config}: ok\n")
         return EXIT_OK
     _start_logging(config.log_level)
@@ -71,6 +82,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         # It starts all the same: a clock is set soon after a boot, and a certificate is read anew when it is replaced.
         log.log(logging.WARNING if problem.in_force else logging.ERROR, "%s", problem.text)
     return _serve(arguments.config, config, files)
+
+
+def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
+    """Say what the log of a start would warn of: a policy that allows nothing is legal, and locks a fleet out."""
+    from controlplane.policy_reload import doubt
+
+    warnings = [None if config.policy is None else doubt(config.policy.policy())]
+    warnings.append(_NO_STUN_SERVERS if config.stun_listen and not config.stun_servers else None)
+    for text in filter(None, warnings):
+        sys.stderr.write(f"plr-controlplane: warning: {text}\n")
 
 
 def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> int:
@@ -92,7 +113,7 @@ def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> 
 
 def _parser() -> argparse.ArgumentParser:
     summary, _, epilog = (__doc__ or "").partition("\n\n")
-    parser = argparse.ArgumentParser(
+    parser = _OneLineParser(
         prog="plr-controlplane",
         description=summary,
         epilog=epilog,
@@ -150,10 +171,7 @@ async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None)
             addresses.metrics or "off",
         )
         if addresses.stun and not config.stun_servers:
-            log.warning(
-                "stun_servers is empty: sidecars are told no STUN server, and robots behind a NAT stay unreachable "
-                "unless their own configuration names one"
-            )
+            log.warning("%s", _NO_STUN_SERVERS)
         interpreter.settle()
         systemd.ready()
 

@@ -24,16 +24,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
+def doubt(policy: Policy | None) -> str | None:
+    """What is worth a warning of a policy, or of having none."""
+    if policy is None:
+        return "there is no policy: every robot may call, and every cloud may offer, every service"
+    if policy.calls and policy.offers:
+        return None
+    nobody = "no robot may call any service" if not policy.calls else "no cloud may offer any service"
+    return f"policy: rules for calls {len(policy.calls)}, for offers {len(policy.offers)}: {nobody}"
+
+
 def announce(policy: Policy | None) -> None:
     """Log what is in force."""
-    if policy is None:
-        log.warning("there is no policy: every robot may call, and every cloud may offer, every service")
-    elif not policy.calls or not policy.offers:
-        nobody = "no robot may call any service" if not policy.calls else "no cloud may offer any service"
-        log.warning(
-            "policy in force: rules for calls %d, for offers %d: %s", len(policy.calls), len(policy.offers), nobody
-        )
-    else:
+    problem = doubt(policy)
+    if problem is not None:
+        log.warning("%s", problem)
+    elif policy is not None:
         log.info("policy in force: rules for calls %d, for offers %d", len(policy.calls), len(policy.offers))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from protos.durations import in_words
 from protos.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
 
 if TYPE_CHECKING:
@@ -41,16 +42,9 @@ def term_problem(files: TlsFiles, now_wall: float) -> TermProblem | None:
     if left_s >= SOON_S:
         return None
     remedy = _REMEDIES[EXPIRED].format(name=name)
-    return TermProblem(in_force=True, text=f"{path}: {_left(left_s)} until it ends; {remedy}")
+    return TermProblem(in_force=True, text=f"{path}: {in_words(left_s)} until it ends; {remedy}")
 
 
 def with_remedy(refusal: CertificateError, name: str) -> str:
     """Return why a node's certificate is refused and what to do about it, in one line."""
     return f"{refusal}; {_REMEDIES.get(refusal.reason, 'see docs/certificates.md').format(name=name)}"
-
-
-def _left(left_s: float) -> str:
-    for unit, seconds in (("days", 86_400.0), ("hours", 3600.0), ("minutes", 60.0)):
-        if left_s >= 2 * seconds:
-            return f"{left_s / seconds:.0f} {unit}"
-    return f"{left_s:.0f} seconds"

@@ -83,7 +83,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         # The constructors of the YAML package leak these for malformed scalars (!!int x, 2026-02-31).
         raise ConfigError(source, "", f"expected YAML: {_one_line(str(error))}") from error
     if data is None:
-        return {}
+        raise ConfigError(source, "", "expected keys and values, but it is empty; deploy/config has examples")
     if not isinstance(data, dict):
         raise ConfigError(source, "", f"expected keys and values, got {_shown(data)}")
     for key in data:

@@ -25,6 +25,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, SignatureAlgorithmOID
 
+from protos.durations import in_words
 from protos.errors import DecodeError
 from protos.names import node_name
 
@@ -340,6 +341,6 @@ def _validity(certificate: x509.Certificate) -> tuple[float, float]:
 
 def _check_time(not_before: float, not_after: float, now_wall: float, what: str) -> None:
     if now_wall < not_before:
-        raise CertificateError(NOT_YET_VALID, f"{what} is not valid yet, for {not_before - now_wall:.0f} s")
+        raise CertificateError(NOT_YET_VALID, f"{what} is not valid yet, for {in_words(not_before - now_wall)}")
     if now_wall > not_after:
-        raise CertificateError(EXPIRED, f"{what} expired {now_wall - not_after:.0f} s ago")
+        raise CertificateError(EXPIRED, f"{what} expired {in_words(now_wall - not_after)} ago")

@@ -37,6 +37,9 @@ EXIT_OK = 0
 EXIT_FAILURE = 1
 EXIT_BAD_CONFIG = 2
 
+SHORT_DEADLINE_MS = 1.0
+"""Below this somebody thought in seconds."""
+
 IMPATIENT_AFTER_S = 1.0
 """A signal this long after the first ends the program at once; sooner, it is one and the same sent to a group too."""
 
@@ -78,6 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             refuse_exposed(config, str(options.config))
         if options.check_config:
             _warn_of_missing_interfaces(config)
+            _warn_of_short_deadlines(config)
             _check_certificate(config)
             _check_ros(thorough=True)
             sys.stdout.write(f"{options.config}: ok\n")
@@ -115,6 +119,13 @@ def _warn_of_missing_interfaces(config: SidecarConfig) -> None:
 
     for line in missing_interfaces(list_interfaces(), config.interfaces):
         sys.stderr.write(f"{PROGRAM}: warning: {line}\n")
+
+
+def _warn_of_short_deadlines(config: SidecarConfig) -> None:
+    for number, service in enumerate(config.services):
+        if service.deadline_ms is not None and service.deadline_ms < SHORT_DEADLINE_MS:
+            problem = f"{service.deadline_ms:g} ms is less than any network takes; the unit is milliseconds"
+            sys.stderr.write(f"{PROGRAM}: warning: services[{number}].deadline_ms: {problem}\n")
 
 
 def _check_ros(*, thorough: bool) -> None:

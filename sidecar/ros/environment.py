@@ -46,8 +46,11 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
     said = _try(environment)
     if said is None:
         return None
-    if rmw:
-        return f"RMW_IMPLEMENTATION: expected an rmw that is installed, got {rmw!r}: {said}"
+    if rmw and rmw != DEFAULT_RMW:
+        return (
+            f"RMW_IMPLEMENTATION: {rmw!r} is not installed here; unset it, which means {DEFAULT_RMW}, or install it "
+            "with ROS from apt: ros-jazzy-" + rmw.replace("_", "-")
+        )
     return f"ROS 2 does not start here: {said}"
 
 

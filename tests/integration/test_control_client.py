@@ -298,10 +298,10 @@ def test_comes_back_with_the_python_of_debian_12(monkeypatch: pytest.MonkeyPatch
     """Until 3.11.3 `asyncio.timeout` took every cancellation counted in its task for one that is wanted now."""
     entered = asyncio.Timeout.__aenter__
 
-    async def enter(timeout: asyncio.Timeout) -> asyncio.Timeout:
-        await entered(timeout)
-        vars(timeout)["_cancelling"] = 0  # as 3.11.2 compares: with nothing, not with what was counted before
-        return timeout
+    async def enter(entering: asyncio.Timeout) -> asyncio.Timeout:
+        await entered(entering)
+        vars(entering)["_cancelling"] = 0  # as 3.11.2 compares: with nothing, not with what was counted before
+        return entering
 
     monkeypatch.setattr(asyncio.Timeout, "__aenter__", enter)
     port = free_port()

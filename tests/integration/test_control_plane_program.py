@@ -79,6 +79,35 @@ def test_check_config_and_version(tmp_path: Path) -> None:
     assert run().returncode == 2
 
 
+@pytest.mark.audit("ops-7")
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        ("policy:\n", "no robot may call any service"),
+        ("policy: {}\n", "no robot may call any service"),
+        ("stun_listen: 127.0.0.1:0\n", "stun_servers is empty"),
+    ],
+)
+def test_check_config_warns_of_what_is_legal_and_hardly_meant(tmp_path: Path, more: str, told: str) -> None:
+    config = tmp_path / "odd.yaml"
+    config.write_text(f"insecure: true\nlisten: 127.0.0.1:0\nstun_servers: [127.0.0.1:3478]\n{more}")
+    if "stun" in more:
+        config.write_text(f"insecure: true\nlisten: 127.0.0.1:0\n{more}")
+    done = run("--config", str(config), "--check-config")
+    assert (done.returncode, done.stdout) == (0, f"{config}: ok\n")
+    assert done.stderr.startswith("plr-controlplane: warning: ")
+    assert done.stderr.count("\n") == 1
+    assert told in done.stderr
+
+
+@pytest.mark.audit("ops-7")
+def test_wrong_usage_is_told_in_one_line() -> None:
+    done = run()
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.endswith("see plr-controlplane --help\n")
+
+
 def test_insecure_mode_is_refused_where_others_reach_it_unless_one_knows(tmp_path: Path) -> None:
     config = tmp_path / "exposed.yaml"
     config.write_text("insecure: true\n")
@@ -90,7 +119,10 @@ def test_insecure_mode_is_refused_where_others_reach_it_unless_one_knows(tmp_pat
 
 def test_without_certificates_and_without_the_word_insecure_it_does_not_start(tmp_path: Path) -> None:
     config = tmp_path / "neither.yaml"
-    cases = {"": "tls_dir: expected the folder", "insecure: true\ntls_dir: /etc/plr/tls": "one or the other"}
+    cases = {
+        "log_level: info": "tls_dir: expected the folder",
+        "insecure: true\ntls_dir: /etc/plr/tls": "one or the other",
+    }
     for text, told in cases.items():
         config.write_text(text)
         done = run("--config", str(config))

@@ -37,9 +37,10 @@ def ca() -> Authority:
         (
             -60.0,
             False,
-            "cert.pem: nobody talks to this node: the certificate of robot-1 expired 60 s ago; renew",
+            "cert.pem: nobody talks to this node: the certificate of robot-1 expired 60 seconds ago; renew",
         ),
-        (math.inf, False, "not valid yet, for 100 s; set this host's"),
+        (-864_006.0, False, "expired 10 days ago; renew"),
+        (math.inf, False, "not valid yet, for 100 seconds; set this host's"),
     ],
 )
 def test_the_terms_of_a_certificate(
@@ -75,7 +76,8 @@ def test_a_configuration_with_an_ended_certificate_is_refused_and_one_that_ends_
     ca.write_tls_dir(tmp_path / "tls", "node-1", role, validity=Validity(*term))
     config = tmp_path / "config.yaml"
     robot = "control_plane: 192.0.2.1:50051\nservices: [{name: /plan, deadline_ms: 100}]\n"
-    config.write_text(f"tls_dir: {tmp_path}/tls\n" + (robot if role is IdentityRole.ROBOT else ""))
+    others = "stun_servers: [192.0.2.1:3478]\n"
+    config.write_text(f"tls_dir: {tmp_path}/tls\n" + (robot if role is IdentityRole.ROBOT else others))
     main, name = (sidecar, "plr-sidecar") if role is IdentityRole.ROBOT else (control_plane, "plr-controlplane")
     code = main(["--config", str(config), "--check-config"])
     shown = capsys.readouterr()

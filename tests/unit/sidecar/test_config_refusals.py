@@ -186,7 +186,7 @@ def test_a_parameter_service_may_stand_behind_a_glob_which_does_not_open_it() ->
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "name: expected, but missing (and 3 more)"),
+        ("", "expected keys and values, but it is empty; deploy/config has examples"),
         ("- name", "expected keys and values"),
         ("name: [", "line 1: expected YAML"),
         ("name: a\nrole: robot\nname: b\n", "line 3: expected YAML: key 'name' is written twice"),
