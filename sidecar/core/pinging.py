@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from sidecar.core.path_id import PathId
     from sidecar.core.paths import Path
 
-PINGS_PER_S, PINGS_AT_ONCE = 20.0, 40.0
-"""Of one link, however many ask: some 30 kB a second of the longest that Ethernet carries, 60 kB at once."""
+PINGS_PER_S = 20.0
+"""Of one link, however many ask: some 30 kB a second of the longest that Ethernet carries, ..."""
+PINGS_AT_ONCE = 40.0
+"""... and so many at once."""
 COST_BYTES = 1500
 """A longer one counts as several."""
 MAX_PINGS_OUT = 64

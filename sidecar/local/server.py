@@ -75,6 +75,8 @@ REFUSALS = ("full", "user_full", "not_allowed", "bad_request", "too_often", "too
 """The keys of `LocalServer.refused`."""
 
 _SO_PEERGROUPS = 59
+_MAX_GROUPS_BYTES = 1024
+"""What Python asks the kernel for at most: 256 groups."""
 _CREDENTIALS = struct.Struct("iII")
 
 
@@ -465,7 +467,7 @@ def _groups(sock: socket.socket) -> set[int]:
     """The groups of who connected, as they were then."""
     own = int(_CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[2])
     try:
-        packed = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, 65_536)
+        packed = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _MAX_GROUPS_BYTES)
     except OSError:  # before Linux 4.13, or more groups than anybody has
         return {own}
     return {own, *(group for (group,) in struct.iter_unpack("I", packed))}

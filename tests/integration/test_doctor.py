@@ -47,6 +47,11 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Program]:
         try:
             for program in (cloud, robot):
                 program.start()
+            # Step by step, so that each has its patience on a busy machine.
+            cloud.wait_for_log("in use, port")
+            robot.wait_for_log("in use, port")
+            cloud.wait_for_log("registered with the control plane")
+            robot.wait_for_log("registered with the control plane")
             robot.wait_for_log("path lo to cloud-1 is up")
             yield robot
         finally:

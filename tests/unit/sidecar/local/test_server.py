@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import grp
 import json
 import os
 import socket
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -31,12 +33,12 @@ from sidecar.local.server import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 pytestmark = pytest.mark.audit("ops-14")
 
 PATIENCE_S = 20.0
 NOBODY = 65534
+ROOT = Path(__file__).parents[4]
 
 
 class Source:
@@ -153,6 +155,36 @@ with socket.socket(socket.AF_UNIX) as sock:
     asked = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
     assert "only root and members of the group plr may ask" in asked.stdout, asked.stderr
     assert server.refused["not_allowed"] == 1
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="becoming another user takes root")
+def test_a_member_of_the_group_may_ask_and_others_may_not(
+    tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = grp.getgrnam("daemon")
+    monkeypatch.setattr(server_module, "GROUP", group.gr_name)
+    for folder in [tmp_path, *tmp_path.parents[:2]]:
+        folder.chmod(0o755)
+    server = LocalServer(tmp_path / "sidecar.sock", source)
+    server.open()
+    try:
+        status = server.path.stat()
+        assert (stat.S_IMODE(status.st_mode), status.st_gid) == (0o660, group.gr_gid)
+        for groups, allowed in (([group.gr_gid], True), ([], False)):
+            script = f"""
+import os, sys, pathlib
+from sidecar.local.client import LocalClient, LocalError
+os.setgroups({groups}); os.setgid({NOBODY}); os.setuid({NOBODY})
+try:
+    print(LocalClient(pathlib.Path({str(server.path)!r})).state()["node"]["name"])
+except LocalError as error:
+    print(error)
+"""
+            asked = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, cwd=ROOT)
+            assert ("robot-1" in asked.stdout) is allowed, asked.stderr
+            assert ("this user may not ask the sidecar" in asked.stdout) is not allowed
+    finally:
+        server.close()
 
 
 @pytest.mark.parametrize(
