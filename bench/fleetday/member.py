@@ -22,6 +22,7 @@ from protos.model import (
     PeerSet,
     Registration,
     Report,
+    ResourceKind,
     Role,
     ServiceSet,
     SessionId,

@@ -106,7 +106,7 @@ class Plane:
         self._matcher = Matcher()
         self.events = EventLog(self._folder, wall=self._wall, clock=lambda: self._timeline.now)
         self._core.remember(*departures(self.events.events(), now_wall=self._wall(), now=now), now)
-        self._core.relay_revocations(self.crl)
+        self._core.relay_revocations(self.crl, now)
         self.started_at = now
         self.starts += 1
         self.events.record(EventKind.STARTED)
@@ -178,7 +178,7 @@ class Plane:
         self.barred.add(name)
         self.crl = crl
         if self._core is not None:
-            self._core.relay_revocations(crl)
+            self._core.relay_revocations(crl, self._timeline.now)
             self._core.part_with(name, reason, self._timeline.now)
             self._settle()
 

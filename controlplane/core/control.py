@@ -478,10 +478,24 @@ class ControlCore:
             self._drawing_since = now
             self._drawing.begin(routine=change is Change.REPORT)
         ready = (sidecar for sidecar in self.registry if sidecar.ready)
-        if not self._drawing.advance(ready, self.permits, self.estimator, now):
+        if not self._drawing.advance(ready, self.permits, self.estimator, now, self._lost_share):
             return None
         self._drawing_since = None
+        if self._drawing.urgent_left:
+            self._debounce.go_on(now)
+        if self._drawing.routine_left:
+            self._debounce.note(Change.REPORT, now)
         return self._drawing.picture()
+
+    def _lost_share(self, robot: NodeName) -> float:
+        """The share of a robot's assignments whose paths are not up."""
+        sidecar = self.registry.get(robot)
+        if sidecar is None:
+            return 0.0
+        plans = (self.plan.blocks.get(BlockKey(robot, use.name)) for use in sidecar.uses)
+        pairs = [pair for plan in plans if plan is not None for pair in plan.assignments]
+        lost = sum(not self.estimator.path_up(robot, interface, server) for interface, server in pairs)
+        return lost / len(pairs) if pairs else 0.0
 
     def settle(self, picture: Picture, plan: Plan, now: float) -> Settled:
         """Decide what of the solver's answer is worth a change, for `solved`.

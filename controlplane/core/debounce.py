@@ -48,6 +48,11 @@ class Debounce:
             self._urgent = change
             self._urgent_at = now + URGENT_DELAY_S
 
+    def go_on(self, now: float) -> None:
+        """The solving that is under way is not for everything urgent: the next one follows at once."""
+        self._urgent = self._urgent or Change.PATH
+        self._urgent_at = now
+
     def next_time(self) -> float | None:
         """When to solve; None while nothing changed, or while a solving runs."""
         if self._running:

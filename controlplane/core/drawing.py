@@ -18,7 +18,7 @@ from controlplane.core.problem import BlockKey, FleetKey, Problem
 from protos.model import Role
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.path_rules import PathRule
@@ -39,6 +39,11 @@ LOOKED_AT_ONCE = 200
 
 FEW_ROBOTS = 16
 """Robots that are all estimated anew when they are to be drawn at once: of more, those only that have to be."""
+
+URGENT_AT_ONCE, URGENT_SHARE = 64, 0.25
+"""Robots that are to be drawn whatever it costs and are drawn for one picture: so many, or this share of those that
+wait, if that is more. So their mappings leave while the next ones are drawn, and each picture, which takes time for the
+whole fleet, is worth it."""
 
 ROUTINE_PAIRS = 4000
 """Pairs estimated between two routine solvings because of reports alone: a tenth of a processor."""
@@ -133,8 +138,15 @@ class Drawing:
         self._surprise: dict[NodeName, float] = {}
         """Robots that reported since they were drawn, and their misses beyond those believed in."""
         self._routine = False
-        self._queue: list[tuple[NodeName, bool]] | None = None
-        """Robots still to be drawn for the next picture, the last one first; None until looked for."""
+        self._queue: list[NodeName] | None = None
+        """Robots still to be drawn for the next picture because of reports, the last one first; None until looked
+        for."""
+        self._urgent_order: list[NodeName] = []
+        """Of the urgent ones, the last one first; those that became so since are not in it."""
+        self._urgent_most = 0
+        self._urgent_drawn = 0
+        """For the next picture, of at most so many."""
+        self._routine_pairs = 0
         self._rest: tuple[NodeName, bool, list[tuple[BlockKey, _Inputs]]] | None = None
         """The robot that is being drawn, and its uses that are still to be, the last one first."""
 
@@ -172,11 +184,31 @@ class Drawing:
         self._routine = routine
         self._queue = None
         self._put_back()
+        self._urgent_order.clear()
+        self._urgent_drawn = self._routine_pairs = 0
 
-    def advance(self, sidecars: Iterable[Sidecar], permits: Permits, estimator: Estimator, now: float) -> bool:
+    @property
+    def urgent_left(self) -> bool:
+        """Whether the next picture is wanted at once, for robots that this one has no place for."""
+        return bool(self._urgent)
+
+    @property
+    def routine_left(self) -> bool:
+        """Whether some robots were left out that are to be drawn because of reports."""
+        return bool(self._queue)
+
+    def advance(
+        self,
+        sidecars: Iterable[Sidecar],
+        permits: Permits,
+        estimator: Estimator,
+        now: float,
+        lost: Callable[[NodeName], float] = lambda robot: 0.0,
+    ) -> bool:
         """Draw some of what has to be drawn for the next picture; True once that is complete.
 
-        `sidecars` are those ready. To be called again until it returns True, with other work in between.
+        `sidecars` are those ready. Urgent robots go first, those with most `lost` before others; beside them those
+        that merely reported get a slice. To be called again until it returns True, with other work in between.
         """
         if self._frame is None:
             if self._looking is None:
@@ -187,15 +219,14 @@ class Drawing:
             self._looking = None
         assert self._frame is not None
         if self._queue is None:
-            routine = self._next_routine(self._frame, now) if self._routine else []
-            self._queue = [(name, True) for name in routine]
-        few = len(self._urgent) <= FEW_ROBOTS
-        self._queue += [(name, anew or few) for name, anew in reversed(self._urgent.items())]
-        self._urgent.clear()
+            self._queue = self._next_routine(self._frame, now) if self._routine else []
         pairs = 0
-        while (self._rest or self._queue) and pairs < SLICE_PAIRS:
+        while pairs < SLICE_PAIRS:
             if self._rest is None:
-                robot, anew = self._queue.pop()
+                found = self._next_robot(lost)
+                if found is None:
+                    return True
+                robot, anew = found
                 self._rest = robot, anew, list(reversed(self._frame.uses.get(robot, ())))
                 if anew or robot not in self._at:
                     self._at[robot] = now
@@ -205,7 +236,28 @@ class Drawing:
                 pairs += self._draw_use(*uses.pop(), estimator, now, anew=anew)
             if not uses:
                 self._rest = None
-        return not self._queue and not self._rest
+        return not (self._rest or self._urgent or self._queue)
+
+    def _next_robot(self, lost: Callable[[NodeName], float]) -> tuple[NodeName, bool] | None:
+        """The robot to draw next, and whether it is estimated anew; None if the picture is complete."""
+        if not self._urgent_drawn:
+            self._urgent_most = max(URGENT_AT_ONCE, round(URGENT_SHARE * len(self._urgent)))
+        if self._urgent and self._urgent_drawn < self._urgent_most:
+            few = len(self._urgent) + self._urgent_drawn <= FEW_ROBOTS
+            while not self._urgent_order or self._urgent_order[-1] not in self._urgent:
+                if self._urgent_order:
+                    self._urgent_order.pop()
+                else:
+                    self._urgent_order = sorted(reversed(self._urgent), key=lost)
+            robot = self._urgent_order.pop()
+            self._urgent_drawn += 1
+            return robot, self._urgent.pop(robot) or few
+        if self._queue and (not self._urgent_drawn or self._routine_pairs < SLICE_PAIRS):
+            robot = self._queue.pop()
+            if self._frame is not None:
+                self._routine_pairs += sum(inputs.pairs for _, inputs in self._frame.uses.get(robot, ()))
+            return robot, True
+        return None
 
     def _put_back(self) -> None:
         """A robot of which some uses were drawn is drawn anew."""

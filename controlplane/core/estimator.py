@@ -240,6 +240,7 @@ class Estimator:
         forget_before(tables.fates, since, lambda fate: fate.at)
         forget_before(tables.services, since, lambda of_service: of_service.sizes.at)
         forget_before(tables.outcomes, since, lambda count: count.at)
+        forget_before(tables.late, since, lambda late: late.at)
         while (oldest := next(iter(self._robots.values()))).heard_at < since:
             self._robots.popitem(last=False)
             self._histograms -= len(oldest.network)

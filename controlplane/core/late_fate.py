@@ -25,6 +25,11 @@ class LateFate:
         self._first = FadedCount(HALF_LIFE_S, now)
         self._requests = FadedCount(HALF_LIFE_S, now)
 
+    @property
+    def at(self) -> float:
+        """When something was added last."""
+        return max(self._first.at, self._requests.at)
+
     def add_first(self, copies: float, missed: float, now: float) -> None:
         """Count first copies, of which each would have been measured with the same probability."""
         self._first.add(copies, missed, now)

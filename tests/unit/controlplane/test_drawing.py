@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -14,6 +15,8 @@ from controlplane.core.drawing import (
     SLICE_PAIRS,
     STALE_S,
     SURPRISE_MISSES,
+    URGENT_AT_ONCE,
+    URGENT_SHARE,
     WEIGHT_SHARE,
     Drawing,
     is_alike,
@@ -24,6 +27,9 @@ from controlplane.core.problem import Block, BlockKey, Objective
 from controlplane.core.registry import Sidecar
 from protos.model import InterfaceName, NodeName, Report, Role, ServiceName, ServiceSet
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 ALL_UP = tuple(path(interface, server) for interface in ("wlan0", "wwan0") for server in ("a", "b"))
 ONE_DOWN = (path("wlan0", "a", up=False), *ALL_UP[1:])
@@ -56,10 +62,21 @@ class Fleet:
             self.drawing.robot_changed(robot)
 
     def draw(self, *, routine: bool) -> int:
-        """Returns in how many slices."""
+        """All that is urgent, in as many pictures as that takes; returns in how many slices."""
+        slices = 0
+        while True:
+            slices += self.draw_one(routine=routine)
+            if not self.drawing.urgent_left:
+                return slices
+
+    def draw_one(self, *, routine: bool, lost: Mapping[NodeName, float] | None = None) -> int:
+        """One picture; returns in how many slices."""
+        share = {} if lost is None else lost
         self.drawing.begin(routine=routine)
         slices = 1
-        while not self.drawing.advance(self.sidecars, self.permits, self.estimator, self.now):
+        while not self.drawing.advance(
+            self.sidecars, self.permits, self.estimator, self.now, lambda robot: share.get(robot, 0.0)
+        ):
             slices += 1
         return slices
 
@@ -225,3 +242,46 @@ def test_one_robot_with_many_services_is_drawn_in_slices_too() -> None:
     while not fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now):
         pass
     assert {block.servers for block in fleet.drawing.picture().problem.blocks} == {("b",)}
+
+
+@pytest.mark.audit("ops-20")
+def test_of_many_urgent_robots_a_part_is_drawn_at_once_and_those_that_lost_most_first() -> None:
+    fleet = Fleet(3 * URGENT_AT_ONCE)
+    before = fleet.blocks()
+    for name in fleet.names:
+        fleet.report(name, Report(paths=ONE_DOWN))
+    lost = {name: 1.0 for name in fleet.names[100:][:URGENT_AT_ONCE]}
+    fleet.draw_one(routine=False, lost=lost)
+    assert fleet.moved(before) == lost.keys()
+    assert fleet.drawing.urgent_left
+    fleet.draw_one(routine=False)
+    assert fleet.moved(before) == {*lost, *fleet.names[:URGENT_AT_ONCE]}, "then those that waited longest"
+    fleet.draw(routine=False)
+    assert fleet.moved(before) == set(fleet.names)
+    assert not fleet.drawing.urgent_left
+
+
+@pytest.mark.audit("ops-20")
+def test_of_very_many_a_share_is_drawn_at_once() -> None:
+    fleet = Fleet(8 * URGENT_AT_ONCE)
+    before = fleet.blocks()
+    for name in fleet.names:
+        fleet.report(name, Report(paths=ONE_DOWN))
+    fleet.draw_one(routine=False)
+    assert len(fleet.moved(before)) == round(URGENT_SHARE * len(fleet.names)) > URGENT_AT_ONCE
+
+
+@pytest.mark.audit("ops-20")
+def test_urgent_robots_keep_no_others_from_being_drawn() -> None:
+    fleet = Fleet(40)
+    fleet.now = STALE_S / 2
+    for name in fleet.names:
+        fleet.report(name, Report((latency("wwan0", "b", histogram(0.01, times=50)),), ALL_UP))
+    flapping = fleet.names[0]
+    before = fleet.blocks()
+    for turn in range(20):
+        fleet.report(flapping, Report(paths=ONE_DOWN if turn % 2 else ALL_UP))
+        fleet.draw_one(routine=True)
+        if fleet.moved(before) == set(fleet.names):
+            return
+    raise AssertionError(f"only {len(fleet.moved(before))} were drawn")
