@@ -6,6 +6,7 @@ import math
 import random
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from bench.fleetday.checks import Checker, is_healthy
@@ -213,7 +214,7 @@ class Day:
     def _someone(self, role: Role | None = None) -> Member:
         return self.rng.choice(self._alive(role))
 
-    def _later(self, least_s: float, most_s: float, action: Callable[[], None]) -> None:
+    def _later(self, least_s: float, most_s: float, action: Callable[[], object]) -> None:
         when = self.timeline.now + self.rng.uniform(least_s, most_s)
         if self.scale.grid_s and most_s > self.scale.grid_s:
             when = math.ceil(when / self.scale.grid_s) * self.scale.grid_s + self.rng.random()
@@ -345,6 +346,11 @@ class Day:
         """A sidecar takes nothing for a while, as its driver hangs."""
         self._spell(self._someone(), "refuses")
 
+    def refuse_all(self) -> None:
+        """Nobody takes anything any more."""
+        for member in self._alive():
+            member.refuses = True
+
     def reads_slowly(self) -> None:
         """A sidecar behind a bad link takes seconds for a message."""
         member = self._someone()
@@ -442,7 +448,7 @@ class Day:
         self.plane.start()
         for number in range(self.scale.members):
             role = Role.CLOUD if number < self.clouds_wanted else Role.ROBOT
-            self._later(0.0, 60.0, lambda role=role: self._join(role))  # type: ignore[misc]  # bound in its own turn
+            self._later(0.0, 60.0, partial(self._join, role))
         length_s = self.scale.hours * HOUR_S
         spread = self.scale.restarts
         for kind, count, last in (

@@ -29,8 +29,8 @@ pytestmark = pytest.mark.audit("ops-24h")
 
 SMALL = Scale(
     members=24,
-    hours=0.5,
-    every_hours=0.25,
+    hours=0.4,
+    every_hours=0.2,
     moment_s=10.0,
     events=3,
     grid_s=0.0,
@@ -98,7 +98,7 @@ def test_what_is_taken_for_synced_without_being_so_is_seen(tmp_path: Path, monke
 
     monkeypatch.setattr(Track, "send", believing)
     day = Day(7, SHORT, tmp_path)
-    day.timeline.after(300.0, lambda: [setattr(member, "refuses", True) for member in day.members.values()])
+    day.timeline.after(300.0, day.refuse_all)
     day.run()
     assert any("believed to hold" in complaint for complaint in day.checker.complaints)
 

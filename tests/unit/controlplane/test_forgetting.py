@@ -84,10 +84,10 @@ def test_a_server_that_is_gone_keeps_no_robots() -> None:
         core.receive(stream, ServiceSet((offer(),)) if role is Role.CLOUD else ServiceSet((), (use(),)), 0.0)
     core.handle_timer(1.0)
     cloud = NodeName("cloud")
-    snapshots = core._publisher[cloud]
-    assert snapshots.peers.sent is not None
+    assert core._publisher[cloud].peers.sent is not None
     core.end_stream(cloud, CloseReason.CERTIFICATE_ENDED, 1.0)
     core.handle_timer(100.0)
     assert core.registry.get(cloud) is None
+    snapshots = core._publisher._gone[cloud]
     assert snapshots.peers.sent is None
     assert snapshots.known_names == {"robot"}
