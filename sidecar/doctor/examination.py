@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections import Counter
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from protos.config_file import parse_yaml, read_text
 from protos.errors import ConfigError, DecodeError
 from protos.identity import Identity, IdentityRole
 from protos.model import NodeName, ServiceName
@@ -69,11 +71,27 @@ def sockets(where: Where, config: SidecarConfig | None) -> list[Path]:
     """Return where the sidecar's socket may be, the likelier first."""
     if where.socket is not None:
         return [where.socket]
-    if config is None:
-        return [RUNTIME_SOCKET]
-    if config.local_socket != "auto":
-        return [] if config.local_socket is None else [Path(config.local_socket)]
-    return [config.state_dir / "sidecar.sock", RUNTIME_SOCKET]
+    if config is not None:
+        told, state_dir = config.local_socket, config.state_dir
+    else:
+        told, state_dir = _as_written(where.config)
+    if told != "auto":
+        return [] if told is None else [Path(told)]
+    return [state_dir / "sidecar.sock", RUNTIME_SOCKET]
+
+
+def _as_written(path: Path) -> tuple[str | None, Path]:
+    """Return local_socket and state_dir of a configuration that is wrong, or whose certificate this user may not read:
+    where the running sidecar is, it may tell all the same."""
+    try:
+        data = parse_yaml(read_text(path), str(path))
+    except ConfigError:
+        data = {}
+    told, state_dir = data.get("local_socket", "auto"), data.get("state_dir")
+    return (
+        told if told is None or isinstance(told, str) else "auto",
+        Path(state_dir if isinstance(state_dir, str) else "/var/lib/plr"),
+    )
 
 
 def connect(where: Where, config: SidecarConfig | None) -> LocalClient:
@@ -122,8 +140,7 @@ def examine(where: Where, *, pinging: bool = True) -> Examination:
         expected = None if config is None else config.name
         seen.findings += _judged(lambda state: running_checks.node(state, expected), seen.state)
     if problem is not None:
-        remedy = "correct it, and try: plr-sidecar --config FILE --check-config"
-        seen.findings.append(fail("configuration", str(problem), remedy))
+        seen.findings.append(_wrong(problem))
     elif config is not None:
         seen.findings.append(ok("configuration", f"{where.config} is right"))
     now_wall = time.time()
@@ -143,6 +160,14 @@ def _try_config(where: Where, told: Mapping[str, Any] | None) -> tuple[SidecarCo
         return read_config(where, told), None
     except ConfigError as error:
         return None, error
+
+
+def _wrong(problem: ConfigError) -> Finding:
+    if problem.problem.endswith(os.strerror(errno.EACCES)):
+        return warn(
+            "configuration", f"{problem}: not for this user to read, so that it is not judged", "sudo plr doctor"
+        )
+    return fail("configuration", str(problem), "correct it, and try: plr-sidecar --config FILE --check-config")
 
 
 def _not_running(error: LocalError, where: Where) -> Finding:

@@ -86,8 +86,10 @@ def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[F
 def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str | None) -> Iterator[Finding]:
     """Judge ROS by the sidecar's `environment`; `problem` is what `sidecar.ros.environment` found."""
     if problem is not None:
-        text, _, remedy = problem.partition(": ")
-        yield fail("ros", text if remedy else problem, remedy or "see docs/install.md, ROS on the host")
+        remedy = (
+            "mend the environment of the unit (/etc/plr/sidecar.env) or of this shell: docs/install.md, ROS on the host"
+        )
+        yield fail("ros", problem, remedy)
     else:
         yield ok(
             "ros", f"rclpy works, with {environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp (the default)'}"

@@ -63,6 +63,8 @@ def _try(environment: Mapping[str, str]) -> str | None:
         )
     except subprocess.TimeoutExpired:
         return f"rclpy did not start within {TRY_TIMEOUT_S:.0f} s"
+    except OSError as error:
+        return f"{sys.executable} cannot be run by this user: {error.strerror or error}"
     if done.returncode == 0:
         return None
     lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [f"it ends with {done.returncode}"]

@@ -1,0 +1,66 @@
+"""Where the doctor looks for a sidecar, and what it makes of an answer of another version."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import yaml
+
+from protos.errors import ConfigError
+from sidecar.doctor.examination import RUNTIME_SOCKET, Where, _judged, _wrong, sockets
+from sidecar.doctor.finding import Level
+from sidecar.doctor.running_checks import paths
+from tests.unit.sidecar.configs import ROBOT, parse
+
+if TYPE_CHECKING:
+    from typing import Any
+
+pytestmark = pytest.mark.audit("ops-14")
+
+
+def test_the_socket_is_where_the_configuration_says() -> None:
+    assert sockets(Where(), parse(ROBOT)) == [Path("/var/lib/plr/sidecar.sock"), RUNTIME_SOCKET]
+    assert sockets(Where(), parse(ROBOT, local_socket="/run/x.sock")) == [Path("/run/x.sock")]
+    assert sockets(Where(), parse(ROBOT, local_socket=None)) == []
+    assert sockets(Where(socket=Path("/run/y.sock")), parse(ROBOT)) == [Path("/run/y.sock")]
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [
+        ({"local_socket": "/run/x.sock", "nonsense": 1}, [Path("/run/x.sock")]),
+        ({"state_dir": "/srv/plr", "nonsense": 1}, [Path("/srv/plr/sidecar.sock"), RUNTIME_SOCKET]),
+        ({"local_socket": 7, "state_dir": []}, [Path("/var/lib/plr/sidecar.sock"), RUNTIME_SOCKET]),
+    ],
+)
+def test_also_where_the_rest_of_it_is_wrong(tmp_path: Path, written: dict[str, Any], expected: list[Path]) -> None:
+    path = tmp_path / "sidecar.yaml"
+    path.write_text(yaml.safe_dump(written))
+    assert sockets(Where(path), None) == expected
+
+
+def test_under_systemd_it_is_in_the_runtime_folder() -> None:
+    config = parse(ROBOT)
+    assert config.local_socket_path("/run/plr") == RUNTIME_SOCKET
+    assert config.local_socket_path(None) == Path("/var/lib/plr/sidecar.sock")
+    assert parse(ROBOT, local_socket=None).local_socket_path("/run/plr") is None
+
+
+@pytest.mark.parametrize("wrong", ["sidecar.sock", "", "/" + "x" * 107])
+def test_a_path_that_cannot_be_one_is_refused(wrong: str) -> None:
+    with pytest.raises(ConfigError, match="local_socket: expected auto, null or an absolute path"):
+        parse(ROBOT, local_socket=wrong)
+
+
+def test_what_another_version_tells_is_a_warning() -> None:
+    (finding,) = _judged(lambda state: paths(state, {}), {"paths": [{"interface": "wlan0"}]})
+    assert finding.level is Level.WARN
+    assert "not understood" in finding.text
+
+
+def test_a_file_that_is_not_for_this_user_is_no_failure() -> None:
+    assert _wrong(ConfigError("x.yaml", "", f"cannot be read: {os.strerror(13)}")).level is Level.WARN
+    assert _wrong(ConfigError("x.yaml", "deadline", "unknown key")).level is Level.FAIL
