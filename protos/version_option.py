@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING, Any
 
 from protos import commit
@@ -26,4 +27,5 @@ class ShowVersion(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
         """End the program."""
-        parser.exit(message=f"{describe(parser.prog)}\n")
+        sys.stdout.write(f"{describe(parser.prog)}\n")
+        parser.exit()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos import extras
+from protos import commit, extras
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -173,3 +173,11 @@ def test_without_git_a_wheel_names_no_commit(checkout: Path) -> None:
     git(checkout.parent, "init", "--quiet")
     git(checkout.parent, "commit", "--quiet", "--allow-empty", "--message", "another")
     assert "protos/commit.txt" not in content(build(checkout))
+
+
+@pytest.mark.audit("ops-10")
+def test_a_checkout_asks_git_and_does_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert commit.commit.__wrapped__() is None
+    monkeypatch.setattr(commit, "commit", lambda: "0123456789ab")
+    assert commit.version().endswith("+0123456789ab")

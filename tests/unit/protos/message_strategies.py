@@ -178,6 +178,7 @@ registrations = st.builds(
     versions,
     credentials,
     domain_labels,
+    st.integers(0, 0xFFFFFFFF),
 )
 
 
