@@ -13,6 +13,7 @@ or several: what is put in force is whole (`PeerAssembly`).
 from __future__ import annotations
 
 import enum
+import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -61,6 +62,9 @@ HEARTBEATS_PER_LEASE = 3.0
 
 URGENT_PART, URGENT_LEAST_S = 0.1, 0.1
 """What is urgent is reported so soon after the report before: a part of the interval, and at least so much."""
+
+PERHAPS_UNTOLD_S = 15.0
+"""What was urgent so shortly before a stream is told again: the one before may have been dead already, unnoticed."""
 
 MIN_INTERVAL_S = 0.05
 """Floor of what the control plane may ask for: it must not be able to make the sidecar spin."""
@@ -142,6 +146,7 @@ class ControlSession:
         self._heartbeat_interval_s = 0.0
         self._report_interval_s = 0.0
         self._reported_at = 0.0
+        self._urgent_at = -math.inf
         self._heartbeat_at = 0.0
         self._report_at = 0.0
         self._clear_outgoing()
@@ -247,6 +252,8 @@ class ControlSession:
         self._report_at = (
             min(self._report_at, now + self._report_interval_s) if told_before else (now + self._report_interval_s)
         )
+        if not told_before and (self._urgent_at > self._reported_at or now - self._urgent_at < PERHAPS_UNTOLD_S):
+            self._report_at = min(self._report_at, max(now, self._soonest_report()))
         return welcome
 
     def _receive_peers(self, message: PeerSet) -> Apply | None:
@@ -354,7 +361,9 @@ class ControlSession:
         """Something happened that cannot wait for the interval: a path went, a deadline was missed.
 
         The fleet's size counts all the same, as it may have happened to all: two reports are a tenth of it apart.
+        Without a stream it waits for the next one.
         """
+        self._urgent_at = now
         self._report_at = min(self._report_at, max(now, self._soonest_report()))
 
     def _soonest_report(self) -> float:

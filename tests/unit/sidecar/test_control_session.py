@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import random
 
 import pytest
@@ -444,6 +445,66 @@ def test_what_is_urgent_is_reported_before_it_is_due_but_not_all_the_time() -> N
     session.send_report(REPORT, 6.0)
     answer(session, 6.0)
     assert session.next_timer() == 16.0
+
+
+def welcomed(session: ControlSession, now: float, interval_s: float = 10.0) -> ControlSession:
+    session.opened(now)
+    session.messages_to_send(now)
+    session.receive(Welcome(lease_s=3 * interval_s, report_interval_s=interval_s), now)
+    session.messages_to_send(now)
+    return session
+
+
+@pytest.mark.audit("ops-18")
+@pytest.mark.parametrize("interval_s", [0.5, 10.0])
+def test_a_network_that_flaps_all_the_time_makes_no_more_than_ten_reports_in_an_interval(interval_s: float) -> None:
+    session = welcomed(make_session(), 0.0, interval_s)
+    reported_at = []
+    for tick in range(int(20 * interval_s / 0.05)):
+        now = 0.05 * tick
+        session.report_at_once(now)
+        if session.report_due(now):
+            session.send_report(REPORT, now)
+            assert REPORT in session.messages_to_send(now)
+            reported_at.append(now)
+    least_s = max(interval_s / 10, 0.1)
+    assert 20 * interval_s / least_s / 2 < len(reported_at) <= 20 * interval_s / least_s + 1
+    assert min(b - a for a, b in itertools.pairwise(reported_at)) >= least_s - 1e-9
+
+
+@pytest.mark.audit("ops-18")
+def test_what_happens_without_a_stream_is_reported_as_soon_as_there_is_one() -> None:
+    session = welcomed(make_session(), 0.0)
+    session.send_report(REPORT, 10.0)
+    session.messages_to_send(10.0)
+    session.closed(20.0)
+    session.report_at_once(21.0)
+    assert not session.report_due(21.0)
+    welcomed(session, 80.0)
+    assert session.report_due(80.0)
+
+
+@pytest.mark.audit("ops-18")
+def test_what_was_reported_into_a_stream_that_then_broke_is_reported_again() -> None:
+    session = welcomed(make_session(), 0.0)
+    session.report_at_once(20.0)
+    session.send_report(REPORT, 20.0)
+    assert REPORT in session.messages_to_send(20.0)
+    session.closed(22.0)
+    welcomed(session, 23.0)
+    assert session.report_due(23.0)
+
+
+@pytest.mark.audit("ops-18")
+def test_a_stream_that_comes_back_brings_no_report_of_its_own() -> None:
+    session = welcomed(make_session(), 0.0)
+    session.report_at_once(20.0)
+    session.send_report(REPORT, 20.0)
+    session.messages_to_send(20.0)
+    session.closed(50.0)
+    welcomed(session, 51.0)
+    assert not session.report_due(60.9)
+    assert session.report_due(61.0)
 
 
 @pytest.mark.audit("ops-18")

@@ -174,3 +174,17 @@ def test_what_is_judged_at_the_deadline_is_told_before_its_times_are_known(measu
     measurements.lost(ON_WLAN, delivered=False)
     (late,) = measurements.take(Routes(), []).latencies
     assert (late.requests, late.missed, late.network.lost) == (0, 0, 1)
+
+
+@pytest.mark.audit("ops-18")
+def test_a_missed_deadline_is_urgent_once_for_each_report(measurements: Measurements) -> None:
+    measurements.outcome(ECHO, "ok")
+    assert not measurements.take_urgency()
+    measurements.outcome(ECHO, "deadline_missed")
+    assert measurements.take_urgency()
+    measurements.outcome(ECHO, "deadline_missed")
+    assert not measurements.take_urgency()
+    measurements.take(Routes(), [])
+    assert not measurements.take_urgency()
+    measurements.outcome(ECHO, "deadline_missed")
+    assert measurements.take_urgency()
