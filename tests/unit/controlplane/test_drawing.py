@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import random
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from controlplane.core import drawing
 from controlplane.core.drawing import (
     EPSILON_SHARE,
     FEW_ROBOTS,
@@ -23,9 +25,11 @@ from controlplane.core.drawing import (
 )
 from controlplane.core.estimator import Estimator
 from controlplane.core.permits import Permits
+from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem import Block, BlockKey, Objective
 from controlplane.core.registry import Sidecar
 from protos.model import InterfaceName, NodeName, Report, Role, ServiceName, ServiceSet
+from protos.preferences import InterfaceLabel
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
 
 if TYPE_CHECKING:
@@ -44,10 +48,11 @@ class Fleet:
         self.estimator = Estimator(half_life_s=60.0)
         self.drawing = Drawing(default_capacity_interfaces=1, objective=Objective.JOINT)
         self.permits = Permits(None)
-        self.sidecars = [self._cloud(name) for name in ("a", "b")] + [
+        self.robots = [
             Sidecar(registration(name), stream(2), interfaces("wlan0", "wwan0"), ServiceSet((), (use(),)))
             for name in self.names
         ]
+        self.sidecars = [self._cloud(name) for name in ("a", "b")] + self.robots
         for name in self.names:
             self.report(name, Report(paths=ALL_UP))
         self.draw(routine=True)
@@ -71,8 +76,11 @@ class Fleet:
 
     def draw_one(self, *, routine: bool, lost: Mapping[NodeName, float] | None = None) -> int:
         """One picture; returns in how many slices."""
-        share = {} if lost is None else lost
         self.drawing.begin(routine=routine)
+        return self.finish(lost)
+
+    def finish(self, lost: Mapping[NodeName, float] | None = None) -> int:
+        share = {} if lost is None else lost
         slices = 1
         while not self.drawing.advance(
             self.sidecars, self.permits, self.estimator, self.now, lambda robot: share.get(robot, 0.0)
@@ -285,3 +293,111 @@ def test_urgent_robots_keep_no_others_from_being_drawn() -> None:
         if fleet.moved(before) == set(fleet.names):
             return
     raise AssertionError(f"only {len(fleet.moved(before))} were drawn")
+# ── who could call what where ──
+
+ALLOWED = (
+    None,
+    Policy((CallRule(("robot-0*",), ("*",), ("a", "c")),), (OfferRule(("*",), ("*",)),)),
+    Policy((CallRule(("*",), ("*",), ("*",)),), (OfferRule(("a",), ("*",)),)),
+)
+
+
+def change_one(rng: random.Random, fleet: Fleet) -> None:
+    """Somebody comes, goes, or tells something else; or nothing that matters changes."""
+    place = rng.randrange(len(fleet.sidecars))
+    was = fleet.sidecars[place]
+    match rng.randrange(8):
+        case 0:
+            del fleet.sidecars[place]
+        case 1:
+            names = {sidecar.name for sidecar in fleet.sidecars}
+            fleet.sidecars += [
+                sidecar for sidecar in (cloud_of("c"), cloud_of("d", 7), *fleet.robots[-2:]) if sidecar.name not in names
+            ]
+        case 2:
+            fleet.permits = Permits(rng.choice(ALLOWED))
+        case 3:
+            fleet.sidecars[place] = replace(was, candidates=interfaces(*rng.sample(("wlan0", "wwan0", "eth0"), 2)))
+        case 4:
+            fleet.sidecars[place] = replace(was, draining=not was.draining)
+        case 5:
+            kept = () if rng.random() < 0.3 else (offer(capacity=rng.randrange(3)),)
+            uses = (use(deadline_s=rng.choice((0.1, 0.2))),)
+            told = ServiceSet((), uses) if was.role is Role.ROBOT else ServiceSet(kept)
+            fleet.sidecars[place] = replace(was, services=told)
+        case 6:
+            fleet.sidecars[place] = replace(was, labels=(InterfaceLabel(InterfaceName("wlan0"), "carrier"),))
+        case _:
+            fleet.sidecars[place] = replace(was, stream=stream(99))
+
+
+def cloud_of(name: str, capacity: int = 0) -> Sidecar:
+    services = ServiceSet((offer(capacity=capacity),))
+    offered = frozenset({PLAN})
+    return Sidecar(registration(name, Role.CLOUD), stream(1), interfaces("eth0"), services, offered=offered)
+
+
+@pytest.mark.audit("ops-18")
+@pytest.mark.parametrize("seed", range(6))
+def test_whoever_changes_in_whatever_order_the_picture_is_that_of_who_looks_for_the_first_time(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, "LOOKED_AT_ONCE", 2)
+    rng = random.Random(seed)
+    fleet = Fleet(8)
+    fleet.sidecars[:2] = [cloud_of("a"), cloud_of("b")]
+    for _ in range(60):
+        change_one(rng, fleet)
+        fleet.drawing.members_changed()
+        fleet.drawing.begin(routine=False)
+        for _ in range(rng.randrange(3)):
+            fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now)
+            if rng.random() < 0.3:
+                change_one(rng, fleet)
+                fleet.drawing.members_changed()
+        fleet.finish()
+        first = Drawing(default_capacity_interfaces=1, objective=Objective.JOINT)
+        first.begin(routine=False)
+        while not first.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now):
+            pass
+        assert fleet.drawing.picture() == first.picture()
+
+
+@pytest.mark.audit("ops-18")
+def test_a_change_of_one_robot_lets_the_others_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet = Fleet(50)
+    looked_at = []
+    inputs = drawing._inputs
+
+    def counted(robot: Sidecar, *rest: Any) -> drawing._Inputs:
+        looked_at.append(robot.name)
+        return inputs(robot, *rest)
+
+    monkeypatch.setattr(drawing, "_inputs", counted)
+    fleet.sidecars[7] = replace(fleet.sidecars[7], candidates=interfaces("wlan0"))
+    fleet.drawing.members_changed()
+    fleet.draw(routine=False)
+    assert looked_at == [fleet.sidecars[7].name]
+    fleet.sidecars[0] = replace(fleet.sidecars[0], stream=stream(5))
+    fleet.drawing.members_changed()
+    fleet.draw(routine=False)
+    assert len(looked_at) == 1
+    fleet.sidecars[0] = replace(fleet.sidecars[0], services=ServiceSet((offer(capacity=3),)))
+    fleet.drawing.members_changed()
+    fleet.draw(routine=False)
+    assert len(looked_at) == 51
+
+
+@pytest.mark.audit("ops-18")
+def test_a_large_fleet_is_looked_at_in_several_goes() -> None:
+    fleet = Fleet(2 * drawing.LOOKED_AT_ONCE + 1)
+    fleet.permits = Permits(ALLOWED[2])
+    fleet.drawing.members_changed()
+    fleet.drawing.begin(routine=False)
+    for _ in range(2):
+        assert not fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now)
+        assert not fleet.drawing.picture().problem.blocks
+    fleet.finish()
+    assert {note.unserved for note in fleet.drawing.picture().notes.values()} == {
+        "the access policy lets this robot call it on no live server"
+    }

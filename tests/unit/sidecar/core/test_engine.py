@@ -408,3 +408,20 @@ def test_what_a_peer_could_not_be_told_is_bounded_and_ends_with_its_session() ->
     assert len(sidecar.engine._inbound._untold) == 1
     sidecar.view(peer(A, session=2), version=2)
     assert not sidecar.engine._inbound._untold
+
+
+@pytest.mark.audit("ops-18")
+def test_a_path_that_goes_or_comes_is_urgent_to_a_robot() -> None:
+    sidecar = robot()
+    sidecar.engine.take_report(1.0)
+    assert not sidecar.engine.take_urgency()
+    for state in (PathState.DOWN, PathState.UP):
+        sidecar.change(state, 1.0)
+        assert sidecar.engine.take_urgency()
+        assert not sidecar.engine.take_urgency()
+        sidecar.engine.take_report(1.0)
+    sidecar.change(PathState.UP, 2.0)
+    assert not sidecar.engine.take_urgency(), "no news"
+    other = cloud()
+    other.change(PathState.DOWN, 1.0)
+    assert not other.engine.take_urgency()
