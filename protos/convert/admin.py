@@ -15,6 +15,7 @@ from protos.convert.fields import (
     each,
     known,
     microseconds,
+    unique,
     version,
 )
 from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
@@ -59,6 +60,7 @@ def status_query_from_proto(message: admin_pb2.StreamStatusRequest) -> StatusQue
     """Check a question for the status."""
     if len(message.names) > MAX_SIDECARS:
         raise DecodeError(f"names has {len(message.names)} elements, more than {MAX_SIDECARS}")
+    unique(message.names, "names")
     return StatusQuery(tuple(node_name(name, "names") for name in message.names), message.detailed_at_most)
 
 

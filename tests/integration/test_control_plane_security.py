@@ -158,11 +158,14 @@ def test_each_service_is_for_its_roles_only(plane: SecuredControlPlane) -> None:
         assert error.code() is grpc.StatusCode.PERMISSION_DENIED
     with open_channel(plane.address, operator) as channel:
         admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest(), timeout=PATIENCE_S)
+        assert list(status_parts(channel))
         listed = reflect(channel)
         assert listed.code() is grpc.StatusCode.OK
     with open_channel(plane.address, r) as channel:
         with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match=r"it may not use plr\.v1\.Admin"):
             admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest(), timeout=PATIENCE_S)
+        with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match=r"it may not use plr\.v1\.Admin"):
+            list(status_parts(channel))
         with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match="ServerReflection"):
             reflect(channel)
         health = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=PATIENCE_S)
@@ -171,6 +174,10 @@ def test_each_service_is_for_its_roles_only(plane: SecuredControlPlane) -> None:
         with pytest.raises(grpc.RpcError) as error_info:
             call(b"", timeout=PATIENCE_S)
         assert error_info.value.code() is grpc.StatusCode.UNIMPLEMENTED
+
+
+def status_parts(channel: grpc.Channel) -> Iterator[admin_pb2.GetStatusResponse]:
+    return admin_pb2_grpc.AdminStub(channel).StreamStatus(admin_pb2.StreamStatusRequest(), timeout=PATIENCE_S)
 
 
 def reflect(channel: grpc.Channel) -> grpc.Call:
