@@ -43,9 +43,9 @@ def test_a_member_takes_one_place_however_many_connections_it_opens() -> None:
     for item in "abcd":
         gate.wait(item, "x")
     for _ in range(4):
-        item = gate.next(0.0)
-        assert item is not None
-        gate.proven(item, "robot-1", 0.0)
+        turn = gate.next(0.0)
+        assert turn is not None
+        gate.proven(turn, "robot-1", 0.0)
     assert gate.on_the_way == 1
     assert not gate.over("d", "robot-1")  # another took its place
     assert gate.over("a", "robot-1")
