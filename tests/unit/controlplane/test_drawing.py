@@ -293,6 +293,8 @@ def test_urgent_robots_keep_no_others_from_being_drawn() -> None:
         if fleet.moved(before) == set(fleet.names):
             return
     raise AssertionError(f"only {len(fleet.moved(before))} were drawn")
+
+
 # ── who could call what where ──
 
 ALLOWED = (
@@ -312,7 +314,9 @@ def change_one(rng: random.Random, fleet: Fleet) -> None:
         case 1:
             names = {sidecar.name for sidecar in fleet.sidecars}
             fleet.sidecars += [
-                sidecar for sidecar in (cloud_of("c"), cloud_of("d", 7), *fleet.robots[-2:]) if sidecar.name not in names
+                sidecar
+                for sidecar in (cloud_of("c"), cloud_of("d", 7), *fleet.robots[-2:])
+                if sidecar.name not in names
             ]
         case 2:
             fleet.permits = Permits(rng.choice(ALLOWED))
