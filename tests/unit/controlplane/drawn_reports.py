@@ -81,8 +81,8 @@ def _report(rng: random.Random, needs_s: dict[NodeName, float]) -> Report:
         joints.append(
             JointReport(service, Assignment(INTERFACES[0], near[0]), Assignment(INTERFACES[1], near[-1]), 20, both)
         )
-        server = rng.choice((None, near[0]))
-        fates.append(InterfaceJointReport(service, INTERFACES[0], INTERFACES[1], server, 20, both, 8, 2, 1))
+        common = rng.choice((None, near[0]))
+        fates.append(InterfaceJointReport(service, INTERFACES[0], INTERFACES[1], common, 20, both, 8, 2, 1))
     return Report(
         latencies=tuple(_latency(rng, server, needs_s[server]) for server in rng.choices(near, k=rng.randint(0, 4))),
         paths=tuple(paths),
