@@ -157,6 +157,8 @@ class ServiceUse:
     """With RedundancyMode.HEDGE: the share of first copies that is waited for."""
     budgeted: bool = False
     """Budgets may keep back all copies but the first one."""
+    wanted_miss: float = 0.0
+    """The share of misses that the configuration allows, also where no mapping is chosen by it; 0: it names none."""
 
 
 @dataclass(frozen=True, slots=True)

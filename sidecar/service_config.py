@@ -203,6 +203,7 @@ class ServiceConfig(Section):
             adaptive_target=self.target_miss or DEFAULT_ADAPTIVE_TARGET,
             copies=self.copies or (AT_MOST_EVERY_INTERFACE if cheapest else EVERY_INTERFACE),
             target_miss=(self.target_miss or 0.0) if cheapest else 0.0,
+            wanted_miss=self.target_miss or 0.0,
             charge=self.cost_per_request or 0.0,
             fallback=self._fallback_rule(),
         )

@@ -116,7 +116,9 @@ def _misses(
     block, notes = plan.blocks.get(key), picture.notes.get(key)
     sending = notes.sending if notes is not None else NO_SENDING
     predicted = predicted_miss(use, block, sending) if block is not None else None
-    return MissView(use.name, predicted, estimator.observed_miss_ratio(robot, use.name, now), use.target_miss)
+    return MissView(
+        use.name, predicted, estimator.observed_miss_ratio(robot, use.name, now), use.wanted_miss or use.target_miss
+    )
 
 
 def medians(paths: Sequence[PathView]) -> list[float]:

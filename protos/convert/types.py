@@ -198,6 +198,7 @@ def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
         redundancy=_REDUNDANCY_MODES.get(message.redundancy, RedundancyMode.SINGLE),
         hedge_quantile=probability(message.hedge_quantile, "hedge_quantile") or DEFAULT_HEDGE_QUANTILE,
         budgeted=message.budgeted,
+        wanted_miss=probability(message.wanted_miss, "wanted_miss"),
     )
 
 
@@ -224,6 +225,7 @@ def use_to_proto(use: ServiceUse) -> types_pb2.ServiceUse:
         redundancy=_REDUNDANCY_NUMBERS[use.redundancy],
         hedge_quantile=use.hedge_quantile,
         budgeted=use.budgeted,
+        wanted_miss=use.wanted_miss,
     )
 
 

@@ -154,6 +154,7 @@ class Offers:
                         redundancy=rule.redundancy,
                         hedge_quantile=rule.hedge_quantile,
                         budgeted=self._budgeted,
+                        wanted_miss=rule.wanted_miss,
                     )
                 )
         return tuple(uses)

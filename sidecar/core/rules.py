@@ -76,6 +76,8 @@ class ServiceRule:
     """Robot: how many copies of a request the control plane may map."""
     target_miss: float = 0.0
     """Robot: above 0, the cheapest mapping is wanted that misses no more often; 0: the most reliable one."""
+    wanted_miss: float = 0.0
+    """Robot: the share of misses that the configuration allows, whatever is done about it; 0: it names none."""
     exploration: float = 0.0
     """Robot: at most this share of the requests gets one more copy over a path that the mapping does not use."""
     fallback: FallbackRule | None = None

@@ -218,6 +218,7 @@ class ServiceUse(_message.Message):
     REDUNDANCY_FIELD_NUMBER: _builtins.int
     HEDGE_QUANTILE_FIELD_NUMBER: _builtins.int
     BUDGETED_FIELD_NUMBER: _builtins.int
+    WANTED_MISS_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     type: _builtins.str
     deadline_us: _builtins.int
@@ -239,6 +240,8 @@ class ServiceUse(_message.Message):
     """With REDUNDANCY_MODE_HEDGE: the share of first copies that is waited for, below 1; 0: as many as is usual."""
     budgeted: _builtins.bool
     """Budgets may keep back all copies but the first one."""
+    wanted_miss: _builtins.float
+    """The share of misses that the configuration allows, also where the mapping is not chosen by it; 0: it names none."""
     def __init__(
         self,
         *,
@@ -254,10 +257,11 @@ class ServiceUse(_message.Message):
         redundancy: Global___RedundancyMode.ValueType = ...,
         hedge_quantile: _builtins.float = ...,
         budgeted: _builtins.bool = ...,
+        wanted_miss: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["budgeted", b"budgeted", "deadline_us", b"deadline_us", "fallback_up", b"fallback_up", "has_fallback", b"has_fallback", "hedge_quantile", b"hedge_quantile", "idempotent", b"idempotent", "least_copies", b"least_copies", "most_copies", b"most_copies", "name", b"name", "redundancy", b"redundancy", "target_miss", b"target_miss", "type", b"type"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["budgeted", b"budgeted", "deadline_us", b"deadline_us", "fallback_up", b"fallback_up", "has_fallback", b"has_fallback", "hedge_quantile", b"hedge_quantile", "idempotent", b"idempotent", "least_copies", b"least_copies", "most_copies", b"most_copies", "name", b"name", "redundancy", b"redundancy", "target_miss", b"target_miss", "type", b"type", "wanted_miss", b"wanted_miss"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

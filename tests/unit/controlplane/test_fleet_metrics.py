@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +35,7 @@ from protos.model import (
     ServiceSet,
 )
 from protos.preferences import InterfaceLabel
+from protos.redundancy_mode import RedundancyMode
 from tests.sim.control_world import SETTLED_S, World
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, path, registration, use
 
@@ -116,6 +118,14 @@ def test_whose_network_an_interface_uses_is_told_by_the_robot_or_by_the_interfac
         {"robot": "robot", "interface": "wlan0", "carrier": "wlan0"},
         {"robot": "robot", "interface": "wwan0", "carrier": "telekom"},
     ]
+
+
+def test_a_target_is_told_of_also_where_the_mapping_is_not_chosen_by_it() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    robot = world.robot()
+    world.say(robot, ServiceSet((), (replace(use(), redundancy=RedundancyMode.ADAPTIVE, wanted_miss=0.01),)))
+    found = series(families(fleet_of(world)))
+    assert value(found, "plr_target_miss_probability", robot="robot", service=PLAN) == 0.01
 
 
 def test_paths_to_a_server_that_is_gone_have_no_series() -> None:

@@ -150,6 +150,7 @@ uses = st.builds(
     st.sampled_from(RedundancyMode),
     st.floats(0.5, 0.99),
     st.booleans(),
+    probabilities,
 )
 permits = st.just(ALL_CALLS) | st.builds(CallPermit, st.frozensets(service_names, max_size=3))
 peers = st.builds(

@@ -67,6 +67,7 @@ def test_how_many_copies_are_sent_and_when() -> None:
     (rule,) = parse(changed).service_rules()
     assert (rule.redundancy, rule.adaptive_target) == (RedundancyMode.ADAPTIVE, 0.01)
     assert (rule.copies, rule.target_miss) == (EVERY_INTERFACE, 0.0), "it says nothing of the mapping"
+    assert rule.wanted_miss == 0.01
 
 
 def test_what_extra_copies_may_cost() -> None:
