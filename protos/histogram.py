@@ -235,17 +235,17 @@ class Histogram:
         return sum(count * MIDS[index] for index, count in self._items())
 
     @property
-    def used(self) -> Sequence[int]:
-        """Indices of the buckets in use, ascending."""
-        return [index for index, _ in self._items()] if self._sparse is None else self._sparse[0]
+    def sparse(self) -> tuple[Sequence[int], Sequence[int]]:
+        """Indices of the buckets in use, ascending, and their counts."""
+        if self._sparse is not None:
+            return self._sparse
+        used = list(itertools.compress(range(BUCKETS), self._counts))
+        return used, [self._counts[index] for index in used]
 
     def to_sparse(self) -> tuple[list[int], list[int], int]:
         """Indices of the buckets in use, ascending, their counts, and the lost."""
-        if self._sparse is not None:
-            indices, found = self._sparse
-            return list(indices), list(found), self._lost
-        used = list(itertools.compress(range(BUCKETS), self._counts))
-        return used, [self._counts[index] for index in used], self._lost
+        indices, counts = self.sparse
+        return list(indices), list(counts), self._lost
 
     def _items(self) -> Iterator[tuple[int, int]]:
         """The buckets in use, ascending, with their counts."""

@@ -126,7 +126,8 @@ class FadedHistogram:
         """Merge new samples, and of those called off when they were."""
         factor = math.exp2((self._at - now) / self._half_life_s) * self._silence.end()
         self._at = now
-        indices, counts, lost = histogram.to_sparse()
+        indices, counts = histogram.sparse
+        lost = histogram.lost
         self._counts *= factor
         if indices:
             if indices[0] < self._first or indices[-1] - self._first >= len(self._values):

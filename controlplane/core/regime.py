@@ -113,7 +113,7 @@ def _is_usual(new: Histogram, known: NDArray[np.float64], known_lost: float, kep
         return False
     sums = np.add.reduce
     least = USUAL_SHARE * (float(sums(known)) + known_lost + PRIOR_SAMPLES / kept)
-    return all(sums(known[max(0, bucket - _PER_BIN) : bucket + _PER_BIN + 1]) >= least for bucket in new.used)
+    return all(sums(known[max(0, bucket - _PER_BIN) : bucket + _PER_BIN + 1]) >= least for bucket in new.sparse[0])
 
 
 def _log_begun(counts: NDArray[np.float64], since: Histogram | None) -> float:

@@ -75,14 +75,11 @@ def _report(rng: random.Random, needs_s: dict[NodeName, float]) -> Report:
             sent = rng.choice((0, 10, 1_000))
             rtt = _times(rng, rng.choice((0, 1, 5)), 0.04, lost=rng.choice((0, 0, 1)))
             paths.append(PathReport(interface, server, rng.random() < 0.95, rtt, sent, rng.choice((0, 0, 1, 30))))
-    joints, fates = [], []
+    (wlan, wwan, _), joints, fates = INTERFACES, [], []
     if rng.random() < 0.4:
         both = rng.randint(0, 5)
-        joints.append(
-            JointReport(service, Assignment(INTERFACES[0], near[0]), Assignment(INTERFACES[1], near[-1]), 20, both)
-        )
-        common = rng.choice((None, near[0]))
-        fates.append(InterfaceJointReport(service, INTERFACES[0], INTERFACES[1], common, 20, both, 8, 2, 1))
+        joints.append(JointReport(service, Assignment(wlan, near[0]), Assignment(wwan, near[-1]), 20, both))
+        fates.append(InterfaceJointReport(service, wlan, wwan, rng.choice((None, near[0])), 20, both, 8, 2, 1))
     return Report(
         latencies=tuple(_latency(rng, server, needs_s[server]) for server in rng.choices(near, k=rng.randint(0, 4))),
         paths=tuple(paths),
