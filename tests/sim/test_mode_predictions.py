@@ -25,7 +25,7 @@ SIZE = 300
 WARM_S, SECONDS = 20, 45
 SEEDS = (2, 3)
 FACTOR = 2.5
-"""Between what is observed in 90 s and the mean of what was predicted meanwhile: some 7 to 20 misses are compared ..."""
+"""Between what is observed in 90 s and the mean of what was predicted meanwhile: 7 to 20 misses are compared ..."""
 CHANCE = 4.0
 """... and so many more or less are chance."""
 
