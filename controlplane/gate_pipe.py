@@ -75,6 +75,8 @@ class PipeEnd(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Pass it on."""
         self.received_at = time.monotonic()
+        if self.lost:
+            return
         if self._other is None:
             self._early += data
         else:
@@ -97,7 +99,13 @@ class PipeEnd(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """The other end has nobody to talk to any more."""
         self.lost = True
-        if self._other is not None:
-            self._other.close()
         if self._on_lost is not None:
             self._on_lost()
+            self._on_lost = None
+        other = self._other
+        if other is None:
+            return
+        other.close()
+        if other.lost:
+            # The garbage collector does not look at what has been there for long (`protos.interpreter`).
+            self._other = other._other = None

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import ssl
 import time
+import weakref
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -362,3 +364,28 @@ def test_the_gate_knows_of_bytes_that_nobody_has_read(tmp_path: Path) -> None:
             await until(lambda: not gate.gate.has_unread(name, before))
 
     asyncio.run(run())
+
+
+@pytest.mark.audit("ops-19")
+def test_an_ended_connection_is_gone_without_the_garbage_collector(tmp_path: Path) -> None:
+    """What has been there for long is set aside from collections: in a cycle it would stay for ever."""
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate:
+            for name in ("robot-1", "robot-2"):
+                reader, writer = await gate.connect(name)
+                await write(writer, b"hello")
+                assert await reader.readexactly(5) == b"hello"
+                (connection,) = gate.gate._connections.values()
+                tls = getattr(connection.outside.transport, "_ssl_protocol")  # noqa: B009 - of asyncio, and private
+                left = [weakref.ref(part) for part in (connection.outside, connection.inside, tls)]
+                del connection, tls
+                writer.close()
+                await until(lambda left=left: not any(part() for part in left))  # type: ignore[misc]
+
+    gc.collect()
+    gc.disable()
+    try:
+        asyncio.run(run())
+    finally:
+        gc.enable()
