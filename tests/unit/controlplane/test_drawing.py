@@ -402,6 +402,7 @@ def test_a_large_fleet_is_looked_at_in_several_goes() -> None:
         assert not fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now)
         assert not fleet.drawing.picture().problem.blocks
     fleet.finish()
+    fleet.draw(routine=False)
     assert {note.unserved for note in fleet.drawing.picture().notes.values()} == {
         "the access policy lets this robot call it on no live server"
     }

@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.audit("ops-14")
 
-NOW = time.time()
+
+def now() -> float:
+    """When it is asked for: certificates are made in the tests, which may begin long after this file is read."""
+    return time.time()
+
+
 DAY = 86_400.0
 LOCALHOST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
@@ -48,15 +53,15 @@ def tls(tmp_path: Path) -> tuple[Authority, Path]:
 
 
 def test_a_certificate_in_force(tls: tuple[Authority, Path]) -> None:
-    finding = one(node_checks.certificate(load_tls_files(tls[1]), NOW))
+    finding = one(node_checks.certificate(load_tls_files(tls[1]), now()))
     assert finding.level is Level.OK
     assert "robot-7, robot, 30 days left, not revoked by the list held (number 0" in finding.text
 
 
 def test_one_that_ends_soon_is_warned_of_and_one_that_ended_fails(tls: tuple[Authority, Path]) -> None:
     files = load_tls_files(tls[1])
-    assert levels(node_checks.certificate(files, NOW + 25 * DAY)) == [Level.WARN]
-    ended = one(node_checks.certificate(files, NOW + 31 * DAY))
+    assert levels(node_checks.certificate(files, now() + 25 * DAY)) == [Level.WARN]
+    ended = one(node_checks.certificate(files, now() + 31 * DAY))
     assert ended.level is Level.FAIL
     assert "plr ca renew robot-7" in ended.remedy
 
@@ -65,7 +70,7 @@ def test_a_revoked_one_fails(tls: tuple[Authority, Path]) -> None:
     authority, folder = tls
     authority.revoke("robot-7")
     (folder / "crl.pem").write_bytes(authority.crl_pem())
-    finding = one(node_checks.certificate(load_tls_files(folder), NOW))
+    finding = one(node_checks.certificate(load_tls_files(folder), now()))
     assert finding.level is Level.FAIL
     assert "revoked" in finding.text
 
@@ -73,15 +78,15 @@ def test_a_revoked_one_fails(tls: tuple[Authority, Path]) -> None:
 def test_another_one_in_use_than_on_disk_is_warned_of(tls: tuple[Authority, Path]) -> None:
     files = load_tls_files(tls[1])
     same = {"serial": f"{files.identity.serial:x}"}
-    assert levels(node_checks.certificate(files, NOW, same)) == [Level.OK]
-    assert levels(node_checks.certificate(files, NOW, {"serial": "abc"})) == [Level.OK, Level.WARN]
+    assert levels(node_checks.certificate(files, now(), same)) == [Level.OK]
+    assert levels(node_checks.certificate(files, now(), {"serial": "abc"})) == [Level.OK, Level.WARN]
 
 
 def test_the_certificate_that_a_sidecar_tells_of() -> None:
-    used = {"name": "robot-7", "role": "robot", "not_after": NOW + 3 * DAY, "revocation_lists": [], "problem": None}
-    assert levels(node_checks.certificate_in_use(used, NOW)) == [Level.OK]
+    used = {"name": "robot-7", "role": "robot", "not_after": now() + 3 * DAY, "revocation_lists": [], "problem": None}
+    assert levels(node_checks.certificate_in_use(used, now())) == [Level.OK]
     problem = {"in_force": False, "text": "cert.pem: expired; renew it"}
-    finding = one(node_checks.certificate_in_use({**used, "problem": problem}, NOW))
+    finding = one(node_checks.certificate_in_use({**used, "problem": problem}, now()))
     assert (finding.level, finding.text, finding.remedy) == (Level.FAIL, "cert.pem: expired", "renew it")
 
 
@@ -96,7 +101,7 @@ def test_the_certificate_that_a_sidecar_tells_of() -> None:
     ],
 )
 def test_the_clock(ahead_s: float, state: ClockState | None, level: Level) -> None:
-    assert levels(node_checks.clock(NOW, NOW + ahead_s, state)) == [level]
+    assert levels(node_checks.clock(now(), now() + ahead_s, state)) == [level]
 
 
 def test_ros() -> None:
