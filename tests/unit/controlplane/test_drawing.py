@@ -17,7 +17,6 @@ from controlplane.core.drawing import (
     SLICE_PAIRS,
     STALE_S,
     SURPRISE_MISSES,
-    URGENT_AT_ONCE,
     URGENT_SHARE,
     WEIGHT_SHARE,
     Drawing,
@@ -252,31 +251,38 @@ def test_one_robot_with_many_services_is_drawn_in_slices_too() -> None:
     assert {block.servers for block in fleet.drawing.picture().problem.blocks} == {("b",)}
 
 
+AT_ONCE = 40
+
+
 @pytest.mark.audit("ops-20")
-def test_of_many_urgent_robots_a_part_is_drawn_at_once_and_those_that_lost_most_first() -> None:
-    fleet = Fleet(3 * URGENT_AT_ONCE)
+def test_of_many_urgent_robots_a_part_is_drawn_at_once_and_those_that_lost_most_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(drawing, "URGENT_AT_ONCE", AT_ONCE)
+    fleet = Fleet(3 * AT_ONCE)
     before = fleet.blocks()
     for name in fleet.names:
         fleet.report(name, Report(paths=ONE_DOWN))
-    lost = {name: 1.0 for name in fleet.names[100:][:URGENT_AT_ONCE]}
+    lost = {name: 1.0 for name in fleet.names[70:][:AT_ONCE]}
     fleet.draw_one(routine=False, lost=lost)
     assert fleet.moved(before) == lost.keys()
     assert fleet.drawing.urgent_left
     fleet.draw_one(routine=False)
-    assert fleet.moved(before) == {*lost, *fleet.names[:URGENT_AT_ONCE]}, "then those that waited longest"
+    assert fleet.moved(before) == {*lost, *fleet.names[:AT_ONCE]}, "then those that waited longest"
     fleet.draw(routine=False)
     assert fleet.moved(before) == set(fleet.names)
     assert not fleet.drawing.urgent_left
 
 
 @pytest.mark.audit("ops-20")
-def test_of_very_many_a_share_is_drawn_at_once() -> None:
-    fleet = Fleet(8 * URGENT_AT_ONCE)
+def test_of_very_many_a_share_is_drawn_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "URGENT_AT_ONCE", AT_ONCE)
+    fleet = Fleet(8 * AT_ONCE)
     before = fleet.blocks()
     for name in fleet.names:
         fleet.report(name, Report(paths=ONE_DOWN))
     fleet.draw_one(routine=False)
-    assert len(fleet.moved(before)) == round(URGENT_SHARE * len(fleet.names)) > URGENT_AT_ONCE
+    assert len(fleet.moved(before)) == round(URGENT_SHARE * len(fleet.names)) > AT_ONCE
 
 
 @pytest.mark.audit("ops-20")
