@@ -10,6 +10,7 @@ import fcntl
 import logging
 import os
 import secrets
+import stat
 import threading
 import time
 from collections import Counter
@@ -167,8 +168,7 @@ class StateStore:
     def _read(self, name: str, decode: Callable[[bytes], T]) -> T | None:
         path = self._folder / name
         try:
-            with path.open("rb") as file:
-                data = file.read(MAX_FILE_BYTES + 1)
+            data = _read_file(path)
             if len(data) > MAX_FILE_BYTES:
                 raise DecodeError(f"more than {MAX_FILE_BYTES} bytes")
             return decode(data)
@@ -191,7 +191,9 @@ class StateStore:
         path = self._folder / name
         temporary = path.with_name(name + ".new")
         try:
-            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+            # In a folder that somebody else made it may be his link to a file that he may not write.
+            temporary.unlink(missing_ok=True)
+            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
             with open(descriptor, "wb") as file:
                 file.write(data)
                 file.flush()
@@ -201,6 +203,15 @@ class StateStore:
         except OSError as error:
             self.failures["write_failed"] += 1
             log.error("%s not written: %s; a restart will not know it", path, error)
+
+
+def _read_file(path: Path) -> bytes:
+    """Read a file, one byte more than MAX_FILE_BYTES at most; raises OSError, also for what may block."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError("it is no regular file")
+        return file.read(MAX_FILE_BYTES + 1)
 
 
 def _lock(folder: Path) -> int:

@@ -24,6 +24,7 @@ import sys
 import tarfile
 import time
 import urllib.request
+from http.client import HTTPException
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,10 +41,14 @@ from sidecar.doctor.scrub import scrubbed, scrubbed_value
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from sidecar.config import SidecarConfig
     from sidecar.doctor.examination import Examination, Where
 
 EXIT_OK = 0
 EXIT_FAILURE = 1
+_NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+"""The metrics are this host's own."""
+MAX_LINE, MAX_KEY = 2000, 64
 MAX_PART_BYTES = 8 << 20
 """Of each file; a longer one loses its middle."""
 COMMAND_S = 15.0
@@ -90,19 +95,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def write(output: Path, stem: str, seen: Examination, where: Where) -> None:
     """Write the tar, for nobody but this user to read; raises OSError."""
     descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    with open(descriptor, "wb") as file, tarfile.open(fileobj=file, mode="w:gz") as tar:
-        for name, text in parts(seen, where):
-            data = _shortened(scrubbed(text)).encode(errors="replace")
-            info = tarfile.TarInfo(f"{stem}/{name}")
-            info.size, info.mtime, info.mode = len(data), int(time.time()), 0o600
-            tar.addfile(info, io.BytesIO(data))
+    try:
+        with open(descriptor, "wb") as file, tarfile.open(fileobj=file, mode="w:gz") as tar:
+            for name, text in parts(seen, where):
+                data = scrubbed(_shortened(text)).encode(errors="replace")
+                info = tarfile.TarInfo(f"{stem}/{name}")
+                info.size, info.mtime, info.mode = len(data), int(time.time()), 0o600
+                tar.addfile(info, io.BytesIO(data))
+    except BaseException:
+        output.unlink(missing_ok=True)
+        raise
 
 
 def parts(seen: Examination, where: Where) -> Iterator[tuple[str, str]]:
     """Yield name and text of each file; what cannot be had says why."""
     yield "doctor.txt", as_text(seen.findings)
     yield "doctor.json", json.dumps(scrubbed_value(json.loads(as_json(seen))), indent=2)
-    yield "configuration.yaml", _configuration(where.config)
+    yield "configuration.yaml", _configuration(where.config, seen.config)
     yield "versions.txt", _versions()
     for name, command in COMMANDS.items():
         yield name, _output(command)
@@ -111,18 +120,23 @@ def parts(seen: Examination, where: Where) -> Iterator[tuple[str, str]]:
 
 
 def _shortened(text: str) -> str:
+    # Looking for secrets takes long in long lines, and no line that helps is so long.
+    text = "\n".join(line if len(line) <= MAX_LINE else f"{line[:MAX_LINE]}..." for line in text.split("\n"))
     if len(text) <= MAX_PART_BYTES:
         return text
     half = MAX_PART_BYTES // 2
     return f"{text[:half]}\n... {len(text) - 2 * half} characters left out ...\n{text[-half:]}"
 
 
-def _configuration(path: Path) -> str:
-    """The configuration as it was read: comments, which may hold anything, are not in it."""
+def _configuration(path: Path, config: SidecarConfig | None) -> str:
+    """The configuration's known keys with their values. Of one that is wrong the keys: its values may be anything."""
+    if config is not None:
+        return yaml.safe_dump(scrubbed_value(config.model_dump(mode="json", warnings=False)), sort_keys=False)
     try:
-        return yaml.safe_dump(scrubbed_value(parse_yaml(read_text(path), str(path))), sort_keys=False)
+        content = parse_yaml(read_text(path), str(path))
     except ConfigError as error:
         return f"{error}\n"
+    return "".join(f"{str(key)[:MAX_KEY]!r}: (left out, as the configuration is wrong)\n" for key in content)
 
 
 def _versions() -> str:
@@ -174,8 +188,10 @@ def _metrics(seen: Examination) -> str:
     if listen is None:
         return "no metrics are served\n"
     try:
-        with urllib.request.urlopen(f"http://{listen}/metrics", timeout=METRICS_S) as answer:
-            data: bytes = answer.read(MAX_PART_BYTES)
+        with _NO_PROXY.open(f"http://{listen}/metrics", timeout=METRICS_S) as answer:
+            data, until = b"", time.monotonic() + METRICS_S
+            while len(data) < MAX_PART_BYTES and time.monotonic() < until and (some := answer.read1(1 << 16)):
+                data += some
             return data.decode(errors="replace")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, HTTPException) as error:
         return f"http://{listen}/metrics: {error}\n"

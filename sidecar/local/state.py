@@ -123,7 +123,7 @@ class LocalState:
             "up_s": now - self.started_at,
             "insecure": config.insecure,
             "stun": config.stun.enabled,
-            "environment": {name: os.environ[name] for name in ENVIRONMENT if name in os.environ},
+            "environment": {name: _told(os.environ[name]) for name in ENVIRONMENT if name in os.environ},
         }
 
     def _certificate(self) -> dict[str, Any]:
@@ -245,3 +245,8 @@ def _interface(view: InterfaceView, now: float) -> dict[str, Any]:
             if one.family in view.families
         ],
     }
+
+
+def _told(value: str) -> str:
+    """A variable's value; not a configuration that stands in it as a whole, which may hold passwords."""
+    return f"{len(value)} characters of configuration" if "<" in value else value
