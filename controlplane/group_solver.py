@@ -6,9 +6,10 @@ a small group until the optimum is proven, in a large one only if the gap is wid
 
 from __future__ import annotations
 
+import logging
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from controlplane.core.decomposition import Decomposition, Relaxed
@@ -20,7 +21,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from controlplane.core.plan import Plan
-    from controlplane.core.problem import BlockKey, Choice, FleetKey, Problem
+    from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
+
+log = logging.getLogger(__name__)
+
+TELL_AGAIN_S = 60.0
+MAX_TOLD = 1024
+"""Blocks that could not be solved and when that was said; then all may be told again."""
 
 SMALL_BLOCKS = 64
 """Groups of up to this many blocks are solved to the optimum, if the time allows."""
@@ -60,6 +67,54 @@ class Found:
     worth: Mapping[BlockKey, float]
     """What each block's best choice is worth at these prices: together, less the prices of the capacities, a bound
     too."""
+
+
+class FailureLog:
+    """Says which blocks could not be solved, each once in a minute."""
+
+    def __init__(self) -> None:
+        self._told: dict[BlockKey, float] = {}
+
+    def note(self, key: BlockKey, error: Exception, now: float) -> None:
+        """Solving this block raised."""
+        if now - self._told.get(key, -math.inf) < TELL_AGAIN_S:
+            return
+        if len(self._told) >= MAX_TOLD:
+            self._told.clear()
+        self._told[key] = now
+        log.error("%s of %s could not be solved, it keeps what it has: %r", key.service, key.robot, error)
+
+
+_failures = FailureLog()
+
+
+def solve_group(group: Problem, end: float, hint: Plan | None, prices: Mapping[FleetKey, float]) -> Found:
+    """Solve a group. Should that fail, for a block that nobody foresaw, all others get a choice all the same: each its
+    best without regard to the limits that they share, and that one what it has."""
+    try:
+        return GroupSolver(group, end).solve(hint, prices)
+    except Exception as error:
+        if len(group.blocks) == 1:
+            _failures.note(group.blocks[0].key, error, time.monotonic())
+    choices: dict[BlockKey, Choice] = {}
+    for block in group.blocks:
+        alone = replace(group, blocks=(block,), fleet_capacity={})
+        try:
+            choices |= GroupSolver(alone, end).solve(hint, {}).choices
+        except Exception as error:
+            _failures.note(block.key, error, time.monotonic())
+            choices[block.key] = _at_hand(block, hint)
+    return Found(choices, -math.inf, proven=False, prices={}, worth={})
+
+
+def _at_hand(block: Block, hint: Plan | None) -> Choice:
+    """What the block has, if that is possible still, else its best path alone."""
+    kept = choice_of(block, hint.blocks.get(block.key)) if hint is not None else None
+    if kept is not None:
+        return kept
+    paths = [(e, i, j) for i, row in enumerate(block.epsilon) for j, e in enumerate(row) if e is not None]
+    _, interface, server = min(paths, default=(1.0, -1, -1))
+    return tuple(server if i == interface else None for i in range(len(block.interfaces)))
 
 
 class GroupSolver:

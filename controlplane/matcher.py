@@ -17,7 +17,7 @@ from controlplane.core.grouping import independent_groups
 from controlplane.core.limits import Limits
 from controlplane.core.plan import Plan, make_plan
 from controlplane.core.problem import FleetKey, reachable
-from controlplane.group_solver import SMALL_BLOCKS, GroupSolver
+from controlplane.group_solver import SMALL_BLOCKS, solve_group
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -75,7 +75,7 @@ class Matcher:
         return self._solve_all(problem, end, hint, kept.prices if kept is not None else {})
 
     def _solve_all(self, problem: Problem, end: float, hint: Plan | None, prices: Mapping[FleetKey, float]) -> Plan:
-        found = [GroupSolver(group, end).solve(hint, prices) for group in _groups(problem)]
+        found = [solve_group(group, end, hint, prices) for group in _groups(problem)]
         plan = make_plan(
             problem,
             {key: choice for group in found for key, choice in group.choices.items()},
@@ -113,7 +113,7 @@ class Matcher:
         part = _part(problem, changed, free)
         if part is None:
             return None
-        found = [GroupSolver(group, end).solve(None, {}) for group in _groups(part)]
+        found = [solve_group(group, end, None, {}) for group in _groups(part)]
         choices = {key: choice for group in found for key, choice in group.choices.items()}
         added = make_plan(replace(part, blocks=tuple(changed)), choices)
         if added.fleet_excess:

@@ -65,6 +65,9 @@ MAX_SIGNATURE_BYTES = 72
 MAX_CANDIDATES_OF_INTERFACE = 8
 """Addresses under which peers look for one interface: IPv4, some of IPv6, what a NAT makes of each, one advertised."""
 
+MAX_VERSION = (1 << 63) - 1
+"""Largest version of a resource: half of the field, so that a larger one can always be given out."""
+
 MAX_PEERS = 4096
 """Peers of one sidecar: as many sidecars as a control plane registers."""
 

@@ -24,6 +24,9 @@ OWN_EXCESS_PRICE = 1e6
 """Of an interface beyond the block's own capacity: more than any cost and any price of a server."""
 
 
+MOST_DIMENSIONS = 32
+"""Of numpy's arrays, by some of its functions."""
+
 MAX_LISTED = 4096
 """Choices looked at of one block: 2 interfaces with 64 servers, 3 with 16, 4 with 8."""
 
@@ -130,6 +133,11 @@ def _promising(block: Block, interface: int, servers: Indices, share: int) -> In
 
 def _all_of(way: list[int], options: list[Indices]) -> Indices:
     """Every way to give the interfaces named one of their options, and the others none."""
+    if len(way) > MOST_DIMENSIONS:
+        rows = np.array(list(itertools.product(*(options[i] for i in way))), dtype=np.intp)
+        choices = np.full((len(rows), len(options)), -1, dtype=np.intp)
+        choices[:, way] = rows
+        return choices
     grids = np.meshgrid(*(options[i] for i in way), indexing="ij")
     choices = np.full((grids[0].size, len(options)), -1, dtype=np.intp)
     for i, grid in zip(way, grids, strict=True):

@@ -131,9 +131,10 @@ class ComputeTimes:
             self._drop(server, next(iter(kept)))
         elif len(self._servers) > MAX_PROCESSING:
             self._drop(*next(iter(self._servers)))
-        self._forget_old(now)
         # No more than a robot may count for: what it says of one moment shall not pass for minutes.
         of_server.lately.add(min(samples, int(COUNTS_ANYWAY)), 0.0, now)
+        # Not before: it may be the first to be reported on after a long time.
+        self._forget_old(now)
         processing = of_server.witnesses.weigh(robot, processing, now)
         since = of_server.changed_with(robot, processing, now)
         if since is None:

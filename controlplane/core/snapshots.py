@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from protos.model import POLICY_PENDING, MappingSet, PeerSet, ResourceKind, Version
+from protos.model import MAX_VERSION, POLICY_PENDING, MappingSet, PeerSet, ResourceKind, Version
 from protos.status import ResourceStatus, SyncState
 
 if TYPE_CHECKING:
@@ -34,10 +34,11 @@ class VersionSource:
     def above(self, floor: Version) -> Version:
         """A new version, larger than `floor` and all given out before.
 
-        A floor beyond the epoch (what a sidecar says it holds) lifts this sidecar's version alone, not everybody's.
+        A floor beyond the epoch (what a sidecar says it holds) lifts this sidecar's version alone, not everybody's. Who
+        says that he holds the largest there can be is given that again: he alone has the harm.
         """
         self._last += 1
-        return Version(max(self._last, floor + 1))
+        return Version(min(max(self._last, floor + 1), MAX_VERSION))
 
 
 class Track(Generic[C]):

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, TypeVar
 
 from protos.errors import DecodeError
-from protos.model import Version
+from protos.model import MAX_VERSION, Version
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -45,9 +45,6 @@ MAX_SIDECARS = 8192
 
 MAX_DURATION_S = 86_400.0
 """Longest deadline, lease or interval: one day. What is longer is a mistake of units."""
-
-MAX_VERSION = (1 << 63) - 1
-"""Largest version of a resource: half of the field, so that a larger one can always be given out."""
 
 MAX_EVENTS = 1 << 53
 """Largest count of datagrams or requests in one report: what a float still holds exactly."""

@@ -48,6 +48,9 @@ from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+LEAST_TARGET = 1e-9
+"""Least miss probability that can be wanted: one request in years."""
+
 MAX_INTERFACE_ID = 255
 """The data plane's frames give an interface one byte."""
 
@@ -192,7 +195,7 @@ def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
         deadline_s=duration(message.deadline_us, "deadline_us"),
         idempotent=message.idempotent,
         copies=_copies_from_proto(message),
-        target_miss=probability(message.target_miss, "target_miss"),
+        target_miss=_target(message.target_miss),
         fallback_up=message.fallback_up if message.has_fallback else None,
         # A mode of a later version: nothing but the prediction hangs on it, and no copies promise the least.
         redundancy=_REDUNDANCY_MODES.get(message.redundancy, RedundancyMode.SINGLE),
@@ -208,6 +211,11 @@ def _copies_from_proto(message: types_pb2.ServiceUse) -> Copies:
     if most and not 1 <= least <= most:
         raise DecodeError(f"least_copies {least} is not within 1..{most}, the most")
     return Copies(least, most)
+
+
+def _target(value: float) -> float:
+    """Check the wanted miss probability; 0 wants none. A smaller one than can be counted in a lifetime is that one."""
+    return max(probability(value, "target_miss"), LEAST_TARGET) if value else 0.0
 
 
 def use_to_proto(use: ServiceUse) -> types_pb2.ServiceUse:

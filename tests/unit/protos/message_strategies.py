@@ -9,7 +9,8 @@ from typing import TypeVar
 from hypothesis import strategies as st
 
 from protos.convert.control import MAX_WALL_S
-from protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS, MAX_VERSION
+from protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS
+from protos.convert.types import LEAST_TARGET
 from protos.explanation import (
     Alternative,
     AlternativeKind,
@@ -26,6 +27,7 @@ from protos.model import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
     MAX_SIGNATURE_BYTES,
+    MAX_VERSION,
     PROTOCOL_VERSION,
     TOKEN_BYTES,
     Ack,
@@ -145,7 +147,7 @@ uses = st.builds(
     durations,
     st.booleans(),
     copies.map(lambda pair: Copies(*pair)),
-    probabilities,
+    st.just(0.0) | st.floats(LEAST_TARGET, 1.0),
     st.none() | st.booleans(),
     st.sampled_from(RedundancyMode),
     st.floats(0.5, 0.99),

@@ -29,12 +29,13 @@ from protos.convert import (
     status_from_proto,
     status_to_proto,
 )
-from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_VERSION
+from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS
 from protos.errors import DecodeError, UnknownKindError
 from protos.fleet_events import EventList
 from protos.model import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
+    MAX_VERSION,
     NO_CALLS,
     Ack,
     CallPermit,
