@@ -181,6 +181,7 @@ registrations = st.builds(
     versions,
     credentials,
     domain_labels,
+    st.booleans(),
     st.integers(0, 0xFFFFFFFF),
 )
 
