@@ -173,7 +173,7 @@ async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None)
         if addresses.stun and not config.stun_servers:
             log.warning("%s", _NO_STUN_SERVERS)
         interpreter.settle()
-        interpreter.keep_settling()
+        interpreter.collect_by_hand()
         systemd.ready()
 
     def stopping() -> None:

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, cast
 from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.samples import Sample
 
-from controlplane.core.fleet_view import medians
 from protos.model import Role
 
 if TYPE_CHECKING:
@@ -41,11 +40,6 @@ MAX_GONE = 1024
 
 REUSED_S = 1.0
 """Scrapes within this time share their values."""
-
-
-PATHS_AT_ONCE = 1000
-"""Paths whose round trips are worked out together: numpy gives the interpreter up and takes it back with each call, and
-with many small ones the loop, which waits for it, goes without for 0.1 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,11 +219,10 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
                 yield (robot.name, service, pair.interface, pair.server), 1.0
 
     def round_trips() -> Iterator[tuple[Labels, float]]:
-        of_all = ((robot.name, path) for robot, room in rooms for path in robot.paths[: room.round_trips])
-        while some := list(islice(of_all, PATHS_AT_ONCE)):
-            for (name, path), rtt in zip(some, medians([path for _, path in some]), strict=True):
-                if not math.isnan(rtt):
-                    yield (name, path.interface, path.server), rtt
+        for robot, room in rooms:
+            for path in robot.paths[: room.round_trips]:
+                if not math.isnan(path.round_trip_s):
+                    yield (robot.name, path.interface, path.server), path.round_trip_s
 
     def left_out() -> Iterator[tuple[Labels, float]]:
         yield (), float(sum(room.left_out for _, room in rooms))

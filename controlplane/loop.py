@@ -29,10 +29,10 @@ from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
 from controlplane.earliest_end import EarliestEnd
 from controlplane.fleet_metrics import MAX_GONE, Fleet
+from controlplane.garbage import Collector
 from controlplane.mailbox import Mailbox
 from controlplane.remembered import departures
 from controlplane.turns import Turns
-from protos import interpreter
 from protos.convert import status_to_proto
 from protos.fleet_events import EventKind
 from protos.identity import EXPIRED, REVOKED, CertificateError
@@ -67,9 +67,6 @@ ENDED_LINES_PER_S, ENDED_LINES_BURST = 1.0, 20.0
 
 METRICS_INTERVAL_S = 1.0
 """How old what is scraped may be: Prometheus scrapes every few seconds at most."""
-
-ENDED_STREAMS = 1000
-"""So many leave 20 MB. To look for them holds the loop for 0.1 s, or as long as it takes to look at the whole fleet."""
 
 FLEET_TIMEOUT_S = 4.0
 """For all of them: a scrape waits no longer, and Prometheus not much."""
@@ -158,8 +155,7 @@ class ControlLoop:
         self._quiet_looks = 0
         """Since the loop was last busy; at QUIET_LOOKS the solver is ready."""
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
-        self._ended_streams = 0
-        """Since all garbage was looked for: each leaves some 20 kB in cycles of exceptions and frames."""
+        self._garbage = Collector()
         self.stun_servers: list[StunServer] = []
         self.has_unread: Callable[[NodeName, float], bool] = lambda name, since: False
         """Whether something of a member is there that came later than what was read of it at this time."""
@@ -204,7 +200,6 @@ class ControlLoop:
 
     def disconnected(self, stream: StreamId) -> None:
         """A stream ended."""
-        self._ended_streams += 1
         mailbox = self._mailboxes.pop(stream, None)
         if mailbox is not None:
             self._superseded += mailbox.superseded
@@ -393,9 +388,10 @@ class ControlLoop:
                     self._core.follow_load(share)
                     self._prepare_if_quiet(share)
                     self._update_metrics()
-                    self._look_for_garbage()
+                    self._garbage.look_if_worth(len(self._core.registry))
                     metrics_at = now + METRICS_INTERVAL_S
                 self._dispatch_quietly()
+                self._garbage.set_aside(now)
                 # What takes several turns takes half of the loop's time at most: streams have the other half.
                 next_at = max(self._core.next_timer() or metrics_at, self._loop.time() + drawn_s)
                 await self._sleep_until(min(metrics_at, next_at))
@@ -405,11 +401,6 @@ class ControlLoop:
         """Of those whose lease has ended, whose bytes have arrived: a late loop must cost nobody the lease."""
         registry = self._core.registry
         return {name for name in registry.due(now) if self.has_unread(name, registry.heard_at(name, now))}
-
-    def _look_for_garbage(self) -> None:
-        if self._ended_streams >= ENDED_STREAMS:
-            self._ended_streams = 0
-            interpreter.look_at_all()
 
     def _prepare_if_quiet(self, share: float | None) -> None:
         """Not at the start at once: a fleet that comes back needs the processor."""

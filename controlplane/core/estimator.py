@@ -321,7 +321,7 @@ class Estimator:
         tables = self._robots.get(robot)
         if tables is not None:
             for (interface, server), state in tables.network.paths.items():
-                yield PathView(interface, server, state.up, state.rtt.snapshot())
+                yield PathView(interface, server, state.up, state.rtt.median_once())
 
     def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
         """Whether the path was up when last reported; None if it never was reported."""

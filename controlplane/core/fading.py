@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from array import array
+from bisect import bisect_left
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from controlplane.core.distribution import Distribution
 from controlplane.core.silence import Silence
-from protos.histogram import BUCKETS, Histogram
+from protos.histogram import BUCKETS, MIDS, Histogram
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -200,6 +202,13 @@ class FadedHistogram:
         """Median of the answered samples, within 2 %; NaN without any."""
         answered = self.answered()
         return answered.median() if answered is not None else math.nan
+
+    def median_once(self) -> float:
+        """The same, where nobody asks again soon: nothing is kept for that."""
+        reached = list(accumulate(self._values))
+        if not reached or reached[-1] <= _FORGOTTEN:
+            return math.nan
+        return MIDS[self._first + bisect_left(reached, reached[-1] / 2)]
 
     def answered(self) -> Distribution | None:
         """The answered samples alone; None without any."""

@@ -8,19 +8,14 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from controlplane.core.mode_miss import NO_SENDING, predicted_miss
 from controlplane.core.picture import interfaces_of
 from controlplane.core.problem import BlockKey
-from protos.histogram import BUCKETS, MIDS
 from protos.model import Role
 from protos.status import SyncState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
+    from collections.abc import Callable
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.picture import Picture
@@ -32,8 +27,6 @@ if TYPE_CHECKING:
 MAX_VIEWED = 512
 """Paths, and services, of one robot that are looked at."""
 
-_MIDS = np.array(MIDS)
-
 
 @dataclass(frozen=True, slots=True)
 class PathView:
@@ -42,8 +35,8 @@ class PathView:
     interface: InterfaceName
     server: NodeName
     up: bool
-    round_trips: NDArray[np.float64]
-    """Weights by bucket of `protos.histogram`; never changed."""
+    round_trip_s: float
+    """The median, within 2 %; NaN where none is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,15 +112,3 @@ def _misses(
     return MissView(
         use.name, predicted, estimator.observed_miss_ratio(robot, use.name, now), use.wanted_miss or use.target_miss
     )
-
-
-def medians(paths: Sequence[PathView]) -> list[float]:
-    """The median round trip of each path in seconds, within 2 %; NaN where none is known."""
-    if not paths:
-        return []
-    reached = np.cumsum([path.round_trips for path in paths], axis=1)
-    half = reached[:, -1:] / 2
-    # Rounding must not put it beyond the last bucket.
-    index = np.minimum((reached < half).sum(axis=1), BUCKETS - 1)
-    found: list[float] = np.where(half[:, 0] > 0.0, _MIDS[index], np.nan).tolist()
-    return found

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 from controlplane import turns
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.control_events import Settings
-from controlplane.core.fleet_view import MemberView, MissView, PathView, medians
+from controlplane.core.fading import FadedHistogram
+from controlplane.core.fleet_view import MemberView, MissView, PathView
 from controlplane.core.registry import Refusal
 from controlplane.event_log import EventLog
 from controlplane.fleet_metrics import MAX_GONE, MAX_SERIES, REUSED_S, Fleet, FleetCollector, families
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
 from protos.fleet_events import DepartedSidecar, Why
-from protos.histogram import BUCKETS
+from protos.histogram import Histogram
 from protos.model import (
     Assignment,
     CandidateSet,
@@ -189,8 +190,6 @@ def test_a_member_is_told_of_once_also_where_the_policy_cut_it_off() -> None:
 
 
 def robot_view(name: str, interfaces: int, servers: int, services: int) -> MemberView:
-    weights = np.zeros(BUCKETS)
-    weights[100] = 1.0
     nics = [InterfaceName(f"nic{number}") for number in range(interfaces)]
     clouds = [NodeName(f"cloud-{number}") for number in range(servers)]
     names = [ServiceName(f"/service_{number}") for number in range(services)]
@@ -199,7 +198,7 @@ def robot_view(name: str, interfaces: int, servers: int, services: int) -> Membe
         role=Role.ROBOT,
         connected=True,
         seen_at=0.0,
-        paths=tuple(PathView(nic, cloud, True, weights) for nic in nics for cloud in clouds),
+        paths=tuple(PathView(nic, cloud, True, 0.03) for nic in nics for cloud in clouds),
         mapping=tuple(
             ServiceMapping(service, tuple(Assignment(nic, cloud) for nic, cloud in zip(nics, clouds, strict=False)))
             for service in names
@@ -239,14 +238,15 @@ def test_also_as_many_members_as_can_be_there_at_all() -> None:
     assert len(series(families(fleet(robots, gone=MAX_GONE)))) <= MAX_SERIES + 1
 
 
-def test_medians_are_those_of_the_histogram() -> None:
-    views = []
-    for seconds in (0.001, 0.03, 5.0):
-        weights = histogram(seconds, seconds * 1.5, seconds / 1.5).counts.astype(np.float64) / 4.0
-        views.append(PathView(InterfaceName("wlan0"), NodeName("a"), True, weights))
-    views.append(PathView(InterfaceName("wlan0"), NodeName("b"), True, np.zeros(BUCKETS)))
-    assert medians(views) == pytest.approx([0.001, 0.03, 5.0, np.nan], rel=0.03, nan_ok=True)
-    assert medians([]) == []
+@pytest.mark.parametrize("seconds", [0.001, 0.03, 5.0])
+def test_the_median_is_that_of_the_histogram(seconds: float) -> None:
+    faded = FadedHistogram(30.0, now=0.0)
+    assert math.isnan(faded.median_once())
+    faded.add(histogram(seconds, seconds * 1.5, seconds / 1.5), now=0.0)
+    assert faded.median_once() == pytest.approx(seconds, rel=0.03)
+    assert faded.median_once() == faded.median()
+    faded.add(Histogram(), now=1e6)
+    assert math.isnan(faded.median_once()), "all of it is forgotten"
 
 
 @pytest.mark.parametrize("threaded", [False, True])

@@ -1,4 +1,4 @@
-"""What outlives full collections is set aside, and found again when it is asked for."""
+"""What lives is set aside, and looked at again when it is asked for."""
 
 from __future__ import annotations
 
@@ -19,30 +19,33 @@ def ring():
     one.other, other.other = other, one
     return one
 
-gc.disable()
-interpreter.keep_settling()
+interpreter.settle()
+interpreter.collect_by_hand()
+seen = [weakref.ref(ring()) for _ in range(100_000)]
+assert all(ref() is not None for ref in seen), "nothing is collected unasked"
+interpreter.set_aside()
+assert not any(ref() is not None for ref in seen), "cycles that have come and gone since are found"
 held = [ring() for _ in range(1000)]
-gc.collect()
 frozen = gc.get_freeze_count()
-assert frozen >= 2000, frozen
+interpreter.set_aside()
+assert gc.get_freeze_count() >= frozen + 2000
 seen = [weakref.ref(one) for one in held]
 alone = [Node() for _ in range(1000)]
-gc.collect()
+interpreter.set_aside()
 gone = weakref.ref(alone[0])
 alone.clear()
 assert gone() is None, "what is no cycle goes without any collection"
 held.clear()
-gc.collect()
-assert all(ref() is not None for ref in seen), "a collection does not look at what is set aside"
+interpreter.set_aside()
+assert all(ref() is not None for ref in seen), "what was set aside is not looked at"
 interpreter.look_at_all()
-gc.collect()
 assert not any(ref() is not None for ref in seen)
 interpreter.clear()
-assert gc.get_freeze_count() == 0
+assert gc.get_freeze_count() == 0 and gc.isenabled()
 """
 
 
 @pytest.mark.audit("ops-19")
-def test_what_outlives_full_collections_is_not_looked_at_until_all_is() -> None:
+def test_what_is_set_aside_is_not_looked_at_until_all_is() -> None:
     """In a program of its own: the garbage collector is everybody's."""
     subprocess.run([sys.executable, "-c", PROGRAM], check=True, timeout=60)
