@@ -385,7 +385,7 @@ class ControlLoop:
                 drawn_s = self._loop.time() - now
                 if now >= metrics_at:
                     share = used.share(time.thread_time(), now)
-                    self._core.follow_load(share)
+                    self._core.follow_load(now, share)
                     self._prepare_if_quiet(share)
                     self._update_metrics()
                     self._garbage.look_if_worth(len(self._core.registry))

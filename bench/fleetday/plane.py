@@ -186,7 +186,7 @@ class Plane:
 
     def _follow_load(self, core: ControlCore) -> None:
         if core is self._core:
-            core.follow_load(self.busy)
+            core.follow_load(self._timeline.now, self.busy)
             self._timeline.after(LOAD_EVERY_S, partial(self._follow_load, core))
 
     def _settle(self) -> None:

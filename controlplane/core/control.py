@@ -176,7 +176,7 @@ class ControlCore:
         self._publisher.begin_stream(registration)
         self._welcome(name, stream)
         self._came_or_went(name, now)
-        self.follow_load()
+        self.follow_load(now)
         return stream
 
     def receive(self, stream: StreamId, message: SidecarMessage, now: float) -> None:
@@ -185,7 +185,7 @@ class ControlCore:
         if name is None or not self.registry.touch(name, stream, now):
             self.counters.old_stream_messages += 1
             return
-        if self._told_intervals[name] != self.pacing.interval_s:
+        if self.pacing.worth_telling(self._told_intervals[name], now):
             # Along with what is said anyway: to tell all of them at once would hold up everything else.
             self._welcome(name, stream)
         match message:
@@ -272,9 +272,12 @@ class ControlCore:
         )
         self._events.append(Send(stream, welcome))
 
-    def follow_load(self, busy: float | None = None) -> None:
-        """Let sidecars report as often as their number allows, and `busy`: the share of one core used lately."""
-        self.pacing.follow(len(self.registry), busy)
+    def follow_load(self, now: float, busy: float | None = None) -> None:
+        """Let sidecars report as often as their number allows, and `busy`: the share of one core used lately.
+
+        After a restart those who are still to come back count too: each is told once how often.
+        """
+        self.pacing.follow(len(self.registry) + len(self._returning), now, busy)
         self.registry.lease_s = self.pacing.lease_s
 
     def relay_revocations(self, crl: bytes, now: float) -> None:
@@ -382,6 +385,7 @@ class ControlCore:
             self._drawing_since,
             self._publisher.warm_until,
             self._publisher.resend_at,
+            self._publisher.inform_at,
             self.restlessness.next_time(),
             self._publishing_since if self._publications else None,
             self._untold_since if self._untold else None,
@@ -407,9 +411,12 @@ class ControlCore:
                     self._announced(name, told, now)
         if self._publisher.warm_until is not None and self._publisher.warm_until <= now:
             self._publisher.end_warm_up()
-            self._publish_soon(now)
+            self._members_changed(now)
         if self._publisher.resend_at is not None and self._publisher.resend_at <= now:
             self._publisher.send_refused_again()
+            self._publish_soon(now)
+        if self._publisher.inform_at is not None and self._publisher.inform_at <= now:
+            self._publisher.inform()
             self._publish_soon(now)
         if self._publish_at is not None and self._publish_at <= now and not self._publications:
             self._publish(now)
@@ -477,7 +484,9 @@ class ControlCore:
                 return None
             self._drawing_since = now
             self._drawing.begin(routine=change is Change.REPORT)
-        ready = (sidecar for sidecar in self.registry if sidecar.ready)
+        # Who waits for its servers has a mapping; what is made of nothing known must not take its place.
+        waits = self._publisher.waits
+        ready = (sidecar for sidecar in self.registry if sidecar.ready and not waits(sidecar.name))
         if not self._drawing.advance(ready, self.permits, self.estimator, now, self._lost_share):
             return None
         self._drawing_since = None
@@ -519,7 +528,7 @@ class ControlCore:
         self._picture = settled.picture
         if self._publish_at is None:
             self._begin_publishing(
-                self._publisher.publish_plan(settled.robots, self.permits, plan, settled.picture), now
+                self._publisher.publish_plan(settled.robots, self.permits, plan, settled.picture, now), now
             )
         else:
             self._publisher.plan_changed(settled.robots)
@@ -532,7 +541,10 @@ class ControlCore:
 
     def _publish(self, now: float) -> None:
         self._publish_at = None
-        self._begin_publishing(self._publisher.publish(self.permits, self.plan, self._picture), now)
+        if self._publisher.release():
+            self._drawing.members_changed()
+            self._debounce.note(Change.MEMBERS, now)
+        self._begin_publishing(self._publisher.publish(self.permits, self.plan, self._picture, now), now)
 
     def _begin_publishing(self, publication: Iterator[Send | None], now: float) -> None:
         self._publications.append(publication)

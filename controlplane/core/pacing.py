@@ -35,7 +35,14 @@ LEAST_RECONNECT_S = 1.0
 """As far apart may the attempts of a small fleet be."""
 
 WORTH_TELLING = 1.25
-"""Sidecars are told of another interval when it differs by this factor: not at each one that comes."""
+"""The interval changes by this factor at least: not with each sidecar that comes."""
+
+FAR_OFF = 2.0
+"""A sidecar is told at once when its interval is off by this factor ..."""
+
+SETTLED_S = 10.0
+"""... and otherwise when the interval has stood for so long: while a fleet comes, it changes each second, and every
+sidecar would be told four times."""
 
 
 class Pacing:
@@ -47,6 +54,8 @@ class Pacing:
         self._stretch = 1.0
         self._sidecars = 0
         self._busy = 0.0
+        self._since = -math.inf
+        """When the interval changed last."""
         self.interval_s = interval_s
 
     @property
@@ -59,8 +68,8 @@ class Pacing:
         """How far apart a sidecar's attempts to connect may be: so many come back in this time as are let in in it."""
         return min(max(self._sidecars / ADMITTED_PER_S, LEAST_RECONNECT_S), MAX_INTERVAL_S)
 
-    def follow(self, sidecars: int, busy: float | None = None) -> None:
-        """So many are registered; `busy` is the share of one core that the control plane took lately, if it is new."""
+    def follow(self, sidecars: int, now: float, busy: float | None = None) -> None:
+        """So many are there, or about to be; `busy` is the share of one core taken lately, if that is news."""
         self._sidecars = sidecars
         if busy is not None:
             self._busy += BUSY_WEIGHT * (busy - self._busy)
@@ -71,8 +80,18 @@ class Pacing:
         most = max(MAX_INTERVAL_S, self._least_interval_s)
         paced = self._least_interval_s * math.sqrt(max(sidecars, FULL_PACE) / FULL_PACE)
         wanted = min(paced * self._stretch, most)
-        if not 1.0 / WORTH_TELLING < wanted / self.interval_s < WORTH_TELLING or wanted in (
-            self._least_interval_s,
-            most,
-        ):
+        if wanted == self.interval_s:
+            return
+        if _is_far(wanted, self.interval_s, WORTH_TELLING) or wanted in (self._least_interval_s, most):
             self.interval_s = wanted
+            self._since = now
+
+    def worth_telling(self, told_s: float, now: float) -> bool:
+        """Whether a sidecar that was told this interval is to be told the one in force."""
+        if told_s == self.interval_s:
+            return False
+        return _is_far(told_s, self.interval_s, FAR_OFF) or now - self._since >= SETTLED_S
+
+
+def _is_far(one_s: float, other_s: float, factor: float) -> bool:
+    return not 1.0 / factor < one_s / other_s < factor

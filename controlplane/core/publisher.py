@@ -49,6 +49,11 @@ RESEND_S = 5.0
 peers (1 kB each) that is refused for good takes 20 kB/s of a cellular link."""
 
 
+INFORM_S = 5.0
+"""Within this time after a mapping a robot is not sent one that merely reads differently: nothing acts on that, and
+what is predicted of a robot that has just come changes with each of its first reports."""
+
+
 class Publisher:
     """The snapshots of all sidecars, those registered and the last ones gone."""
 
@@ -64,8 +69,12 @@ class Publisher:
         """Robots, and the servers that they wait for; None before their first report."""
         self.resend_at: float | None = None
         """When to `send_refused_again`, to all in one go; None while nothing is refused."""
+        self.inform_at: float | None = None
+        """When to `inform`; None while there is nobody to."""
+        self._uninformed: set[NodeName] = set()
+        """Robots whose mapping reads differently by now."""
         self._due: set[NodeName] = set()
-        """To look at for news with the next `publish`, beside those held back."""
+        """To look at for news with the next `publish`."""
         self._clouds_due = False
         self._all_due = False
 
@@ -100,11 +109,30 @@ class Publisher:
         """A sidecar is not registered any more."""
         self.changed(name, role)
         self._held_back.pop(name, None)
+        self._uninformed.discard(name)
         self._known_peers.forget(name)
         gone = self._gone[name] = self._snapshots.pop(name)
         gone.peers.sent = None  # a server's holds all robots as they were then
         if len(self._gone) > MAX_GONE_SNAPSHOTS:
             self._gone.popitem(last=False)
+
+    def waits(self, name: NodeName) -> bool:
+        """Whether a robot is held back."""
+        return name in self._held_back
+
+    def release(self) -> bool:
+        """Let go of those whose servers are all back; returns whether there are any."""
+        returned = [
+            name for name, servers in self._held_back.items() if servers is not None and self._are_back(servers)
+        ]
+        for name in returned:
+            del self._held_back[name]
+        self._due.update(returned)
+        return bool(returned)
+
+    def _are_back(self, servers: Iterable[NodeName]) -> bool:
+        known = (self._registry.get(server) for server in servers)
+        return all(other is not None and other.ready for other in known)
 
     def waits_for(self, name: NodeName, servers: Iterable[NodeName]) -> bool:
         """A robot reports on these servers; True if it is held back."""
@@ -146,7 +174,13 @@ class Publisher:
             if snapshots.send_refused_again():
                 self._due.add(name)
 
-    def publish(self, permits: Permits, plan: Plan, picture: Picture) -> Iterator[Send | None]:
+    def inform(self) -> None:
+        """Whose mapping merely reads differently is looked at with the next `publish`."""
+        self.inform_at = None
+        self._due.update(self._uninformed)
+        self._uninformed.clear()
+
+    def publish(self, permits: Permits, plan: Plan, picture: Picture, now: float) -> Iterator[Send | None]:
         """Everything that is news to somebody, and None before each sidecar: so often other work may come in between.
 
         Clouds first: what a robot learns that it may call shall be refused nowhere.
@@ -159,12 +193,12 @@ class Publisher:
                 continue
             yield from self._peers(sidecar, sidecar.stream, views, permits)
             if sidecar.role is Role.ROBOT:
-                yield from self._mapping(sidecar, sidecar.stream, views, plan, picture)
+                yield from self._mapping(sidecar, sidecar.stream, views, plan, picture, now)
 
     def _take_due(self) -> list[NodeName]:
         """Whom to look at now, clouds first."""
         everybody, clouds = self._all_due, self._all_due or self._clouds_due
-        due = self._due | self._held_back.keys()
+        due = self._due
         self._due, self._clouds_due, self._all_due = set(), False, False
         clouds_due: list[NodeName] = []
         robots_due: list[NodeName] = []
@@ -181,7 +215,7 @@ class Publisher:
         self._due.update(robots)
 
     def publish_plan(
-        self, robots: Iterable[NodeName], permits: Permits, plan: Plan, picture: Picture
+        self, robots: Iterable[NodeName], permits: Permits, plan: Plan, picture: Picture, now: float
     ) -> Iterator[Send | None]:
         """The mappings of these robots, where they are news; who is there did not change since `publish`."""
         views = Views(self._registry, permits, self._known_peers)
@@ -189,23 +223,13 @@ class Publisher:
             yield None
             robot = self._registry.get(name)
             if robot is not None and robot.stream is not None and not self._is_held_back(robot, permits):
-                yield from self._mapping(robot, robot.stream, views, plan, picture)
+                yield from self._mapping(robot, robot.stream, views, plan, picture, now)
 
     def _is_held_back(self, sidecar: Sidecar, permits: Permits) -> bool:
         if permits.restricted and sidecar.role is Role.CLOUD and not sidecar.ready:
             # What robots may call on it depends on what it offers.
             return True
-        name = sidecar.name
-        if name not in self._held_back:
-            return False
-        servers = self._held_back[name]
-        if servers is None:
-            return True
-        known = (self._registry.get(server) for server in servers)
-        if all(other is not None and other.ready for other in known):
-            del self._held_back[name]
-            return False
-        return True
+        return self.waits(sidecar.name)
 
     def _peers(self, sidecar: Sidecar, stream: StreamId, views: Views, permits: Permits) -> Iterator[Send]:
         snapshots = self._snapshots[sidecar.name]
@@ -220,7 +244,9 @@ class Publisher:
         removed = views.removed(sidecar, snapshots.known_names)
         yield Send(stream, snapshots.send_peers(view, told, removed, base, self._versions))
 
-    def _mapping(self, robot: Sidecar, stream: StreamId, views: Views, plan: Plan, picture: Picture) -> Iterator[Send]:
+    def _mapping(
+        self, robot: Sidecar, stream: StreamId, views: Views, plan: Plan, picture: Picture, now: float
+    ) -> Iterator[Send]:
         snapshots = self._snapshots[robot.name]
         sent = snapshots.mapping.sent
         mapping = reconcile.mapping_of(robot, views.servers_of(robot.name), plan, picture, sent or ())
@@ -229,8 +255,14 @@ class Publisher:
             worth_sending = bool(mapping)
         else:
             worth_sending = snapshots.mapping.send_again or reconcile.differs(mapping, sent)
+            if not worth_sending and reconcile.reads_differently(mapping, sent):
+                inform_at = snapshots.mapped_at + INFORM_S
+                worth_sending = inform_at <= now
+                if not worth_sending:
+                    self._uninformed.add(robot.name)
+                    self.inform_at = min(inform_at, self.inform_at or inform_at)
         if worth_sending:
-            yield Send(stream, snapshots.send_mapping(mapping, self._versions))
+            yield Send(stream, snapshots.send_mapping(mapping, self._versions, now))
 
     def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
         """How far every registered sidecar follows; clouds get no mapping."""

@@ -127,7 +127,7 @@ def _standby(
 
 
 def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objective, *, standby: bool) -> str:
-    """One short line; without figures that change with every report, as a new reason is a new version."""
+    """One short line; without figures that change with every report, as a new reason is a new version in time."""
     parts = [block.shortfall or "least cost that meets the target" if block.target_miss else LEAST[objective]]
     if block.why:
         parts.append(block.why)
@@ -154,12 +154,20 @@ def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objectiv
 
 
 def differs(new: tuple[ServiceMapping, ...], old: tuple[ServiceMapping, ...]) -> bool:
-    """Whether a mapping is worth a new version."""
+    """Whether a robot would do something else, or has to know why it cannot do anything."""
     if len(new) != len(old):
         return True
     return any(
-        (a.service, a.assignments, a.reason, a.explore) != (b.service, b.assignments, b.reason, b.explore)
-        or _prediction_differs(a.predicted_miss, b.predicted_miss)
+        (a.service, a.assignments, a.explore) != (b.service, b.assignments, b.explore)
+        or (not a.assignments and a.reason != b.reason)
+        for a, b in zip(new, old, strict=True)
+    )
+
+
+def reads_differently(new: tuple[ServiceMapping, ...], old: tuple[ServiceMapping, ...]) -> bool:
+    """Whether what stands beside the same assignments is worth a new version, sooner or later."""
+    return any(
+        a.reason != b.reason or _prediction_differs(a.predicted_miss, b.predicted_miss)
         for a, b in zip(new, old, strict=True)
     )
 

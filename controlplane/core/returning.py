@@ -25,6 +25,10 @@ class Returning:
         self.until: float | None = None
         """When to ask who is `missing`; None while nobody is awaited."""
 
+    def __len__(self) -> int:
+        """How many are awaited."""
+        return len(self._awaited)
+
     def expect(self, present: Iterable[Departure], until: float) -> None:
         """These were there; they are noted as departures should they not come back until then."""
         self._awaited = {one.name: one for one in present}

@@ -125,11 +125,13 @@ class Track(Generic[C]):
 class Snapshots:
     """Both resources of one sidecar."""
 
-    __slots__ = ("known_names", "mapping", "peers", "sent_changes", "whole_again_at")
+    __slots__ = ("known_names", "mapped_at", "mapping", "peers", "sent_changes", "whole_again_at")
 
     def __init__(self) -> None:
         self.peers: Track[PeerView] = Track()
         self.mapping: Track[tuple[ServiceMapping, ...]] = Track()
+        self.mapped_at = -math.inf
+        """When the mapping was sent last."""
         self.known_names: set[NodeName] = set()
         """Peers the sidecar may know: of the set it acknowledged last and of all sent since."""
         self.sent_changes = False
@@ -159,8 +161,9 @@ class Snapshots:
         self.known_names.update(told.names())
         return PeerSet(version, self.peers.nonce, told, removed, view.policy, base)
 
-    def send_mapping(self, services: tuple[ServiceMapping, ...], versions: VersionSource) -> MappingSet:
+    def send_mapping(self, services: tuple[ServiceMapping, ...], versions: VersionSource, now: float) -> MappingSet:
         """Send the sidecar its mapping."""
+        self.mapped_at = now
         version = self.mapping.send(services, versions)
         return MappingSet(version, self.mapping.nonce, services)
 

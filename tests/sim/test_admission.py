@@ -175,7 +175,7 @@ def _registration(number: int) -> Registration:
 
 def _welcome(clients: int) -> Welcome:
     pacing = Pacing(interval_s=0.5, lease_s=3.0)
-    pacing.follow(clients)
+    pacing.follow(clients, 0.0)
     return Welcome(lease_s=pacing.lease_s, report_interval_s=pacing.interval_s, reconnect_max_s=pacing.reconnect_max_s)
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from controlplane.core.publisher import INFORM_S
 from protos.model import (
     Heartbeat,
     NodeName,
@@ -43,6 +44,7 @@ def test_two_interfaces_and_two_servers_get_one_each(world: World) -> None:
     world.run(SETTLED_S)
     assert sorted(robot.pairs()) == ["wlan0", "wwan0"]
     assert sorted(robot.pairs().values()) == ["a", "b"]
+    world.run(INFORM_S)
     assert robot.reason() == "least probability that all copies miss"
 
 
@@ -89,10 +91,24 @@ def test_a_dark_interface_stays_on_standby_where_it_was(world: World) -> None:
     world.run(SETTLED_S)
     before = robot.pairs()
     world.report(robot, path("wwan0", "a", up=False), path("wwan0", "b", up=False))
-    world.run(SETTLED_S)
+    world.run(INFORM_S)
     assert robot.pairs()["wwan0"] == before["wwan0"]
     assert "no path is up over wwan0" in robot.reason()
     assert robot.services[0].predicted_miss == pytest.approx(0.5)
+
+
+def test_what_merely_reads_differently_is_told_once_in_a_while(world: World) -> None:
+    """Each first report changes what is predicted; the robot does the same all the while."""
+    world.cloud("a"), world.cloud("b")
+    robot = world.robot()
+    for _ in range(int(10 * INFORM_S)):
+        world.all_up(robot, ("a", "b"))
+        world.run(0.1)
+    first = robot.pairs()
+    readings = {(mapping.reason, mapping.predicted_miss) for told in robot.mapping_sets for mapping in told.services}
+    assert first == robot.pairs()
+    assert len(readings) <= 4
+    assert len(robot.mapping_sets) <= 4
 
 
 def test_what_is_not_idempotent_goes_to_one_server(world: World) -> None:
@@ -181,6 +197,7 @@ def test_a_failed_solving_leaves_the_plan_and_is_tried_again(world: World) -> No
     solvings = world.solvings
     world.run(SETTLED_S)
     assert world.solvings == solvings + 1
+    world.run(INFORM_S)
     assert "no path is up" not in robot.reason()
 
 

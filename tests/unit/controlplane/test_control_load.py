@@ -8,6 +8,7 @@ import pytest
 
 from controlplane.core import control, drawing
 from controlplane.core.estimator import Estimator
+from controlplane.core.publisher import INFORM_S
 from protos.model import Heartbeat, MappingSet, PeerSet
 from tests.sim.control_world import SETTLED_S
 from tests.unit.controlplane.samples import path
@@ -101,6 +102,7 @@ def test_a_dead_server_costs_no_estimates_anew(world: World, monkeypatch: pytest
 @pytest.mark.audit("ops-19")
 def test_nobody_is_told_again_what_did_not_change(world: World) -> None:
     robots = fleet(world)
+    world.run(INFORM_S)
     clouds = [sidecar for sidecar in world.sidecars.values() if sidecar not in robots]
     for sidecar in world.sidecars.values():
         sidecar.received.clear()

@@ -34,7 +34,7 @@ def test_what_a_look_did_not_free_is_not_looked_at_again_soon() -> None:
         if watch.worth_a_look(resident, 0):
             looks += 1
             watch.looked(resident, 0)
-    assert looks <= 16 and looks > 3
+    assert 3 < looks <= 16
 
 
 @pytest.mark.audit("ops-19")

@@ -9,7 +9,7 @@ import pytest
 from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.plan import BlockPlan, Plan
 from controlplane.core.problem import BlockKey, FleetKey, Problem
-from controlplane.core.reconcile import differs, mapping_of
+from controlplane.core.reconcile import differs, mapping_of, reads_differently
 from controlplane.core.registry import Sidecar
 from protos.model import (
     ALL_CALLS,
@@ -127,12 +127,19 @@ def test_only_a_material_change_is_worth_a_version() -> None:
     assert not differs((base,), (base,))
     assert differs((), (base,))
     assert differs((base,), (ServiceMapping(PLAN, (Assignment(WLAN, B),), 0.01, "because"),))
-    assert differs((base,), (ServiceMapping(PLAN, base.assignments, 0.01, "for another reason"),))
     assert differs((base,), (replace(base, explore=Assignment(WLAN, B)),))
-    assert not differs((base,), (ServiceMapping(PLAN, base.assignments, 0.015, "because"),))
-    assert differs((base,), (ServiceMapping(PLAN, base.assignments, 0.03, "because"),))
-    tiny = (ServiceMapping(PLAN, base.assignments, 1e-9, "because"),)
-    assert not differs(tiny, (ServiceMapping(PLAN, base.assignments, 1e-6, "because"),))
+    unserved = replace(base, assignments=())
+    assert differs((unserved,), (replace(unserved, reason="for another reason"),))
+
+
+def test_what_merely_reads_differently_is_told_apart() -> None:
+    base = ServiceMapping(PLAN, (Assignment(WLAN, A),), 0.01, "because")
+    tiny = replace(base, predicted_miss=1e-9)
+    same = [(base, base), (base, replace(base, predicted_miss=0.015)), (tiny, replace(tiny, predicted_miss=1e-6))]
+    other = [(base, replace(base, reason="for another reason")), (base, replace(base, predicted_miss=0.03))]
+    assert not any(differs((one,), (another,)) for one, another in same + other)
+    assert not any(reads_differently((one,), (another,)) for one, another in same)
+    assert all(reads_differently((one,), (another,)) for one, another in other)
 
 
 def test_where_not_every_interface_is_to_carry_a_copy_none_stands_by_beyond_that() -> None:

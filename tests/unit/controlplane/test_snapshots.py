@@ -104,40 +104,40 @@ def test_a_refusal_for_the_same_reason_is_no_news_until_something_is_taken(versi
 def test_only_what_is_refused_is_sent_again(versions: VersionSource) -> None:
     snapshots = Snapshots()
     send_peers(snapshots, versions, "a")
-    snapshots.send_mapping((), versions)
+    snapshots.send_mapping((), versions, 0.0)
     snapshots.send_refused_again()
     assert not snapshots.peers.send_again
     nack(snapshots.track(ResourceKind.MAPPING))
     snapshots.send_refused_again()
     assert (snapshots.peers.send_again, snapshots.mapping.send_again) == (False, True)
-    snapshots.send_mapping((), versions)
+    snapshots.send_mapping((), versions, 0.0)
     assert not snapshots.mapping.send_again
 
 
 @pytest.mark.audit("dp-12")
 def test_what_is_refused_stays_so_while_it_is_sent_again(versions: VersionSource) -> None:
     snapshots = Snapshots()
-    snapshots.send_mapping((), versions)
+    snapshots.send_mapping((), versions, 0.0)
     assert nack(snapshots.mapping)
     for _ in range(2):
         snapshots.send_refused_again()
-        snapshots.send_mapping((), versions)
+        snapshots.send_mapping((), versions, 0.0)
         assert (state(snapshots.mapping), snapshots.mapping.error) == (SyncState.REJECTED, "no such peer")
         snapshots.send_refused_again()
         assert not snapshots.mapping.send_again, "not answered yet"
         assert nack(snapshots.mapping)
     snapshots.send_refused_again()
-    snapshots.send_mapping((), versions)
+    snapshots.send_mapping((), versions, 0.0)
     assert ack(snapshots.mapping)
     assert (state(snapshots.mapping), snapshots.mapping.error) == (SyncState.SYNCED, "")
 
 
 def test_who_took_what_was_sent_again_and_lost_its_stream_needs_nothing(versions: VersionSource) -> None:
     snapshots = Snapshots()
-    snapshots.send_mapping((), versions)
+    snapshots.send_mapping((), versions, 0.0)
     assert nack(snapshots.mapping)
     snapshots.send_refused_again()
-    snapshots.mapping.begin_stream(snapshots.send_mapping((), versions).version)
+    snapshots.mapping.begin_stream(snapshots.send_mapping((), versions, 0.0).version)
     assert (state(snapshots.mapping), snapshots.mapping.error) == (SyncState.SYNCED, "")
 
 
