@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from bench.control.crowd import Crowd
-from bench.control.member import Member
+from bench.control.member import INTERFACES, SERVICE, Member
 from bench.control.plane import Plane
 from bench.control.targets import SIZES, targets
 from bench.pressure import CpuPressure
@@ -35,6 +35,8 @@ SETTLE_S = 20.0
 """From the registration of all to what counts as steady: the first mappings are solved and have gone out."""
 READY_S = 12.0
 """From the start to what counts as empty: the solver's modules are loaded once nobody has come for some seconds."""
+DEAD_S = 2.0
+"""From a kill to the next start."""
 STATUS_LOOKS = 3
 LEASES = 'plr_departures_total{reason="lease_expired"}'
 LOOK_EVERY_S = 0.02
@@ -68,9 +70,12 @@ def run(options: argparse.Namespace) -> int:
             folder = (options.keep_logs or Path(temporary)) / f"control-{size}"
             folder.mkdir(parents=True)
             fleet = Fleet(size, folder, options.steady_s, console.print)
-            asyncio.run(fleet.measure())
-        figures.update({f"{key}_{size}": value for key, value in fleet.figures.items()})
-        details[str(size)] = fleet.details
+            (folder / "bare").mkdir()
+            anchor = Fleet(size, folder / "bare", options.steady_s, console.print)
+            asyncio.run(_both(fleet, anchor))
+        measured = fleet.figures | anchor.figures
+        figures.update({f"{key}_{size}": value for key, value in measured.items()})
+        details[str(size)] = fleet.details | anchor.details
         found = {**figures, "verdicts": {target.key: target.met(figures) for target in wanted}}
         found |= {"details": details, "machine": {**machine(), "cpu_pressure": pressure.share()}}
         options.out.mkdir(parents=True, exist_ok=True)
@@ -121,7 +126,7 @@ class Fleet:
         self._tell("first_mapped_s", time.monotonic() - began)
 
         self._plane.kill()
-        await asyncio.sleep(2.0)
+        await asyncio.sleep(DEAD_S)
         self._crowd.ended.clear()
         began = self._plane.start()
         await self._until("everybody to be back", lambda: self._crowd.online() == self._size)
@@ -144,15 +149,39 @@ class Fleet:
         await self._lose_a_server()
         self._figure("loop_hold_ms", 1000 * max(steady, self._turns("a server is lost")))
 
+    async def measure_bare(self) -> None:
+        """Go through the same with the anchor in the control plane's place."""
+        clouds = [member.name for member in self._members if member.role is Role.CLOUD]
+        what = (str(self._size), SERVICE, INTERFACES[0], *clouds)
+        try:
+            self._plane.start_bare(*what)
+            self._crowd.start()
+            await self._until("everybody to be registered", lambda: self._crowd.online() == self._size)
+            self._plane.kill()
+            await asyncio.sleep(DEAD_S)
+            began = self._plane.start_bare(*what)
+            await self._until("everybody to be back", lambda: self._crowd.online() == self._size)
+            self._figure("bare_registered_s", time.monotonic() - began)
+            await self._until("everybody to be mapped", lambda: self._crowd.unmapped() == 0)
+            await asyncio.sleep(DEAD_S)
+            self._plane.lose_first_server()
+            await self._remap(clouds[0], "bare_remapped_p99_s")
+        finally:
+            await self._crowd.close()
+            self._plane.kill()
+
     async def _lose_a_server(self) -> None:
         dead = self._members[0].name
-        users = [member for member in self._members if dead in member.mapped]
         await self._crowd.leave(dead)
+        await self._remap(dead, "remapped_p99_s")
+
+    async def _remap(self, dead: NodeName, key: str) -> None:
+        users = [member for member in self._members if dead in member.mapped]
         at = self._crowd.lose_server(dead)
         await self._until("new mappings", lambda: not any(dead in member.mapped for member in users))
         taken = sorted(member.mapped_at - at for member in users)
-        self.details["mapped to the dead server"] = len(users)
-        self._figure("remapped_p99_s", taken[int(0.99 * (len(taken) - 1))] if taken else 0.0)
+        self.details[f"{key}: mapped to the dead server"] = len(users)
+        self._figure(key, taken[int(0.99 * (len(taken) - 1))] if taken else 0.0)
 
     def _turns(self, phase: str) -> float:
         hold = self._plane.hold()
@@ -178,6 +207,12 @@ class Fleet:
                 say_at += 5.0
                 self._say(f"{self._size}: waiting for {what}: {self._crowd.online()} online, {dict(self._crowd.ended)}")
             await asyncio.sleep(LOOK_EVERY_S)
+
+
+async def _both(fleet: Fleet, anchor: Fleet) -> None:
+    """In one event loop: gRPC's threads do not survive theirs."""
+    await fleet.measure()
+    await anchor.measure_bare()
 
 
 def _free_port() -> int:

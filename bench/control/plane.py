@@ -50,14 +50,21 @@ class Plane:
         self._port, self._metrics_port = ports
         self._turns = folder / "turns.json"
         self._process: subprocess.Popen[bytes] | None = None
-        tls = self._certify(authority, IdentityRole.CONTROL_PLANE)
+        self._tls = self._certify(authority, IdentityRole.CONTROL_PLANE)
         self._operator = self._certify(authority, IdentityRole.OPERATOR)
         config = {
             "listen": f"127.0.0.1:{self._port}",
-            "tls_dir": str(tls),
+            "tls_dir": str(self._tls),
             "stun_listen": [],
             "metrics_listen": f"127.0.0.1:{self._metrics_port}",
+            "state_dir": str(folder / "state"),
         }
+        self._environment = {
+            **os.environ,
+            "PYTHONDONTWRITEBYTECODE": "",
+            "PYTHONPYCACHEPREFIX": str(folder / "compiled"),
+        }
+        """An installed program is compiled; this one is by its first start."""
         self._config = folder / "controlplane.yaml"
         self._config.write_text(yaml.safe_dump(config))
 
@@ -84,11 +91,18 @@ class Plane:
 
     def start(self) -> float:
         """Start it with as many open files as the unit allows; returns when."""
+        return self._start("bench.control.watched", str(self._turns), "--config", str(self._config))
+
+    def start_bare(self, *what: str) -> float:
+        """Start the anchor in its place; `what` it is told beside port and certificate."""
+        return self._start("bench.control.bare", str(self._port), str(self._tls), *what)
+
+    def _start(self, module: str, *arguments: str) -> float:
         limit = min(open_files_of(UNIT), resource.getrlimit(resource.RLIMIT_NOFILE)[1])
-        command = [sys.executable, "-m", "bench.control.watched", str(self._turns), "--config", str(self._config)]
+        command = [sys.executable, "-m", module, *arguments]
         began = time.monotonic()
         with (self._folder / "controlplane.log").open("ab") as log:
-            self._process = subprocess.Popen(command, stdout=log, stderr=log)
+            self._process = subprocess.Popen(command, stdout=log, stderr=log, env=self._environment)
         # Not between fork and exec: gRPC's threads of this process would be missing there.
         resource.prlimit(self._process.pid, resource.RLIMIT_NOFILE, (limit, limit))
         return began
@@ -98,6 +112,10 @@ class Plane:
         assert self._process is not None
         self._process.kill()
         self._process.wait()
+
+    def lose_first_server(self) -> None:
+        """Tell the anchor."""
+        os.kill(self.pid, signal.SIGUSR2)
 
     def processor_s(self) -> float:
         """Processor time it has used."""
