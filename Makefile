@@ -66,7 +66,7 @@ bench-churn: setup ## interfaces, servers, control plane come and go for ten min
 bench-insiders: setup ## two members of the fleet attack the others in every way at once for ten minutes: nothing is lost (as root)
 	@$(PY) -m bench insiders $(BENCH_ARGS)
 
-bench-control: setup ## the control plane with 500, 1,000, 2,000 and 4,000 sidecars: a restart, steady load, a dead server (15 minutes)
+bench-control: setup ## the control plane with 500, 1,000, 2,000 and 4,000 sidecars: a restart, steady load, a dead server (20 minutes)
 	@$(PY) -m bench control $(BENCH_ARGS)
 
 bench-fleet-day: setup ## 24 simulated hours of a fleet of 1,000 that joins, leaves, roams and loses servers: nothing drifts, nothing grows
