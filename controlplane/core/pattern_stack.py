@@ -9,11 +9,19 @@ lifts above 1 are capped (`objectives`), and where servers share a group that ar
 from __future__ import annotations
 
 import itertools
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.choices import OWN_EXCESS_PRICE, combinations, nearest, tried_of_each
+from controlplane.core.choices import (
+    MAX_LISTED,
+    OWN_EXCESS_PRICE,
+    TRIED_A_CHOICE,
+    combinations,
+    nearest,
+    tried_of_each,
+)
 from controlplane.core.costs import RULE_PRICE
 from controlplane.core.matching import forced_excess
 from controlplane.core.server_groups import ROWS_AT_ONCE, ServerGroups, violations
@@ -34,6 +42,13 @@ if TYPE_CHECKING:
 
 MAX_BRANCHINGS = 6
 """Rounds in which interfaces are kept from servers; each is for fewer blocks."""
+
+MAX_OPEN, MIN_OPEN = 64, 8
+"""Choices of one block that are branched in one round, and of how many there is room for in any case: the others stay
+as they are, and their bound with them."""
+
+MAX_OPEN_ALL = 16_384
+"""The same, of all blocks together; with 8 interfaces each makes 8 more."""
 
 MIN_GAIN = 1e-12
 """Values closer than this are equal: rounding."""
@@ -116,6 +131,7 @@ class PatternStack(Stack):
                 picks[better],
             )
             open_ = (excess > 0) & (least < rank[owner] - MIN_GAIN) & (branching < MAX_BRANCHINGS)
+            open_ = _most_promising(open_, owner, least, max(MIN_OPEN, min(MAX_OPEN, MAX_OPEN_ALL // len(rows))))
             together = self._together(rows[owner], picks, excess_price)
             np.minimum.at(found.least, owner, least + np.where(open_, together, 0.0))
             if not open_.any():
@@ -179,14 +195,47 @@ class PatternStack(Stack):
 
     def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
         priced = self._costs.of_path[row] + price
-        share = tried_of_each(self.interfaces, at_most)
-        options = []
-        for costs in priced:
-            order = np.argsort(costs, kind="stable")[:share]
-            options.append(order[np.isfinite(costs[order])])
-        picks = np.array(list(itertools.product(*options)), dtype=np.intp)
-        copies = (picks < self.servers).sum(axis=1)
-        picks = picks[(copies >= max(1, self._least_copies[row])) & (copies <= self._most_copies[row])]
+        # The best is always among them: it keeps servers apart that are the cheapest of several interfaces.
+        best = self.best(np.array([row]), price[None]).picks
+        picks = np.unique(np.concatenate([best, self._near_picks(row, priced, at_most)]), axis=0)
         rows = np.full(len(picks), row)
         values = self._costs.cost(rows, picks) + price[picks].sum(axis=1)
         return nearest(values, self._costs.excess(rows, picks), picks, margin, at_most, complete=False)
+
+    def _near_picks(self, row: int, priced: Floats, at_most: int) -> Indices:
+        """For each set of interfaces that may carry the copies every way to take one of the cheapest servers of each;
+        where these sets are too many, those of the interfaces that cost least."""
+        tried = min(MAX_LISTED, TRIED_A_CHOICE * at_most)
+        ways = self._ways(row, priced, tried)
+        share = max(1, min(self.servers, max(tried_of_each(len(way), at_most) for way in ways)))
+        while share > 1 and sum(share ** len(way) for way in ways) > tried:
+            share -= 1
+        cheapest = np.argsort(priced[:, : self.servers], axis=1, kind="stable")[:, :share]
+        found = []
+        for way in ways:
+            of_way = np.full((share ** len(way), self.interfaces), self.servers, dtype=np.intp)
+            chosen = combinations(len(way), share)
+            of_way[:, way] = cheapest[way, chosen]
+            found.append(of_way)
+        return np.concatenate(found)
+
+    def _ways(self, row: int, priced: Floats, at_most: int) -> list[list[int]]:
+        """The sets of interfaces that may carry copies; of too many, the cheapest of each size."""
+        sizes = range(max(1, int(self._least_copies[row])), int(self._most_copies[row]) + 1)
+        if sum(math.comb(self.interfaces, size) for size in sizes) <= at_most:
+            return [list(way) for size in sizes for way in itertools.combinations(range(self.interfaces), size)]
+        order = np.argsort(priced[:, : self.servers].min(axis=1), kind="stable").tolist()
+        return [sorted(order[:size]) for size in sizes]
+
+
+def _most_promising(open_: NDArray[np.bool_], owner: Indices, least: Floats, at_most: int) -> NDArray[np.bool_]:
+    """Of the open ones of each owner those `at_most` that are worth least."""
+    nodes = np.flatnonzero(open_)
+    if len(nodes) <= at_most:
+        return open_
+    nodes = nodes[np.lexsort((least[nodes], owner[nodes]))]
+    _, first, count = np.unique(owner[nodes], return_index=True, return_counts=True)
+    rank = np.arange(len(nodes)) - np.repeat(first, count)
+    found = np.zeros_like(open_)
+    found[nodes[rank < at_most]] = True
+    return found

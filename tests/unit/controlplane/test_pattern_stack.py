@@ -14,7 +14,8 @@ from controlplane.core.choices import OWN_EXCESS_PRICE
 from controlplane.core.limits import Limits
 from controlplane.core.pattern_stack import PatternStack
 from controlplane.core.problem import Block, Objective, Problem, block_excess, is_valid
-from tests.unit.controlplane.problems import plain_cost, random_problem, valid_choices
+from protos.preferences import Copies
+from tests.unit.controlplane.problems import block, plain_cost, random_problem, valid_choices
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,3 +89,24 @@ def test_choices_near_the_best_are_valid_and_worth_what_they_say() -> None:
                 assert is_valid(part, choice)
                 assert excess == block_excess(part, choice)
                 assert value == pytest.approx(rank(Objective.JOINT, part, choice, prices, 0.0))
+
+
+@pytest.mark.audit("ops-20")
+@pytest.mark.parametrize("objective", Objective)
+def test_there_are_choices_near_the_best_however_few_copies_are_wanted(objective: Objective) -> None:
+    rng = random.Random(54)
+    for interfaces in (4, 6, 8, 12):
+        for least, most in ((1, 1), (2, 3), (3, 3), (1, interfaces), (interfaces, interfaces)):
+            epsilon: list[list[float | None]] = [
+                [None if rng.random() < 0.2 else rng.random() ** 4 for _ in range(4)] + [0.5] for _ in range(interfaces)
+            ]
+            part = block(epsilon, copies=Copies(least, most))
+            stack = PatternStack(objective, [part], Limits(Problem(())), at_most=4096)
+            prices = np.array([rng.random() for _ in range(stack.servers)] + [0.0])
+            best = stack.best(stack.every, prices[None])
+            for at_most in (1, 4, 100):
+                near = stack.near(0, prices, 1.0, at_most)
+                assert 1 <= len(near.values) <= at_most
+                ranks = near.values + OWN_EXCESS_PRICE * near.excess
+                assert ranks[0] <= best.value[0] + OWN_EXCESS_PRICE * best.excess[0] + 1e-9
+                assert all(is_valid(part, stack.choice_of(picks)) for picks in near.picks)

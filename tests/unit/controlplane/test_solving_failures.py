@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+import math
+import random
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,11 +14,12 @@ import pytest
 from controlplane import group_solver
 from controlplane.core.compute import ComputeTimes
 from controlplane.core.forgetting import FORGET_S
-from controlplane.core.problem import Block, BlockKey, FleetKey, Problem
+from controlplane.core.problem import Block, BlockKey, FleetKey, Objective, Problem
 from controlplane.core.snapshots import VersionSource
 from controlplane.matcher import Matcher
 from protos.convert import use_from_proto, use_to_proto
 from protos.model import MAX_VERSION, InterfaceName, NodeName, ServiceName, Version
+from protos.preferences import Copies
 from tests.unit.controlplane.samples import histogram, use
 
 if TYPE_CHECKING:
@@ -59,6 +63,46 @@ def test_a_block_that_cannot_be_solved_costs_no_other_its_mapping(
     assert plan.blocks[BlockKey(NodeName("bad"), SERVICE)].assignments == ((InterfaceName("if0"), NodeName("cloud-0")),)
     assert caplog.text.count("could not be solved") == 1
     assert "bad" in caplog.text
+
+
+@pytest.mark.audit("ops-20")
+@pytest.mark.parametrize("seed", range(3))
+def test_fewer_copies_than_interfaces_on_crowded_servers_are_the_best_there_are(
+    seed: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two robots, six interfaces each, three copies each, six servers with room for one: each server is taken once."""
+    rng = random.Random(seed)
+    shape = block("shape", interfaces=6, servers=6)
+    one, other = (
+        replace(
+            shape,
+            key=BlockKey(NodeName(name), SERVICE),
+            epsilon=tuple(tuple(rng.random() ** 3 for _ in range(6)) for _ in range(6)),
+            copies=Copies(3, 3),
+        )
+        for name in ("one", "other")
+    )
+    capacity = {FleetKey(server, SERVICE): 1 for server in one.servers}
+    with caplog.at_level(logging.ERROR):
+        plan = Matcher().solve(Problem((one, other), capacity, Objective.PRODUCT), time_limit_s=20.0)
+    assert not caplog.text
+    taken = [server for found in plan.blocks.values() for _, server in found.assignments]
+    assert sorted(taken) == sorted(one.servers)
+    assert not plan.relaxed
+    costs = [_least_of_three(part) for part in (one, other)]
+    best = min(costs[0][servers] + costs[1][frozenset(range(6)) - servers] for servers in costs[0])
+    assert sum(found.cost for found in plan.blocks.values()) == pytest.approx(best, abs=1e-6)
+
+
+def _least_of_three(part: Block) -> dict[frozenset[int], float]:
+    """By set of three servers the least that three copies to them cost."""
+    found: dict[frozenset[int], float] = {}
+    for servers in itertools.combinations(range(6), 3):
+        found[frozenset(servers)] = min(
+            sum(math.log(part.epsilon[i][j] or 0.0) for i, j in zip(interfaces, servers, strict=True))
+            for interfaces in itertools.permutations(range(6), 3)
+        )
+    return found
 
 
 @pytest.mark.audit("ops-20")
