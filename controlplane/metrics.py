@@ -278,6 +278,8 @@ def _drops(core: ControlCore, superseded: int, events: EventLogState) -> Iterabl
             ("report_of_cloud",): core.counters.reports_ignored,
             ("report_forbidden",): core.counters.report_entries_forbidden,
             ("announced_too_often",): core.restlessness.held,
+            ("urgent_too_often",): core.urgency.held,
+            ("interface_left_out",): core.counters.interfaces_left_out,
             ("superseded_before_sent",): superseded,
         },
     )

@@ -30,7 +30,7 @@ from controlplane.core.cut_off import cut_off
 from controlplane.core.debounce import Change, Debounce
 from controlplane.core.departed import Departed, Departure, departure, last_known, why_removed
 from controlplane.core.departed_explanation import explain_departed
-from controlplane.core.drawing import Drawing
+from controlplane.core.drawing import MAX_INTERFACES, Drawing
 from controlplane.core.estimator import Estimator
 from controlplane.core.explanation import explain, find
 from controlplane.core.exploration import Exploration
@@ -50,6 +50,7 @@ from controlplane.core.restlessness import Restlessness
 from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
 from controlplane.core.status import statuses
+from controlplane.core.urgency import Urgency
 from protos.errors import DecodeError
 from protos.fleet_events import Why
 from protos.model import (
@@ -148,6 +149,7 @@ class ControlCore:
         self._untold_since = now
         self._refused_offers = RefusedOffers()
         self.restlessness = Restlessness()
+        self.urgency = Urgency()
         self._publish_at: float | None = None
         self._publications: deque[Iterator[Send | None]] = deque()
         """Begun, and told to some; the first one goes on first."""
@@ -215,6 +217,9 @@ class ControlCore:
     def _announced(self, name: NodeName, told: CandidateSet | ServiceSet, now: float) -> None:
         if isinstance(told, CandidateSet):
             changed = self.registry.set_candidates(name, told)
+            if changed:
+                interfaces = len({candidate.interface for candidate in told.candidates})
+                self.counters.interfaces_left_out += max(0, interfaces - MAX_INTERFACES)
         else:
             known = self.registry.get(name)
             if told.unmet and known is not None and told.unmet != known.unmet:
@@ -242,7 +247,10 @@ class ControlCore:
         if self.estimator.merge(name, report, now):
             change = Change.PATH
         if change is not Change.REPORT:
-            self._drawing.robot_changed(name, anew=surprised)
+            if self.urgency.take(name, self._drawing.cost(name), now):
+                self._drawing.robot_changed(name, anew=surprised)
+            else:
+                change = Change.REPORT
         self._debounce.note(change, now)
         if reaches_again:
             self._publish_soon(now)

@@ -71,6 +71,8 @@ class Counters:
     """Reports of clouds, which measure nothing."""
     report_entries_forbidden: int = 0
     """Of robots about servers or services that they may not use."""
+    interfaces_left_out: int = 0
+    """Announced by robots beyond those that any mapping is sought among."""
     old_stream_messages: int = 0
     """Messages on a stream that is not the sidecar's any more."""
     offers_refused: int = 0

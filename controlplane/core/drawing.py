@@ -10,7 +10,7 @@ within what a change of the mapping could be worth, stays the very same object, 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from controlplane.core.path_rules import PathRules
 from controlplane.core.picture import BlockNotes, Picture, draw_block, interfaces_of
@@ -18,7 +18,7 @@ from controlplane.core.problem import BlockKey, FleetKey, Problem
 from protos.model import Role
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.path_rules import PathRule
@@ -31,8 +31,17 @@ if TYPE_CHECKING:
 SLICE_PAIRS = 40
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""
 
-KEPT_PAIRS = 8
-"""Pairs whose estimates are kept take as long as one that is estimated."""
+ROBOT_PAIRS = 400
+"""Pairs of one robot estimated for one picture, but for the use that is begun: the others are for the next pictures. So
+whoever names many interfaces and services holds up no other robot. A robot with 8 interfaces that calls 4 services on
+16 servers has some 500."""
+
+USE_PAIRS = 1024
+"""Pairs of one use: of how many the estimator knows anything."""
+
+LEAST_INTERFACES, MAX_INTERFACES = 16, 64
+"""Interfaces of one robot that are looked at whatever the number of servers, and of those with few; the first that it
+names."""
 
 LOOKED_AT_ONCE = 200
 """Robots of which it is found out in one go who could serve them: some milliseconds."""
@@ -67,6 +76,7 @@ class _Inputs:
     """What a block is drawn from beside the measurements; equal if that is the same."""
 
     interfaces: tuple[InterfaceName, ...]
+    """Those that are looked at."""
     labels: tuple[InterfaceLabel, ...]
     use: ServiceUse
     offers: tuple[tuple[Registration, ServiceOffer], ...]
@@ -89,6 +99,21 @@ class _Drawn:
     inputs: _Inputs
     block: Block | None
     notes: BlockNotes
+
+
+@dataclass(slots=True)
+class _Work:
+    """A robot that is being drawn."""
+
+    robot: NodeName
+    anew: bool
+    urgent: bool
+    uses: list[tuple[BlockKey, _Inputs]]
+    """Still to be drawn, the last one first."""
+    steps: Generator[float, None, None] | None = None
+    """Of the use that is being drawn."""
+    pairs: float = 0.0
+    """Estimated for this picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,8 +172,14 @@ class Drawing:
         self._urgent_drawn = 0
         """For the next picture, of at most so many."""
         self._routine_pairs = 0
-        self._rest: tuple[NodeName, bool, list[tuple[BlockKey, _Inputs]]] | None = None
-        """The robot that is being drawn, and its uses that are still to be, the last one first."""
+        self._work: _Work | None = None
+        """The robot that is being drawn."""
+        self._aside: dict[NodeName, _Work] = {}
+        """Robots that have had their share of this picture."""
+        self._rests: dict[NodeName, list[tuple[BlockKey, _Inputs]]] = {}
+        """Of robots that wait for another picture with some of their uses, what is left of them, ..."""
+        self._first: dict[NodeName, BlockKey] = {}
+        """... or, where a robot is to be drawn whole once more, with which use to begin: all of them get their turn."""
 
     # ── what changed ──
 
@@ -164,6 +195,18 @@ class Drawing:
         second, and are estimated anew in their turn.
         """
         self._urgent[robot] = anew or self._urgent.get(robot, False)
+        self._draw_whole(robot)
+
+    def cost(self, robot: NodeName) -> int:
+        """How many pairs it takes to draw a robot."""
+        uses = self._frame.uses.get(robot, ()) if self._frame is not None else ()
+        return sum(inputs.pairs for _, inputs in uses)
+
+    def _draw_whole(self, robot: NodeName) -> None:
+        """What is left to be drawn of a robot is not all any more."""
+        rest = self._rests.pop(robot, None)
+        if rest:
+            self._first[robot] = rest[-1][0]
 
     def reported(self, robot: NodeName, report: Report) -> bool:
         """A robot's report was merged into the estimates; True if it misses far more deadlines than was believed."""
@@ -184,18 +227,22 @@ class Drawing:
         self._routine = routine
         self._queue = None
         self._put_back()
+        for robot, work in self._aside.items():
+            if work.urgent and robot not in self._urgent and (robot in self._rests or robot in self._first):
+                self._urgent[robot] = work.anew
+        self._aside.clear()
         self._urgent_order.clear()
         self._urgent_drawn = self._routine_pairs = 0
 
     @property
     def urgent_left(self) -> bool:
         """Whether the next picture is wanted at once, for robots that this one has no place for."""
-        return bool(self._urgent)
+        return bool(self._urgent) or any(work.urgent for work in self._aside.values())
 
     @property
     def routine_left(self) -> bool:
         """Whether some robots were left out that are to be drawn because of reports."""
-        return bool(self._queue)
+        return bool(self._queue) or any(not work.urgent for work in self._aside.values())
 
     def advance(
         self,
@@ -213,6 +260,8 @@ class Drawing:
         if self._frame is None:
             if self._looking is None:
                 self._put_back()
+                for robot in list(self._rests):
+                    self._draw_whole(robot)
                 self._looking = self._look_around(sidecars, permits)
             for _ in self._looking:
                 return False
@@ -220,51 +269,95 @@ class Drawing:
         assert self._frame is not None
         if self._queue is None:
             self._queue = self._next_routine(self._frame, now) if self._routine else []
-        pairs = 0
+        pairs = 0.0
         while pairs < SLICE_PAIRS:
-            if self._rest is None:
-                found = self._next_robot(lost)
-                if found is None:
+            if self._work is None:
+                self._work = self._next_work(self._frame, lost, now)
+                if self._work is None:
                     return True
-                robot, anew = found
-                self._rest = robot, anew, list(reversed(self._frame.uses.get(robot, ())))
-                if anew or robot not in self._at:
-                    self._at[robot] = now
-                    self._surprise.pop(robot, None)
-            robot, anew, uses = self._rest
-            if uses:
-                pairs += self._draw_use(*uses.pop(), estimator, now, anew=anew)
-            if not uses:
-                self._rest = None
-        return not (self._rest or self._urgent or self._queue)
+            work = self._work
+            took = self._draw_some(work, estimator, now)
+            pairs += took
+            work.pairs += took
+            if work.steps is None and not work.uses:
+                self._work = None
+            elif work.steps is None and work.pairs >= ROBOT_PAIRS:
+                self._set_aside(work)
+        return not (self._work or self._urgent or self._queue)
 
-    def _next_robot(self, lost: Callable[[NodeName], float]) -> tuple[NodeName, bool] | None:
-        """The robot to draw next, and whether it is estimated anew; None if the picture is complete."""
+    def _draw_some(self, work: _Work, estimator: Estimator, now: float) -> float:
+        """Returns the pairs that were estimated, or as many as that took time for."""
+        if work.steps is None:
+            if not work.uses:
+                return 0.0
+            work.steps = self._draw_use(*work.uses.pop(), estimator, now, anew=work.anew)
+        try:
+            return next(work.steps)
+        except StopIteration:
+            work.steps = None
+            return 0.0
+
+    def _set_aside(self, work: _Work) -> None:
+        """A robot has had its share of this picture."""
+        self._work = None
+        self._aside[work.robot] = work
+        if work.robot not in self._urgent:
+            self._rests[work.robot] = work.uses
+        else:
+            self._first[work.robot] = work.uses[-1][0]
+        if not work.urgent:
+            self._surprise.setdefault(work.robot, 0.0)
+
+    def _next_work(self, frame: _Frame, lost: Callable[[NodeName], float], now: float) -> _Work | None:
+        found = self._next_robot(lost)
+        if found is None:
+            return None
+        robot, anew, urgent = found
+        uses = list(frame.uses.get(robot, ()))
+        rest = self._rests.pop(robot, None)
+        if rest is not None:
+            uses = rest[::-1]
+        elif (first := self._first.pop(robot, None)) is not None:
+            begin = next((number for number, (key, _) in enumerate(uses) if key == first), 0)
+            uses = uses[begin:] + uses[:begin]
+        if anew or robot not in self._at:
+            self._at[robot] = now
+            self._surprise.pop(robot, None)
+        return _Work(robot, anew, urgent, uses[::-1])
+
+    def _next_robot(self, lost: Callable[[NodeName], float]) -> tuple[NodeName, bool, bool] | None:
+        """The robot to draw next, whether it is estimated anew, and whether it is urgent; None if the picture is
+        complete."""
         if not self._urgent_drawn:
             self._urgent_most = max(URGENT_AT_ONCE, round(URGENT_SHARE * len(self._urgent)))
-        if self._urgent and self._urgent_drawn < self._urgent_most:
+        urgent = self._next_urgent(lost) if self._urgent_drawn < self._urgent_most else None
+        if urgent is not None:
             few = len(self._urgent) + self._urgent_drawn <= FEW_ROBOTS
-            while not self._urgent_order or self._urgent_order[-1] not in self._urgent:
-                if self._urgent_order:
-                    self._urgent_order.pop()
-                else:
-                    self._urgent_order = sorted(reversed(self._urgent), key=lost)
-            robot = self._urgent_order.pop()
             self._urgent_drawn += 1
-            return robot, self._urgent.pop(robot) or few
+            return urgent, self._urgent.pop(urgent) or few, True
         if self._queue and (not self._urgent_drawn or self._routine_pairs < SLICE_PAIRS):
             robot = self._queue.pop()
-            if self._frame is not None:
-                self._routine_pairs += sum(inputs.pairs for _, inputs in self._frame.uses.get(robot, ()))
-            return robot, True
+            self._routine_pairs += min(ROBOT_PAIRS, self.cost(robot))
+            return robot, True, False
+        return None
+
+    def _next_urgent(self, lost: Callable[[NodeName], float]) -> NodeName | None:
+        """The urgent robot that is next, of those that have not had their share of this picture."""
+        for again in (False, True):
+            if again:
+                waiting = [robot for robot in reversed(self._urgent) if robot not in self._aside]
+                self._urgent_order = sorted(waiting, key=lost)
+            while self._urgent_order:
+                robot = self._urgent_order.pop()
+                if robot in self._urgent and robot not in self._aside:
+                    return robot
         return None
 
     def _put_back(self) -> None:
-        """A robot of which some uses were drawn is drawn anew."""
-        if self._rest is not None:
-            robot, anew, _ = self._rest
-            self.robot_changed(robot, anew=anew)
-            self._rest = None
+        """A robot of which some uses were drawn is drawn anew, beginning with the one that was being drawn."""
+        if self._work is not None:
+            work, self._work = self._work, None
+            self.robot_changed(work.robot, anew=work.anew)
 
     def picture(self) -> Picture:
         """What was drawn."""
@@ -330,8 +423,8 @@ class Drawing:
         keys = {key for wanted in uses.values() for key, _ in wanted}
         for drawn in [key for key in self._drawn if key not in keys]:
             del self._drawn[drawn]
-        tables: tuple[dict[NodeName, float] | dict[NodeName, _LookedAt], ...]
-        tables = self._at, self._surprise, self._looked_at
+        tables: tuple[dict[NodeName, Any], ...]
+        tables = self._at, self._surprise, self._looked_at, self._aside, self._rests, self._first
         for table in tables:
             for gone in [name for name in table if name not in uses]:
                 del table[gone]
@@ -342,7 +435,7 @@ class Drawing:
         routine.sort(key=lambda name: self._at.get(name, 0.0))
         pairs, taken = 0, 0
         for name in routine:
-            pairs += sum(inputs.pairs for _, inputs in frame.uses[name])
+            pairs += min(ROBOT_PAIRS, sum(inputs.pairs for _, inputs in frame.uses[name]))
             taken += 1
             if pairs >= ROUTINE_PAIRS:
                 break
@@ -351,29 +444,32 @@ class Drawing:
     def _is_due(self, robot: NodeName, now: float) -> bool:
         return robot in self._surprise or now - self._at.get(robot, now) >= STALE_S
 
-    def _draw_use(self, key: BlockKey, inputs: _Inputs, estimator: Estimator, now: float, *, anew: bool) -> int:
-        """Returns the pairs that were estimated, or as many as that took time for."""
+    def _draw_use(
+        self, key: BlockKey, inputs: _Inputs, estimator: Estimator, now: float, *, anew: bool
+    ) -> Generator[float, None, None]:
+        """Yields as `draw_block`."""
         before = self._drawn.get(key)
         if inputs.unserved:
             servers = tuple(cloud.name for cloud in inputs.clouds)
             self._drawn[key] = _Drawn(inputs, None, BlockNotes(servers, unserved=inputs.unserved))
-            return 0
+            return
         kept = before is not None and not anew and before.inputs.use == inputs.use
         known = (before.block, before.notes) if before is not None and before.block is not None and kept else None
-        block, notes = draw_block(
+        block, notes = yield from draw_block(
             inputs.robot,
             inputs.use,
+            inputs.interfaces,
             inputs.clouds,
             estimator,
             now,
             capacity=self._capacity,
             barred=inputs.barred,
             known=known,
+            before=before.block if before is not None else None,
         )
         if before is not None and before.block is not None and is_alike(block, before.block):
             block = before.block
         self._drawn[key] = _Drawn(inputs, block, notes)
-        return inputs.pairs if known is None else -(-inputs.pairs // KEPT_PAIRS)
 
 
 def _inputs(
@@ -384,7 +480,7 @@ def _inputs(
     path_rules: PathRules,
 ) -> _Inputs:
     """Of those who offer the service the robot may call it on `clouds`."""
-    interfaces = interfaces_of(robot)
+    interfaces = interfaces_of(robot)[: max(LEAST_INTERFACES, min(MAX_INTERFACES, USE_PAIRS // max(1, len(clouds))))]
     barred = path_rules.barred(robot.name, interfaces, [cloud.name for cloud in clouds])
     if not offering:
         unserved = f"no live server offers it as {use.type}"

@@ -12,15 +12,20 @@ from controlplane.core.block_rules import with_rules
 from controlplane.core.mode_miss import NO_SENDING, Sending, asked_times, is_timed, pair_timing
 from controlplane.core.posterior import Estimate
 from controlplane.core.problem import Block, BlockKey, Problem
+from controlplane.core.surplus import most_promising
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Generator, Mapping
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.mode_miss import PairTiming
     from controlplane.core.problem import Path
     from controlplane.core.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceUse
+
+
+KEPT_PAIRS = 8
+"""Pairs whose estimates are kept take as long as one that is estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +40,8 @@ class BlockNotes:
     """No path at all is up, so every pair was let in."""
     barred: frozenset[tuple[InterfaceName, NodeName]] = frozenset()
     """Pairs that the operator's path rules keep mappings from."""
+    surplus: tuple[InterfaceName, ...] = ()
+    """Interfaces left out of the problem, as there are more promising ones, and enough of them."""
     penalised: tuple[NodeName, ...] = ()
     """Servers left out of the problem, as the robot can not use their answers, and there are others."""
     unserved: str = ""
@@ -59,6 +66,7 @@ def interfaces_of(sidecar: Sidecar) -> tuple[InterfaceName, ...]:
 def draw_block(
     robot: Sidecar,
     use: ServiceUse,
+    interfaces: tuple[InterfaceName, ...],
     clouds: tuple[Sidecar, ...],
     estimator: Estimator,
     now: float,
@@ -66,14 +74,16 @@ def draw_block(
     capacity: int,
     barred: frozenset[tuple[InterfaceName, NodeName]] = frozenset(),
     known: tuple[Block, BlockNotes] | None = None,
-) -> tuple[Block, BlockNotes]:
-    """One robot's use of a service on these clouds, of which there is one at least, as of its interfaces.
+    before: Block | None = None,
+) -> Generator[float, None, tuple[Block, BlockNotes]]:
+    """Draw one robot's use of a service on these clouds, of which there is one at least, over these interfaces.
 
     Only paths that are up are candidates, unless none is, and none of the pairs that are `barred`, of which not all
     may be. Paths to servers that the robot penalises are candidates only if all are such. What is in `known` is not
-    estimated anew.
+    estimated anew. Of many interfaces the most promising are taken, and those that were so `before`.
+
+    Yields now and then how many pairs it has estimated since, or as many as took that long.
     """
-    interfaces = interfaces_of(robot)
     servers = tuple(cloud.name for cloud in clouds)
     allowed = {(interface, server) for interface in interfaces for server in servers} - barred
     up = {(interface, server) for interface, server in allowed if estimator.path_up(robot.name, interface, server)}
@@ -87,60 +97,69 @@ def draw_block(
     penalised = tuple(server for server in servers if favoured and server in penalties)
     up = favoured or up
     lit = tuple(interface for interface in interfaces if any((interface, server) in up for server in servers))
-    reached = tuple(server for server in servers if any((interface, server) in up for interface in lit))
-
     kept = _estimates(known[0]) if known is not None else {}
-
-    def estimate(interface: InterfaceName, server: NodeName) -> Estimate | None:
-        if (interface, server) not in up:
-            return None
-        if (interface, server) in kept:
-            return kept[interface, server]
-        return estimator.estimate(robot.name, interface, server, use.name, use.deadline_s, now)
-
-    estimates = [[estimate(interface, server) for server in reached] for interface in lit]
-    epsilons = tuple(tuple(found.mean if found else None for found in row) for row in estimates)
+    estimates: dict[tuple[InterfaceName, NodeName], Estimate] = {}
+    for interface in lit:
+        took = 0.0
+        for server in servers:
+            pair = interface, server
+            if pair in kept and pair in up:
+                estimates[pair] = kept[pair]
+                took += 1 / KEPT_PAIRS
+            elif pair in up:
+                estimates[pair] = estimator.estimate(robot.name, interface, server, use.name, use.deadline_s, now)
+                took += 1
+        yield took
+    taken = most_promising(robot, use, lit, estimates, before)
+    reached = tuple(server for server in servers if any((interface, server) in up for interface in taken))
+    table = [[estimates.get((interface, server)) for server in reached] for interface in taken]
+    epsilons = tuple(tuple(found.mean if found else None for found in row) for row in table)
     block = Block(
         key=BlockKey(robot.name, use.name),
-        interfaces=lit,
+        interfaces=taken,
         servers=reached,
         epsilon=epsilons,
         capacity=capacity,
         idempotent=use.idempotent,
-        lifts=_lifts(BlockKey(robot.name, use.name), lit, reached, epsilons, estimator, now),
-        weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in estimates),
+        lifts=_lifts(BlockKey(robot.name, use.name), taken, reached, epsilons, estimator, now),
+        weights=tuple(tuple(found.weight if found else 0.0 for found in row) for row in table),
     )
     sending = NO_SENDING
     if is_timed(use):
-        before = known[1].sending if known is not None else NO_SENDING
-        timings = _timings(block, use, estimator, now, before.timings)
+        past = known[1].sending if known is not None else NO_SENDING
+        timings: dict[tuple[InterfaceName, NodeName], PairTiming] = {}
+        for row in range(len(taken)):
+            timings |= _timings(block, row, use, estimator, now, past.timings)
+            yield len(reached) / 2
         sending = Sending(timings, *estimator.late_fate(robot.name, use.name, now))
-    notes = BlockNotes(servers, dark, all_dark, barred, penalised, sending=sending)
+    surplus = tuple(interface for interface in lit if interface not in taken)
+    notes = BlockNotes(servers, dark, all_dark, barred, surplus, penalised, sending=sending)
     return with_rules(block, robot, use, clouds), notes
 
 
 def _timings(
     block: Block,
+    interface_number: int,
     use: ServiceUse,
     estimator: Estimator,
     now: float,
     before: Mapping[tuple[InterfaceName, NodeName], PairTiming],
 ) -> dict[tuple[InterfaceName, NodeName], PairTiming]:
-    """Of each pair; what is known from `before` is not looked at again."""
+    """Of each pair of one interface; what is known from `before` is not looked at again."""
     times = asked_times(use.deadline_s)
     timings: dict[tuple[InterfaceName, NodeName], PairTiming] = {}
-    for interface, row in zip(block.interfaces, block.epsilon, strict=True):
-        for server, epsilon in zip(block.servers, row, strict=True):
-            if epsilon is None:
-                continue
-            if (interface, server) in before:
-                timings[interface, server] = before[interface, server]
-                continue
-            pair = interface, server, use.name
-            carried = estimator.carried(block.key.robot, pair, now)
-            late = use.redundancy.sends_late and not use.budgeted
-            slower = estimator.slower_than(block.key.robot, pair, times, now) if late else None
-            timings[interface, server] = pair_timing(carried, epsilon, slower, use.hedge_quantile)
+    interface = block.interfaces[interface_number]
+    for server, epsilon in zip(block.servers, block.epsilon[interface_number], strict=True):
+        if epsilon is None:
+            continue
+        if (interface, server) in before:
+            timings[interface, server] = before[interface, server]
+            continue
+        pair = interface, server, use.name
+        carried = estimator.carried(block.key.robot, pair, now)
+        late = use.redundancy.sends_late and not use.budgeted
+        slower = estimator.slower_than(block.key.robot, pair, times, now) if late else None
+        timings[interface, server] = pair_timing(carried, epsilon, slower, use.hedge_quantile)
     return timings
 
 

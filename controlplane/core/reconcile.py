@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.mode_miss import predicted_miss
 from controlplane.core.picture import interfaces_of
 from controlplane.core.problem import BlockKey, Objective
+from controlplane.core.surplus import MAX_PLANNED
 from protos.model import NO_CALLS, Assignment, ServiceMapping
 
 if TYPE_CHECKING:
@@ -136,6 +137,8 @@ def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objectiv
     if notes.dark:
         standing_by = ": on standby" if standby else ""
         parts.append(f"no path is up over {', '.join(notes.dark)}{standing_by}")
+    if notes.surplus:
+        parts.append(f"more interfaces than {MAX_PLANNED}: without {', '.join(notes.surplus)}")
     if notes.penalised:
         parts.append(f"answers of {', '.join(notes.penalised)} can not be delivered: others go before")
     if block.shared:

@@ -110,3 +110,23 @@ def test_nobody_is_told_again_what_did_not_change(world: World) -> None:
     world.run(SETTLED_S)
     assert all(len(cloud.peer_sets) == 1 for cloud in clouds)
     assert not [one for robot in robots for one in robot.received if isinstance(one, PeerSet | MappingSet)]
+
+
+@pytest.mark.audit("ops-20")
+def test_a_robot_whose_paths_flap_all_the_time_waits_for_the_routine_and_others_do_not(world: World) -> None:
+    robots = fleet(world)
+    flapping, honest = robots[0], robots[1]
+    solved = world.core.counters.solved
+    for turn in range(400):
+        up = bool(turn % 2)
+        world.report(flapping, path("wlan0", "a", up=up), path("wlan0", "b", up=up))
+        world.run(0.02)
+    assert world.core.urgency.held > 300
+    # 50 at once, some more within these 8 s, and the routine ones.
+    assert world.core.counters.solved - solved < 100
+    (before,) = honest.services
+    chosen = before.assignments[0]
+    world.report(honest, path(chosen.interface, chosen.server, up=False))
+    world.run(0.1)
+    (after,) = honest.services
+    assert chosen not in after.assignments

@@ -13,6 +13,8 @@ from controlplane.core.drawing import (
     EPSILON_SHARE,
     FEW_ROBOTS,
     LIFT_SHARE,
+    MAX_INTERFACES,
+    ROBOT_PAIRS,
     ROUTINE_PAIRS,
     SLICE_PAIRS,
     STALE_S,
@@ -24,6 +26,7 @@ from controlplane.core.drawing import (
 )
 from controlplane.core.estimator import Estimator
 from controlplane.core.permits import Permits
+from controlplane.core.picture import KEPT_PAIRS
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem import Block, BlockKey, Objective
 from controlplane.core.registry import Sidecar
@@ -167,7 +170,8 @@ def test_a_large_fleet_is_drawn_in_slices_a_part_at_a_time() -> None:
     fleet.now = 1.0
     for name in fleet.names:
         fleet.report(name, Report((latency("wlan0", "a", histogram(0.01, times=9)),), ALL_UP))
-    assert fleet.draw(routine=True) == ROUTINE_PAIRS // SLICE_PAIRS
+    slices = ROUTINE_PAIRS // SLICE_PAIRS
+    assert slices <= fleet.draw(routine=True) <= slices + 1
     assert len(fleet.moved(before)) == at_once
     fleet.draw(routine=True)
     assert fleet.moved(before) == set(fleet.names)
@@ -412,3 +416,100 @@ def test_a_large_fleet_is_looked_at_in_several_goes() -> None:
     assert {note.unserved for note in fleet.drawing.picture().notes.values()} == {
         "the access policy lets this robot call it on no live server"
     }
+
+
+# ── a robot with much to draw ──
+
+
+def with_a_big_robot(services: int) -> tuple[Fleet, NodeName]:
+    """The first of three robots has many interfaces and calls many services on two clouds."""
+    fleet = Fleet(3)
+    big = fleet.names[0]
+    names = [ServiceName(f"/service_{number:03d}") for number in range(services)]
+    offers = (offer(), *(replace(offer(), name=name) for name in names))
+    fleet.sidecars[:2] = [
+        replace(fleet._cloud(name), services=ServiceSet(offers), offered=frozenset(one.name for one in offers))
+        for name in ("a", "b")
+    ]
+    ports = interfaces(*(f"if{number}" for number in range(200)))
+    fleet.sidecars[2] = replace(
+        fleet.sidecars[2],
+        candidates=ports,
+        services=ServiceSet((), tuple(replace(use(), name=name) for name in names)),
+    )
+    fleet.drawing.members_changed()
+    fleet.draw(routine=True)
+    return fleet, big
+
+
+def drawn_since(fleet: Fleet, was: dict[BlockKey, Any]) -> set[BlockKey]:
+    return {key for key, found in fleet.drawing._drawn.items() if found is not was.get(key)}
+
+
+@pytest.mark.audit("ops-20")
+def test_a_robot_with_much_to_draw_holds_up_no_other_and_all_its_services_get_their_turn() -> None:
+    fleet, big = with_a_big_robot(services=12)
+    most = ROBOT_PAIRS + 2 * MAX_INTERFACES + 2 * 4 * KEPT_PAIRS
+    seen: set[BlockKey] = set()
+    for _ in range(12):
+        # It flaps before each picture, and asks to be drawn before the others.
+        fleet.drawing.robot_changed(big)
+        fleet.drawing.robot_changed(fleet.names[1])
+        was = dict(fleet.drawing._drawn)
+        slices = fleet.draw_one(routine=False)
+        assert slices <= most / SLICE_PAIRS + 2
+        drawn = drawn_since(fleet, was)
+        assert BlockKey(fleet.names[1], PLAN) in drawn, "in the very next picture"
+        assert 0 < len(drawn) < 12
+        seen |= drawn
+    assert len({key for key in seen if key.robot == big}) == 12
+    while fleet.drawing.urgent_left:
+        fleet.draw_one(routine=False)
+    assert len({key for key in drawn_since(fleet, was) if key.robot == big}) == 12, "what it changed last"
+
+
+@pytest.mark.audit("ops-20")
+def test_what_is_left_of_a_robot_is_drawn_whoever_comes_meanwhile() -> None:
+    fleet, big = with_a_big_robot(services=12)
+    for routine in (False, True):
+        was = dict(fleet.drawing._drawn)
+        if routine:
+            fleet.drawing.reported(big, Report())
+        else:
+            fleet.drawing.robot_changed(big)
+        fleet.draw_one(routine=routine)
+        assert fleet.drawing.routine_left if routine else fleet.drawing.urgent_left
+        fleet.sidecars[3] = replace(fleet.sidecars[3], stream=stream(9), candidates=interfaces("eth0"))
+        fleet.drawing.members_changed()
+        while fleet.drawing.urgent_left or fleet.drawing.routine_left:
+            fleet.draw_one(routine=routine)
+        assert len({key for key in drawn_since(fleet, was) if key.robot == big}) == 12
+        fleet.sidecars[3] = replace(fleet.sidecars[3], candidates=interfaces("wlan0", "wwan0"))
+
+
+@pytest.mark.audit("ops-20")
+def test_the_most_promising_of_many_interfaces_are_taken_and_stay() -> None:
+    fleet = Fleet(1)
+    robot = fleet.names[0]
+    ports = [f"if{number:02d}" for number in range(33)]
+    good = [ports[number] for number in (1, 4, 9, 12, 20, 25, 31, 32)]
+    fleet.sidecars[2] = replace(fleet.sidecars[2], candidates=interfaces(*ports))
+    fleet.report(
+        robot,
+        Report(
+            tuple(latency(port, "a", histogram(0.01 if port in good else 1.0, times=50)) for port in ports),
+            tuple(path(port, server) for port in ports for server in ("a", "b")),
+        ),
+    )
+    fleet.drawing.members_changed()
+    fleet.draw(routine=True)
+    (block,) = fleet.blocks().values()
+    assert list(block.interfaces) == good
+    (notes,) = fleet.drawing.picture().notes.values()
+    assert set(notes.surplus) == set(ports) - set(good)
+    fleet.report(robot, Report((latency(ports[0], "a", histogram(0.01, times=60)),)))
+    fleet.draw(routine=True)
+    assert list(fleet.blocks()[robot].interfaces) == good, "one as good does not push out another"
+    fleet.report(robot, Report(paths=tuple(path(good[0], server, up=False) for server in ("a", "b"))))
+    fleet.draw(routine=False)
+    assert list(fleet.blocks()[robot].interfaces) == [ports[0], *good[1:]], "one that is better does"

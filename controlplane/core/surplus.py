@@ -1,0 +1,60 @@
+"""Which of a robot's many interfaces the mapping of a service is sought among.
+
+A request goes out in a handful of copies, however many interfaces there are, and the number of choices grows with the
+power of them: of ten a single robot's would hold up the mappings of all others.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from controlplane.core.posterior import Estimate
+    from controlplane.core.problem import Block
+    from controlplane.core.registry import Sidecar
+    from protos.model import InterfaceName, NodeName, ServiceUse
+
+MAX_PLANNED = 8
+"""Interfaces of one robot in one mapping: as many copies of a request a robot sends at most."""
+
+STAYS = 0.5
+"""What an interface that was among them misses counts so much: no two of them take turns by chance."""
+
+
+def most_promising(
+    robot: Sidecar,
+    use: ServiceUse,
+    interfaces: tuple[InterfaceName, ...],
+    estimates: Mapping[tuple[InterfaceName, NodeName], Estimate],
+    before: Block | None,
+) -> tuple[InterfaceName, ...]:
+    """Up to `MAX_PLANNED` of these interfaces, in their order.
+
+    In turn the one that misses least, one of each carrier first, and, where the service is to be cheap, the cheapest.
+    """
+    if len(interfaces) <= MAX_PLANNED:
+        return interfaces
+    had = before.interfaces if before is not None else ()
+    least = dict.fromkeys(interfaces, 1.0)
+    for (interface, _), estimate in estimates.items():
+        least[interface] = min(least[interface], estimate.mean * (STAYS if interface in had else 1.0))
+    labels = {label.interface: label for label in robot.labels}
+    best_first = sorted(interfaces, key=lambda interface: least[interface])
+    behind: Counter[str] = Counter()
+    turn: dict[InterfaceName, int] = {}
+    for interface in best_first:
+        carrier = labels[interface].carrier if interface in labels else ""
+        turn[interface] = behind[carrier] if carrier else 0
+        behind[carrier] += 1
+    rankings = [sorted(best_first, key=lambda interface: turn[interface])]
+    if use.target_miss:
+        rankings.append(
+            sorted(best_first, key=lambda interface: labels[interface].charge if interface in labels else 1.0)
+        )
+    order = dict.fromkeys(itertools.chain.from_iterable(zip(*rankings, strict=True)))
+    taken = set(itertools.islice(order, MAX_PLANNED))
+    return tuple(interface for interface in interfaces if interface in taken)

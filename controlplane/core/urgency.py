@@ -1,0 +1,49 @@
+"""How much of what is solved at once is for one robot.
+
+A robot whose paths go up and down all the time, or that says so, is drawn and solved at once as often as its share
+lasts, and after that with the next routine solving: others' news wait for it no longer than for anyone's.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import TYPE_CHECKING
+
+from protos.token_bucket import TokenBucket
+
+if TYPE_CHECKING:
+    from protos.model import NodeName
+
+PAIRS_BURST = 2000.0
+"""Pairs (interface, server) of one robot that are drawn at once, those of all its services: a small robot's news some
+50 times, those of one with 8 interfaces and 4 services on 16 servers 4 times."""
+
+PAIRS_PER_S = 100.0
+"""After that."""
+
+LEAST_PAIRS = 40
+"""A robot counts as so many at least: each drawing is a picture of the whole fleet, too."""
+
+MAX_ROBOTS = 8192
+"""Robots that are counted, the one that was urgent longest ago goes: twice those that can be registered."""
+
+
+class Urgency:
+    """Counts what each robot has had. Times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        self._shares: OrderedDict[NodeName, TokenBucket] = OrderedDict()
+        self.held = 0
+        """News that had to wait for a routine solving."""
+
+    def take(self, robot: NodeName, pairs: int, now: float) -> bool:
+        """Whether this robot, which takes so many pairs to draw, may be drawn at once."""
+        share = self._shares.get(robot)
+        if share is None:
+            share = self._shares[robot] = TokenBucket(rate=PAIRS_PER_S, burst=PAIRS_BURST, now=now)
+            if len(self._shares) > MAX_ROBOTS:
+                self._shares.popitem(last=False)
+        self._shares.move_to_end(robot)
+        taken = share.take(now, min(max(pairs, LEAST_PAIRS), PAIRS_BURST))
+        self.held += not taken
+        return taken
