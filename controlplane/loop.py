@@ -156,6 +156,8 @@ class ControlLoop:
         """Since the loop was last busy; at QUIET_LOOKS the solver is ready."""
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
         self._garbage = Collector()
+        self.reports_slowed = 0
+        """Times that a stream was not read for a while, as its reports had more entries than its share."""
         self.stun_servers: list[StunServer] = []
         self.has_unread: Callable[[NodeName, float], bool] = lambda name, since: False
         """Whether something of a member is there that came later than what was read of it at this time."""
@@ -446,7 +448,7 @@ class ControlLoop:
 
     def _update_metrics(self) -> None:
         superseded = self._superseded + sum(mailbox.superseded for mailbox in self._mailboxes.values())
-        self._metrics.update(self._core, self.stun_servers, superseded, self.events.state)
+        self._metrics.update(self._core, self.stun_servers, superseded, self.events.state, self.reports_slowed)
 
     def close_streams(self) -> None:
         """Tell every stream that the control plane stops."""

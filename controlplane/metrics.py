@@ -135,13 +135,14 @@ class Metrics:
         stun_servers: Sequence[StunServer],
         superseded: int,
         events: EventLogState = NO_EVENTS,
+        reports_slowed: int = 0,
     ) -> None:
         """Take the values of this moment."""
         self._values.families = (
             *_members(core),
             *_sync(core),
             *_plan(core),
-            *_drops(core, superseded, events),
+            *_drops(core, superseded, reports_slowed, events),
             *_events(events),
             *_stun(stun_servers),
             *_certificate(self._own),
@@ -260,7 +261,7 @@ def _plan(core: ControlCore) -> Iterable[Metric]:
     yield _counter("plr_reports_total", "Reports merged.", [], {(): core.counters.reports})
 
 
-def _drops(core: ControlCore, superseded: int, events: EventLogState) -> Iterable[Metric]:
+def _drops(core: ControlCore, superseded: int, reports_slowed: int, events: EventLogState) -> Iterable[Metric]:
     yield _counter(
         "plr_control_dropped_total",
         "What was dropped, by reason.",
@@ -280,6 +281,7 @@ def _drops(core: ControlCore, superseded: int, events: EventLogState) -> Iterabl
             ("announced_too_often",): core.restlessness.held,
             ("urgent_too_often",): core.urgency.held,
             ("interface_left_out",): core.counters.interfaces_left_out,
+            ("report_slowed",): reports_slowed,
             ("superseded_before_sent",): superseded,
         },
     )

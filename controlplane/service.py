@@ -11,11 +11,12 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from controlplane.core.control_events import CloseReason
 from controlplane.core.registry import Refusal
-from controlplane.limits import MAX_STREAMS_PER_NAME, TOO_FAST, TOO_MANY_STREAMS, StreamCount, StreamRate
+from controlplane.limits import MAX_STREAMS_PER_NAME, TOO_FAST, TOO_MANY_STREAMS, ReportPace, StreamCount, StreamRate
 from controlplane.stream_encoder import StreamEncoder
-from protos.convert import parse_sidecar_message
+from protos.convert import parse_in_parts, parse_sidecar_message
+from protos.convert.reports import report_entries
 from protos.errors import DecodeError, UnknownKindError
-from protos.model import Heartbeat, Registration
+from protos.model import Heartbeat, Registration, Report
 from protos.plr.v1 import control_pb2
 from protos.protocol_versions import Spoken, refusal
 
@@ -35,6 +36,9 @@ REGISTER_TIMEOUT_S = 10.0
 
 REGISTERED_AT_ONCE = 4
 """In one turn of the loop."""
+
+SHORT_BYTES = 4096
+"""A message up to this long is taken at once."""
 
 _REFUSAL_CODES = {
     Refusal.OLDER_INCARNATION: grpc.StatusCode.ABORTED,
@@ -162,21 +166,40 @@ class ControlPlaneService:
     async def _read(self, stream: StreamId, context: Context) -> NoReturn:
         told = False
         rate = StreamRate(report_interval_s=self._report_interval_s, now=time.monotonic())
+        pace = ReportPace()
         while True:
             data = await self._receive(context)
             if not rate.take(len(data), time.monotonic()):
                 self._loop.refused(TOO_FAST)
                 raise _StreamEndError(grpc.StatusCode.RESOURCE_EXHAUSTED, "messages come too fast")
             try:
-                message: SidecarMessage = Heartbeat()
+                parts: list[SidecarMessage]
                 try:
-                    message = parse_sidecar_message(data)
+                    parts = await self._parse(data)
                 except UnknownKindError as error:
                     self._loop.unknown_message(context.peer(), str(error), again=told)
-                    told = True
-                self._loop.receive(stream, message)
+                    told, parts = True, [Heartbeat()]
+                if len(parts) == 1:
+                    self._loop.receive(stream, parts[0])
+                else:
+                    async for _ in self._loop.turns.each(parts, lambda part: self._loop.receive(stream, part)):
+                        pass
             except DecodeError as error:
                 raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, str(error)) from error
+            entries = sum(report_entries(part) for part in parts if isinstance(part, Report))
+            wait_s = pace.wait_s(entries, time.monotonic())
+            if wait_s:
+                self._loop.reports_slowed += 1
+                await asyncio.sleep(wait_s)
+
+    async def _parse(self, data: bytes) -> list[SidecarMessage]:
+        """A message; a long report in parts, in turns with whatever else is due."""
+        if len(data) <= SHORT_BYTES:
+            return [parse_sidecar_message(data)]
+        parts: list[SidecarMessage] = []
+        async for found in self._loop.turns.each(parse_in_parts(data), lambda part: part):
+            parts += found
+        return parts
 
     async def _write(self, mailbox: Mailbox, context: Context, *, incremental: bool) -> NoReturn:
         while True:

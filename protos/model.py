@@ -485,6 +485,8 @@ class Report:
     interface_joints: tuple[InterfaceJointReport, ...] = ()
     penalties: tuple[PenaltyReport, ...] = ()
     """All that are in force."""
+    continues: bool = False
+    """Whether this is a further part of a report, which says nothing of penalties."""
 
 
 SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain | RevocationSet

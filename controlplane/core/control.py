@@ -240,14 +240,14 @@ class ControlCore:
         # Before the rest: after a restart a robot reports on servers that are not back yet.
         reaches_again = self._publisher.waits_for(name, (path.server for path in report.paths))
         report, left_out = believable(report, name, self.registry, self.permits)
-        self.counters.reports += 1
+        self.counters.reports += not report.continues
         self.counters.report_entries_forbidden += left_out
         surprised = self._drawing.reported(name, report)
         change = Change.MISSES if surprised else Change.REPORT
         if self.estimator.merge(name, report, now):
             change = Change.PATH
         if change is not Change.REPORT:
-            if self.urgency.take(name, self._drawing.cost(name), now):
+            if self._drawing.is_urgent(name) or self.urgency.take(name, self._drawing.cost(name), now):
                 self._drawing.robot_changed(name, anew=surprised)
             else:
                 change = Change.REPORT

@@ -39,9 +39,11 @@ whoever names many interfaces and services holds up no other robot. A robot with
 USE_PAIRS = 1024
 """Pairs of one use: of how many the estimator knows anything."""
 
-LEAST_INTERFACES, MAX_INTERFACES = 16, 64
-"""Interfaces of one robot that are looked at whatever the number of servers, and of those with few; the first that it
-names."""
+MAX_INTERFACES = 64
+"""Interfaces of one robot that are looked at, the first that it names; where there are many servers fewer, ..."""
+
+LEAST_INTERFACES = 16
+"""... but not fewer than these."""
 
 LOOKED_AT_ONCE = 200
 """Robots of which it is found out in one go who could serve them: some milliseconds."""
@@ -196,6 +198,10 @@ class Drawing:
         """
         self._urgent[robot] = anew or self._urgent.get(robot, False)
         self._draw_whole(robot)
+
+    def is_urgent(self, robot: NodeName) -> bool:
+        """Whether it is to be drawn whatever it costs."""
+        return robot in self._urgent
 
     def cost(self, robot: NodeName) -> int:
         """How many pairs it takes to draw a robot."""

@@ -159,8 +159,8 @@ class _Robot:
         self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
         self.late: OrderedDict[ServiceName, LateFate] = OrderedDict()
         self.penalties = Penalties()
-        self.troubles: dict[tuple[ServiceName, float], InterfaceTrouble] = {}
-        """Worked out, by service and deadline ..."""
+        self.troubles: dict[tuple[ServiceName, float, InterfaceName], InterfaceTrouble] = {}
+        """Worked out, by service, deadline and interface ..."""
         self.troubles_at = (0, 0.0)
         """... from so many reports of all robots, at this time."""
 
@@ -197,7 +197,7 @@ class Estimator:
     def merge(self, robot: NodeName, report: Report, now: float) -> bool:
         """Add a report; True if a path went up or down with it, or is reported for the first time, or if a server needs
         other times than before, or is penalised or is so no more."""
-        self._reports += 1
+        self._reports += not report.continues
         tables = self._robots.get(robot)
         if tables is None:
             tables = self._robots[robot] = _Robot(self._half_life_s)
@@ -208,7 +208,7 @@ class Estimator:
         network.most = MAX_HISTOGRAMS // len(self._robots) if self._histograms >= MAX_HISTOGRAMS else MAX_HISTOGRAMS
         self._histograms -= len(network)
         dropped_before = network.dropped
-        changed = tables.penalties.replace(report.penalties, now)
+        changed = not report.continues and tables.penalties.replace(report.penalties, now)
         for latency in report.latencies:
             changed |= self._merge_latency(robot, tables, latency, now)
         for joint in report.joints:
@@ -365,7 +365,7 @@ class Estimator:
         processing = self._times_of(server, service, now)
         asked = Asked(interface, server, _usual_sizes(tables, service), deadline_s)
         prior = from_parts(self._parts_of(tables, service, asked, now), carried, processing.requests)
-        trouble = self._trouble(tables, service, deadline_s, now)
+        trouble = self._trouble(tables, service, deadline_s, interface, now)
         if pair is None:
             return trouble.moved(prior, interface, server)
         changes, before = self._compute.changes(server, service)
@@ -431,13 +431,17 @@ class Estimator:
             parts = self._parts[key] = parts_of(asked, tables.network, times, now)
         return parts
 
-    def _trouble(self, tables: _Robot, service: ServiceName, deadline_s: float, now: float) -> InterfaceTrouble:
-        """What the robot's requests of the service met beyond what their parts explain."""
-        trouble = tables.troubles.get((service, deadline_s))
+    def _trouble(
+        self, tables: _Robot, service: ServiceName, deadline_s: float, wanted: InterfaceName, now: float
+    ) -> InterfaceTrouble:
+        """What the robot's requests of the service met over this interface beyond what their parts explain."""
+        trouble = tables.troubles.get((service, deadline_s, wanted))
         if trouble is None:
-            trouble = tables.troubles[service, deadline_s] = InterfaceTrouble()
+            trouble = tables.troubles[service, deadline_s, wanted] = InterfaceTrouble()
             sizes = _usual_sizes(tables, service)
             for (interface, server, of), pair in tables.trials.items():
+                if interface != wanted:
+                    continue
                 # Outcomes that may be those of a server which changed, or changes now, say nothing of the interface.
                 if of != service or pair.changes != self._compute.changes(server, service)[0]:
                     continue

@@ -124,8 +124,11 @@ class RobotNetwork:
         self._rows: dict[tuple[InterfaceName, int], list[CellKey]] = {}
         """The cells of each interface and size class, those with most requests first."""
         self._size_costs: dict[tuple[InterfaceName, int], float] = {}
+        self._size_costs_anywhere: dict[int, float] = {}
+        self._guessed: dict[PathKey, float] = {}
+        """Round trips that were not measured."""
         self._fresh = False
-        """Whether these three follow from what was merged."""
+        """Whether these follow from what was merged."""
         self.most = MAX_PATHS + MAX_CELLS
         """No new ones beyond so many histograms."""
         self.dropped = 0
@@ -256,28 +259,36 @@ class RobotNetwork:
         If it was not: i to j takes what i to l takes, and what k to j takes longer than k to l; in the median over all
         k and l. Without such a square, the median over the interface's paths, or else over the server's.
         """
+        if key in self._round_trips:
+            return self._round_trips[key], True
+        if key not in self._guessed:
+            self._guessed[key] = self._guess(*key)
+        return self._guessed[key], False
+
+    def _guess(self, interface: InterfaceName, server: NodeName) -> float:
         known = self._round_trips
-        if key in known:
-            return known[key], True
-        interface, server = key
         over = {j: took for (i, j), took in known.items() if i == interface}
         to = {i: took for (i, j), took in known.items() if j == server}
         squares = [over[j] + to[i] - took for (i, j), took in known.items() if j in over and i in to]
         for found in (squares, over.values(), to.values()):
             if found:
-                return max(0.0, median(found)), False
-        return math.nan, False
+                return max(0.0, median(found))
+        return math.nan
 
     def _size_cost(self, interface: InterfaceName, size_class: int, now: float) -> float:
         """How much slower than probes requests of the class are, in seconds: over this interface, or else over any."""
         key = (interface, size_class)
         if key not in self._size_costs:
             found = self._costs(self._rows.get(key, ()), now)
-            if not found:
-                of_class = [row for (_, of), row in self._rows.items() if of == size_class]
-                found = [cost for row in of_class for cost in self._costs(row, now)]
-            self._size_costs[key] = median(found) if found else 0.0
+            self._size_costs[key] = median(found) if found else self._size_cost_anywhere(size_class, now)
         return self._size_costs[key]
+
+    def _size_cost_anywhere(self, size_class: int, now: float) -> float:
+        if size_class not in self._size_costs_anywhere:
+            of_class = [row for (_, of), row in self._rows.items() if of == size_class]
+            found = [cost for row in of_class for cost in self._costs(row, now)]
+            self._size_costs_anywhere[size_class] = median(found) if found else 0.0
+        return self._size_costs_anywhere[size_class]
 
     def _costs(self, cells: Iterable[CellKey], now: float) -> list[float]:
         costs = []
@@ -298,6 +309,8 @@ class RobotNetwork:
         medians = {key: path.rtt.median() for key, path in self.paths.items()}
         self._round_trips = {key: took for key, took in medians.items() if not math.isnan(took)}
         self._size_costs.clear()
+        self._size_costs_anywhere.clear()
+        self._guessed.clear()
         self._rows.clear()
         for of in sorted(self._cells, key=lambda of: self._cells[of].weight(now), reverse=True):
             self._rows.setdefault((of[0], of[2]), []).append(of)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import assert_never
+from typing import TYPE_CHECKING, assert_never
 
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 
@@ -19,7 +19,7 @@ from protos.convert.fields import (
     version,
 )
 from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
-from protos.convert.reports import report_from_proto, report_to_proto
+from protos.convert.reports import report_from_proto, report_parts, report_to_proto
 from protos.convert.types import (
     announced_from_proto,
     candidate_to_proto,
@@ -66,6 +66,9 @@ from protos.model import (
 from protos.names import clean_text, domain_label, node_name, text
 from protos.plr.v1 import control_pb2
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 MAX_WALL_S = 253_402_300_799
 """The end of the year 9999, the last that a certificate can name (RFC 5280 section 4.1.2.5)."""
 
@@ -86,11 +89,23 @@ _REASON_NUMBERS = {reason: number for number, reason in _REASONS.items()}
 
 def parse_sidecar_message(data: bytes) -> SidecarMessage:
     """Parse and check the bytes of one message of a sidecar."""
+    return sidecar_message_from_proto(_sidecar_message(data))
+
+
+def parse_in_parts(data: bytes) -> Iterator[SidecarMessage]:
+    """The same, with a report in parts that each take a moment."""
+    message = _sidecar_message(data)
+    if message.WhichOneof("kind") == "report":
+        yield from report_parts(message.report)
+    else:
+        yield sidecar_message_from_proto(message)
+
+
+def _sidecar_message(data: bytes) -> control_pb2.SidecarMessage:
     try:
-        message = control_pb2.SidecarMessage.FromString(data)
+        return control_pb2.SidecarMessage.FromString(data)
     except ProtobufDecodeError as error:
         raise DecodeError(f"not a SidecarMessage: {error}") from error
-    return sidecar_message_from_proto(message)
 
 
 def parse_control_message(data: bytes) -> ControlMessage:

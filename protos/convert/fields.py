@@ -112,10 +112,15 @@ def known(value: K, names: Mapping[K, T], field: str) -> T:
     return names[value]
 
 
-def each(messages: Sequence[P], limit: int, field: str, convert: Callable[[P], T]) -> tuple[T, ...]:
-    """Convert a repeated field of at most `limit` elements."""
+def check_length(messages: Sequence[P], limit: int, field: str) -> None:
+    """Check how many elements a repeated field has."""
     if len(messages) > limit:
         raise DecodeError(f"{field} has {len(messages)} elements, more than {limit}")
+
+
+def each(messages: Sequence[P], limit: int, field: str, convert: Callable[[P], T]) -> tuple[T, ...]:
+    """Convert a repeated field of at most `limit` elements."""
+    check_length(messages, limit, field)
     return tuple(convert(message) for message in messages)
 
 

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
-from protos.convert.fields import MAX_EVENTS, MAX_OUTCOMES, at_most, duration, each, microseconds, unique
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from protos.convert.fields import (
+    MAX_EVENTS,
+    MAX_OUTCOMES,
+    at_most,
+    check_length,
+    duration,
+    each,
+    microseconds,
+    unique,
+)
 from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
 from protos.errors import DecodeError
@@ -23,6 +35,12 @@ from protos.names import interface_name, node_name, service_name
 from protos.plr.v1 import control_pb2
 from protos.size_class import SIZE_CLASSES
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PART_ENTRIES = 32
+"""Some 2 ms, with what is made of them."""
+
 
 def report_from_proto(message: control_pb2.Report) -> Report:
     """Check a report."""
@@ -36,6 +54,30 @@ def report_from_proto(message: control_pb2.Report) -> Report:
         interface_joints=each(message.interface_joints, MAX_JOINTS, "interface_joints", _interface_joint_from_proto),
         penalties=penalties,
     )
+
+
+def report_parts(message: control_pb2.Report) -> Iterator[Report]:
+    """Check a report, some `PART_ENTRIES` entries at a time: together the parts tell what the whole does.
+
+    Raises DecodeError as `report_from_proto`, lists that are too long first.
+    """
+    lists: tuple[tuple[str, int], ...] = (
+        *(("outcomes", MAX_OUTCOMES), ("latencies", MAX_LATENCIES), ("joints", MAX_JOINTS)),
+        *(("interface_joints", MAX_JOINTS), ("paths", MAX_PATHS)),
+    )
+    for field, limit in lists:
+        check_length(getattr(message, field), limit, field)
+    yield report_from_proto(control_pb2.Report(penalties=message.penalties))
+    for field, _ in lists:
+        entries = getattr(message, field)
+        for begin in range(0, len(entries), PART_ENTRIES):
+            part = report_from_proto(control_pb2.Report(**{field: entries[begin : begin + PART_ENTRIES]}))
+            yield replace(part, continues=True)
+
+
+def report_entries(report: Report) -> int:
+    """How many entries take time to merge."""
+    return len(report.latencies) + len(report.paths) + len(report.joints) + len(report.interface_joints)
 
 
 def report_to_proto(report: Report) -> control_pb2.Report:
