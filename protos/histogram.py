@@ -68,7 +68,7 @@ MIDS: tuple[float, ...] = (
 _EMPTY = bytes(8 * BUCKETS)
 
 MAX_COUNT = 1 << 40
-"""Largest count accepted from the network: more than any sidecar sends in a lifetime, and far from
+"""Most samples of one histogram accepted from the network: more than any sidecar sends in a lifetime, and far from
 where a 64-bit sum or a float would lose it."""
 
 
@@ -266,7 +266,7 @@ class Histogram:
             raise DecodeError(f"histogram counts {lost} lost, which is not within 0..{MAX_COUNT}")
         indices, counts = tuple(indices), tuple(counts)
         if indices:
-            _check_sparse(indices, counts)
+            _check_sparse(indices, counts, lost)
         histogram = cls.__new__(cls)
         histogram._sparse = indices, counts
         histogram._lost = lost
@@ -295,10 +295,10 @@ def _edges() -> NDArray[np.float64]:
     return np.array(EDGES)
 
 
-def _check_sparse(indices: tuple[int, ...], counts: tuple[int, ...]) -> None:
+def _check_sparse(indices: tuple[int, ...], counts: tuple[int, ...], lost: int) -> None:
     """Check as many of both; raises DecodeError on the first that is wrong."""
     ascend = indices[0] >= 0 and indices[-1] < BUCKETS and all(map(lt, indices, indices[1:]))
-    if ascend and min(counts) >= 1 and max(counts) <= MAX_COUNT:
+    if ascend and min(counts) >= 1 and sum(counts) + lost <= MAX_COUNT:
         return
     previous = -1
     for index, count in zip(indices, counts, strict=True):
@@ -307,3 +307,4 @@ def _check_sparse(indices: tuple[int, ...], counts: tuple[int, ...]) -> None:
         if not 1 <= count <= MAX_COUNT:
             raise DecodeError(f"histogram count {count} is not within 1..{MAX_COUNT}")
         previous = index
+    raise DecodeError(f"histogram counts {sum(counts) + lost} samples, more than {MAX_COUNT}")

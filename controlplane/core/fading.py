@@ -13,6 +13,7 @@ import numpy as np
 from controlplane.core.distribution import Distribution
 from controlplane.core.silence import Silence
 from protos.histogram import BUCKETS, MAX_COUNT, MIDS, Histogram
+from protos.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -179,12 +180,12 @@ class FadedHistogram:
         return self._total * math.exp2((self._at - now) / self._half_life_s)
 
     def scaled(self, now: float, sample: int) -> Histogram:
-        """The distribution as whole counts, where a sample that has not faded counts `sample`; no more of them than a
-        histogram may have."""
+        """The distribution as whole counts, where a sample that has not faded counts `sample`; no more of them than fit
+        a histogram, also when those of all size classes are put together."""
         found = self.distribution()
         if found is None:
             return Histogram()
-        scale = min(sample * self.weight(now), MAX_COUNT // 2)
+        scale = min(sample * self.weight(now), MAX_COUNT / (2 * SIZE_CLASSES))
         counts = np.rint(found.mass * scale).astype(np.int64)
         used = np.flatnonzero(counts)
         return Histogram.from_sparse(used.tolist(), counts[used].tolist(), round(found.never * scale))

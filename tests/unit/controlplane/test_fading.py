@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from controlplane.core.fading import FadedCount, FadedHistogram, FadedShares
-from protos.histogram import Histogram
+from protos.explanation import SAMPLE
+from protos.histogram import MAX_COUNT, Histogram
+from protos.size_class import SIZE_CLASSES
 from tests.unit.controlplane.samples import histogram
 
 HALF_LIFE_S = 60.0
@@ -29,6 +31,20 @@ def test_weight_halves_with_each_half_life() -> None:
     made.add(histogram(0.01, times=8), HALF_LIFE_S)
     assert made.weight(HALF_LIFE_S) == pytest.approx(16)
     assert made.lost_share() == pytest.approx(4 / 16)
+
+
+@pytest.mark.audit("ops-20")
+def test_however_many_samples_are_claimed_they_can_be_told_of() -> None:
+    most = Histogram.from_sparse([20, 40], [MAX_COUNT // 4, 3 * MAX_COUNT // 4], 0)
+    made = faded(most)
+    for _ in range(1000):
+        made.add(most, 1.0)
+    together = Histogram()
+    for _ in range(SIZE_CLASSES):
+        together.merge(made.scaled(1.0, SAMPLE))
+    told = Histogram.from_sparse(*together.to_sparse())
+    assert told.sparse[1][1] / told.total == pytest.approx(0.75)
+    assert faded(histogram(0.01, times=8)).scaled(0.0, SAMPLE).total == 8 * SAMPLE
 
 
 def test_recent_samples_outweigh_old_ones() -> None:

@@ -95,7 +95,7 @@ def test_so_many_witnesses_are_remembered() -> None:
 
 
 @given(
-    st.dictionaries(st.integers(0, BUCKETS - 1), st.integers(1, MAX_COUNT), min_size=1, max_size=20),
+    st.dictionaries(st.integers(0, BUCKETS - 1), st.integers(1, MAX_COUNT // 21), min_size=1, max_size=20),
     st.integers(0, 1000),
     st.floats(0.0, 1.0),
 )

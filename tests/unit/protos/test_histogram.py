@@ -152,6 +152,8 @@ def test_any_sparse_form_parses_or_raises_decode_error(
         ([-1], [1], 0, LAYOUT),
         ([1], [0], 0, LAYOUT),
         ([1], [MAX_COUNT + 1], 0, LAYOUT),
+        ([1], [MAX_COUNT], 1, LAYOUT),
+        ([1, 2], [MAX_COUNT // 2 + 1] * 2, 0, LAYOUT),
         ([1], [1, 1], 0, LAYOUT),
         ([], [], MAX_COUNT + 1, LAYOUT),
         ([], [], -1, LAYOUT),
