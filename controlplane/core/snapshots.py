@@ -25,6 +25,11 @@ class PeerView:
     """Of PeerSet."""
 
 
+MAX_LIFTED = 1 << 53
+"""No control plane of ours gives out such a version: seconds since 1970 with 2^20 versions each are half of that in the
+year 2100. Whoever says that he holds one has it from a broken or hostile one, and begins anew."""
+
+
 class VersionSource:
     """Gives out versions that only grow, also over restarts, as `epoch` grows with wall-clock time."""
 
@@ -34,8 +39,7 @@ class VersionSource:
     def above(self, floor: Version) -> Version:
         """A new version, larger than `floor` and all given out before.
 
-        A floor beyond the epoch (what a sidecar says it holds) lifts this sidecar's version alone, not everybody's. Who
-        says that he holds the largest there can be is given that again: he alone has the harm.
+        A floor beyond the epoch (what a sidecar says it holds) lifts this sidecar's version alone, not everybody's.
         """
         self._last += 1
         return Version(min(max(self._last, floor + 1), MAX_VERSION))
@@ -63,7 +67,8 @@ class Track(Generic[C]):
 
     def begin_stream(self, held: Version) -> None:
         """A new stream: the sidecar says which version it holds; what else was sent may not have arrived."""
-        self._floor = max(self._floor, held, self.version_sent)
+        # Only to sidecars older than this control plane versions of other streams mean anything.
+        self._floor = max(self.version_sent, held if held < MAX_LIFTED else Version(0))
         refused, self._unanswered = self.refused, False
         if self.sent is not None and held == self.version_sent and not refused:
             self.error = ""

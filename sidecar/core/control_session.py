@@ -6,8 +6,9 @@
 
 The rules are xDS's. A resource comes with a version and a nonce; the answer repeats the nonce with the version that is
 then in force. Only the newest answer for each resource matters, since the control plane ignores stale nonces: so what
-waits to be sent is bounded without any queue. A mapping comes whole. Peers come whole or as changes, and in one message
-or several: what is put in force is whole (`PeerAssembly`).
+waits to be sent is bounded without any queue. Which of two versions is older matters within one stream alone: whatever
+a control plane has said, the next one begins with whatever version it likes. A mapping comes whole. Peers come whole or
+as changes, and in one message or several: what is put in force is whole (`PeerAssembly`).
 """
 
 from __future__ import annotations
@@ -128,6 +129,8 @@ class ControlSession:
             ResourceKind.PEERS: registration.peers_version,
             ResourceKind.MAPPING: registration.mapping_version,
         }
+        self._taken: dict[ResourceKind, Version] = {}
+        """The newest version that was acknowledged on this stream."""
         self._backoff = Backoff(rng, first_s=RETRY_FIRST_S, max_s=RETRY_MAX_S)
         self._candidates = CandidateSet()
         self._services = ServiceSet()
@@ -186,6 +189,7 @@ class ControlSession:
     def opened(self, now: float) -> None:
         """A stream is being opened: everything is said anew on it."""
         self._clear_outgoing()
+        self._taken.clear()
         self._assembly.begin_stream()
         self.state = ControlState.REGISTERING
         self.stats.attempts += 1
@@ -235,7 +239,7 @@ class ControlSession:
             case PeerSet():
                 return self._receive_peers(message)
             case MappingSet():
-                return self._receive_resource(ResourceKind.MAPPING, message)
+                return Apply(ResourceKind.MAPPING, message) if self._is_news(ResourceKind.MAPPING, message) else None
 
     def _receive_welcome(self, welcome: Welcome, now: float) -> Welcome:
         told_before = self.state is ControlState.ONLINE
@@ -260,26 +264,27 @@ class ControlSession:
         said = self._assembly.take(message)
         if said is None:
             return None
-        if said.version <= self._in_force[ResourceKind.PEERS]:
-            return self._receive_resource(ResourceKind.PEERS, said)
+        if not self._is_news(ResourceKind.PEERS, said):
+            return None
         whole = self._assembly.whole(said)
         if isinstance(whole, str):
-            self.stats.ignored["peers_without_base"] += 1
+            self.stats.ignored["peers_malformed" if self._assembly.is_upon(said) else "peers_without_base"] += 1
             self._nack(ResourceKind.PEERS, said.nonce, whole)
             return None
-        return self._receive_resource(ResourceKind.PEERS, whole)
+        return Apply(ResourceKind.PEERS, whole)
 
-    def _receive_resource(self, resource: ResourceKind, content: PeerSet | MappingSet) -> Apply | None:
-        in_force = self._in_force[resource]
-        if content.version > in_force:
-            return Apply(resource, content)
-        if content.version == in_force:
+    def _is_news(self, resource: ResourceKind, content: PeerSet | MappingSet) -> bool:
+        """Whether this is to be put in force; if not, it is answered."""
+        if content.version == self._in_force[resource]:
             self.stats.ignored[f"{resource.value}_repeated"] += 1
             self._ack(resource, content.nonce)
-        else:
+            return False
+        least = max(self._taken.get(resource, Version(0)), Version(1))
+        if content.version < least:
             self.stats.ignored[f"{resource.value}_older"] += 1
-            self._nack(resource, content.nonce, f"version {content.version} is older than {in_force} in force")
-        return None
+            self._nack(resource, content.nonce, f"version {content.version} is older than {least} of this stream")
+            return False
+        return True
 
     def applied(self, apply: Apply, error: str | None) -> None:
         """The driver put the resource in force, or could not because of `error`."""
@@ -321,6 +326,7 @@ class ControlSession:
 
     def _ack(self, resource: ResourceKind, nonce: int) -> None:
         self.stats.acks[resource] += 1
+        self._taken[resource] = self._in_force[resource]
         self._answers[resource] = Ack(resource, self._in_force[resource], nonce)
 
     def _nack(self, resource: ResourceKind, nonce: int, error: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 from protos.model import MAX_PEERS, PeerSet, Version
@@ -48,13 +49,24 @@ class PeerAssembly:
             return None
         return message
 
+    def is_upon(self, said: PeerSet) -> bool:
+        """Whether this is a whole set, or changes upon the one in force."""
+        return said.base in (0, self._version)
+
     def whole(self, said: PeerSet) -> PeerSet | str:
-        """Return the whole set that this leads to, or why there is none."""
+        """Return the whole set that this leads to, or why there is none.
+
+        A set, whatever number of messages it comes in, names nobody twice: neither as a peer, nor as removed, nor as
+        both.
+        """
         if len(said.peers) > MAX_PEERS or len(said.removed) > MAX_PEERS:
             return f"more than {MAX_PEERS} peers"
+        names = Counter([*(peer.name for peer in said.peers), *(gone.name for gone in said.removed)])
+        if len(names) < len(said.peers) + len(said.removed):
+            (name, _), *_ = names.most_common(1)
+            return f"{name} stands in it twice"
         if not said.base:
-            names = {peer.name for peer in said.peers}
-            return said if len(names) == len(said.peers) else "a peer stands in it twice"
+            return said
         if said.base != self._version:
             return f"these are changes upon version {said.base}; in force is {self._version}"
         whole = put_upon(self._held, said)

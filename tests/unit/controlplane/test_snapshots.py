@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from controlplane.core.snapshots import PeerView, Snapshots, Track, VersionSource
+from controlplane.core.snapshots import MAX_LIFTED, PeerView, Snapshots, Track, VersionSource
 from controlplane.core.told_peers import ToldPeers
 from protos.model import (
+    MAX_VERSION,
     Ack,
     Nack,
     NodeName,
@@ -209,3 +210,15 @@ def test_names_a_sidecar_may_know_grow_until_it_acknowledges(versions: VersionSo
     assert snapshots.known_names == {"a", "b", "c"}
     assert snapshots.peers_acked(Ack(ResourceKind.PEERS, snapshots.peers.version_sent, snapshots.peers.nonce))
     assert snapshots.known_names == {"b", "c"}
+
+
+@pytest.mark.audit("ops-17")
+def test_who_holds_what_no_control_plane_of_ours_gave_out_begins_anew(versions: VersionSource) -> None:
+    track: Track[tuple[int, ...]] = Track()
+    for held in (MAX_VERSION, MAX_LIFTED):
+        track.begin_stream(Version(held))
+        first, then = track.send((1,), versions), track.send((2,), versions)
+        assert first < then < MAX_LIFTED
+    track.begin_stream(Version(MAX_LIFTED - 1))
+    assert track.send((3,), versions) == MAX_LIFTED
+    assert track.send((4,), versions) == MAX_LIFTED + 1, "on one stream they only grow"

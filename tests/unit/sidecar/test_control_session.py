@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import itertools
 import random
+from collections import Counter
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.model import (
+    MAX_VERSION,
     PROTOCOL_VERSION,
     Ack,
     Candidate,
@@ -156,8 +158,23 @@ def test_the_version_in_force_sent_again_is_acked_without_being_applied() -> Non
     assert answer(session) == Ack(ResourceKind.PEERS, Version(6), 3)
 
 
+@pytest.mark.audit("ops-17")
+@pytest.mark.parametrize("version", [MAX_VERSION, 7])
+def test_what_one_control_plane_said_binds_no_other(version: int) -> None:
+    """The next one, or the same after a restart, may begin with any version."""
+    session = online(make_session(peers=version, mapping=version))
+    for event in (session.receive(peers(version - 1), 0.0), session.receive(mapping(3), 0.0)):
+        assert isinstance(event, Apply)
+        session.applied(event, None)
+    assert (session.version(ResourceKind.PEERS), session.version(ResourceKind.MAPPING)) == (version - 1, 3)
+    assert session.receive(mapping(2), 0.0) is None, "on one stream they only grow"
+    session.closed(1.0)
+    assert isinstance(online(session, 2.0).receive(mapping(2), 2.0), Apply)
+
+
 def test_an_older_version_is_refused() -> None:
     session = online(make_session(peers=6))
+    assert session.receive(peers(6, nonce=2), 0.0) is None
     assert session.receive(peers(5, nonce=3), 0.0) is None
     nack = answer(session)
     assert isinstance(nack, Nack)
@@ -403,27 +420,30 @@ PUSHES = st.lists(st.tuples(st.booleans(), VERSIONS, st.booleans(), st.booleans(
 
 
 @given(PUSHES)
-def test_versions_in_force_only_grow_and_every_push_gets_its_answer(
+def test_versions_only_grow_on_a_stream_and_every_push_gets_its_answer(
     pushes: list[tuple[bool, int, bool, bool]],
 ) -> None:
     session = online(make_session())
     now = 0.0
+    acked: Counter[ResourceKind] = Counter()
     for nonce, (is_peers, version, accept, reconnect) in enumerate(pushes, start=1):
         now += 0.01
         if reconnect:
             session.closed(now)
             online(session, now)
+            acked.clear()
         kind = ResourceKind.PEERS if is_peers else ResourceKind.MAPPING
-        before = session.version(kind)
         event = session.receive(peers(version, nonce) if is_peers else mapping(version, nonce), now)
         if isinstance(event, Apply):
-            assert version > before
+            assert version > acked[kind]
             session.applied(event, None if accept else "refused")
         reply = answer(session, now)
         assert isinstance(reply, Ack | Nack)
         assert (reply.resource, reply.nonce) == (kind, nonce)
-        assert reply.version == session.version(kind) >= before
+        assert reply.version == session.version(kind) >= acked[kind]
         assert isinstance(reply, Ack) == (reply.version == version)
+        if isinstance(reply, Ack):
+            acked[kind] = reply.version
     assert session.state is ControlState.ONLINE
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import pytest
 
@@ -97,12 +98,28 @@ def test_too_many_are_refused_and_not_kept() -> None:
     assert str(MAX_PEERS) in str(assembly.whole(PeerSet(Version(3), 3, (peer("more"),), base=Version(2))))
 
 
-def test_a_peer_twice_is_refused() -> None:
-    assembly = PeerAssembly(None)
-    assembly.take(PeerSet(Version(1), 1, (peer("a"),), more=True))
-    said = assembly.take(PeerSet(Version(1), 1, (peer("a", 2),)))
+@pytest.mark.audit("ops-17")
+@pytest.mark.parametrize("base", [0, 5])
+@pytest.mark.parametrize(
+    ("first", "then"),
+    [
+        (((peer("a"),), ()), ((peer("a", 2),), ())),
+        (((peer("a"),), ()), ((), (gone("a"),))),
+        (((), (gone("a"),)), ((peer("a"),), ())),
+        (((), (gone("a"),)), ((), (gone("a"),))),
+    ],
+)
+def test_who_is_named_twice_in_one_set_makes_it_none_and_what_is_held_stays(
+    base: int, first: tuple[tuple[Peer, ...], tuple[RemovedPeer, ...]], then: tuple[Any, Any]
+) -> None:
+    assembly = PeerAssembly(PeerSet(Version(5), 1, (peer("a"), peer("b"))))
+    assembly.take(PeerSet(Version(6), 2, *first, base=Version(base), more=True))
+    said = assembly.take(PeerSet(Version(6), 2, *then, base=Version(base)))
     assert said is not None
-    assert "twice" in str(assembly.whole(said))
+    assert assembly.whole(said) == "a stands in it twice"
+    assert assembly.is_upon(said)
+    after = PeerSet(Version(7), 3, (peer("c"),), base=Version(5))
+    assert names(assembly.whole(after)) == {"a", "b", "c"}
 
 
 def test_whatever_comes_what_is_kept_is_bounded() -> None:
