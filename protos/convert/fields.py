@@ -35,7 +35,7 @@ MAX_OUTCOMES = 1024
 """Outcome reports in one report: as many as a robot can carry services."""
 
 MAX_CRL_BYTES = 1 << 20
-"""Longest revocation list that is relayed: some 25,000 certificates."""
+"""Longest revocation list that is relayed: 15,000 to 20,000 certificates."""
 
 MAX_STUN_SERVERS = 16
 """STUN servers in one welcome."""
