@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import grpc
 
+from controlplane.core.snapshots import MAX_LIFTED
 from protos.model import (
     Ack,
     Drain,
@@ -149,6 +150,12 @@ def test_after_a_restart_versions_grow_and_robots_keep_their_peers_meanwhile(tmp
 
 
 def test_a_sidecar_that_holds_more_than_the_clock_gives_is_outgrown(plane: ControlPlaneProcess) -> None:
-    far = 1 << 62
+    far = MAX_LIFTED - 2
     with cloud(plane.address, "cloud-far", held=far) as c:
         assert c.expect(PeerSet).version == far + 1
+
+
+@pytest.mark.audit("ops-17")
+def test_a_sidecar_that_holds_what_no_control_plane_gave_out_begins_anew(plane: ControlPlaneProcess) -> None:
+    with cloud(plane.address, "cloud-far", held=1 << 62) as c:
+        assert c.expect(PeerSet).version < MAX_LIFTED
