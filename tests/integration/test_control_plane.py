@@ -6,6 +6,7 @@ import signal
 from typing import TYPE_CHECKING
 
 import grpc
+import pytest
 
 from controlplane.core.snapshots import MAX_LIFTED
 from protos.model import (
