@@ -72,6 +72,14 @@ FLEET_TIMEOUT_S = 4.0
 """For all of them: a scrape waits no longer, and Prometheus not much."""
 
 
+URGENT_LIMIT_S = 0.1
+"""For the solver, where a mapping is urgent: what is not proven to be the best by then waits for the next routine
+solving, not for who makes many of these urgent."""
+
+URGENT_LIMIT_EACH_S = 250e-6
+"""The same for large fleets, by a service of a robot: to set them out alone takes a part of it."""
+
+
 def wall_clock_epoch() -> int:
     """Where versions start: seconds since 1970, with 2^20 versions left for each.
 
@@ -443,6 +451,8 @@ class ControlLoop:
     def _solve_and_settle(self, picture: Picture) -> Settled:
         """On the solver's thread."""
         limit_s = self._config.solver_time_limit_ms / 1000
+        if not self._core.solves_routinely:
+            limit_s = min(limit_s, max(URGENT_LIMIT_S, URGENT_LIMIT_EACH_S * len(picture.problem.blocks)))
         plan = self._matcher.solve(picture.problem, limit_s, self._core.plan)
         return self._core.settle(picture, plan, self._loop.time())
 

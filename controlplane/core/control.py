@@ -133,6 +133,8 @@ class ControlCore:
         )
         self._drawing_since: float | None = None
         """When the drawing of the next problem began, None while none is drawn."""
+        self.solves_routinely = False
+        """Whether the problem that `start_solving` gave last may take its time: nothing urgent waits for it."""
         self._debounce = Debounce()
         self._stability = Stability()
         self.history = MappingHistory()
@@ -491,7 +493,8 @@ class ControlCore:
             if change is None:
                 return None
             self._drawing_since = now
-            self._drawing.begin(routine=change is Change.REPORT)
+            self.solves_routinely = change is Change.REPORT
+            self._drawing.begin(routine=self.solves_routinely)
         # Who waits for its servers has a mapping; what is made of nothing known must not take its place.
         waits = self._publisher.waits
         ready = (sidecar for sidecar in self.registry if sidecar.ready and not waits(sidecar.name))

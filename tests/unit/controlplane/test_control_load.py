@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import pytest
@@ -110,6 +111,20 @@ def test_nobody_is_told_again_what_did_not_change(world: World) -> None:
     world.run(SETTLED_S)
     assert all(len(cloud.peer_sets) == 1 for cloud in clouds)
     assert not [one for robot in robots for one in robot.received if isinstance(one, PeerSet | MappingSet)]
+
+
+@pytest.mark.audit("ops-20")
+def test_what_is_urgent_is_not_solved_as_long_as_the_routine(world: World) -> None:
+    robots = fleet(world)
+    solving = [world.core.solves_routinely]
+    for turn in range(200):
+        if turn % 10 == 0:
+            world.report(robots[0], path("wlan0", "a", up=bool(turn % 20)))
+        else:
+            world.report(robots[1], path("wlan0", "a"))
+        world.run(0.05)
+        solving.append(world.core.solves_routinely)
+    assert 10 < sum(before != after for before, after in itertools.pairwise(solving))
 
 
 @pytest.mark.audit("ops-20")
