@@ -22,8 +22,8 @@ _GLOB_CHARACTERS = frozenset("*?[")
 _MAX_SERVICE_CHARACTERS = 255
 MAX_CONTROL_PLANES = 8
 """Addresses of the control plane; each is tried over every interface."""
-_MAX_SOCKET_BYTES = 107
-"""Of a unix socket's path (unix(7))."""
+_MAX_SOCKET_BYTES = 101
+"""Of a unix socket's path, 107 (unix(7)), less the end of the group's (sidecar/local/entrance.py)."""
 _COPIES_WORDS = {"each": EVERY_INTERFACE, "at_most": AT_MOST_EVERY_INTERFACE}
 
 

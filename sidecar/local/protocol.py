@@ -7,7 +7,7 @@
 {"id": 2, "part": "pinged", "value": [...]}   the paths over which it was to leave; then each that is answered:
 {"id": 2, "part": "pong", "value": {"interface": ..., "remote": ..., "rtt_s": ..., "problem": ...}}
 {"id": 1, "end": true}                        there is no more
-{"id": 1, "error": "..."}                     the request is refused
+{"id": 1, "error": "...", "busy": true}       the request is refused; busy: later it may not be
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ VERSION = 1
 """Told in the part `node`. A part or key that a client does not know is to be ignored."""
 MAX_REQUEST_BYTES = 1024
 """Of one line, its end included."""
+MAX_REQUESTS = 8
+"""Of one connection, being answered."""
 MAX_ID = 1 << 32
 _MAX_INTERFACE_CHARACTERS = 15
 
@@ -99,9 +101,12 @@ def encode_end(request_id: int) -> bytes:
     return _line({"id": request_id, "end": True})
 
 
-def encode_error(request_id: int | None, text: str) -> bytes:
-    """Return the line that refuses a request; without id: whatever was asked."""
-    return _line({"id": request_id, "error": text})
+def encode_error(request_id: int | None, text: str, *, busy: bool = False) -> bytes:
+    """Return the line that refuses a request; without id: whatever was asked. `busy`: it may be asked again later."""
+    value: dict[str, object] = {"id": request_id, "error": text}
+    if busy:
+        value["busy"] = True
+    return _line(value)
 
 
 def _line(value: dict[str, object]) -> bytes:

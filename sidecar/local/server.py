@@ -1,22 +1,20 @@
 """Serves a sidecar's local socket: few clients at once, none for long, whoever comes; the data plane never waits.
 
 One thread, and no lock of anybody's is held while a client is served. What a client may cost is bounded: connections,
-the bytes of a request, what waits to be read by it, requests a second, pings that are out. An answer is built piece by
-piece, as the client reads it, with a pause after each, so that who has thousands of paths holds the interpreter from
-nobody.
+the bytes of a request, what waits to be read by it, requests a second, pings that are out. Each user has a share of
+that, and root (with the sidecar's own user: the owner) one that the members of the group do not touch. An answer is
+built piece by piece, as the client reads it, in turns with those of others and with a pause after each, so that who has
+thousands of paths holds the interpreter from nobody.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import grp
 import logging
 import os
+import select
 import selectors
-import socket
-import stat
-import struct
 import threading
 import time
 from collections import Counter, deque
@@ -24,9 +22,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from protos.errors import DecodeError
-from protos.token_bucket import TokenBucket
+from sidecar.core.pinging import Pong
+from sidecar.local.entrance import Entrance, SocketLock, for_group
+from sidecar.local.peer import groups_of, user_of
 from sidecar.local.protocol import (
     MAX_REQUEST_BYTES,
+    MAX_REQUESTS,
     PingRequest,
     StateRequest,
     decode_request,
@@ -34,50 +35,52 @@ from sidecar.local.protocol import (
     encode_error,
     encode_part,
 )
+from sidecar.local.shares import Rate, Rates, Shares
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import Iterator
     from pathlib import Path
 
     from sidecar.core.path_id import PathId
-    from sidecar.core.pinging import Pong
 
 log = logging.getLogger(__name__)
 
 GROUP = "plr"
 """Whose members may ask, beside root and the sidecar's own user."""
-MAX_CONNECTIONS = 16
-MAX_OF_A_USER = 8
-"""Connections of one user other than root: nobody keeps all others out."""
+MAX_OWN = 8
+"""Connections of root and the sidecar's own user."""
+MAX_MEMBERS = 16
+"""Connections of all others together, ..."""
+MAX_OF_A_USER = 4
+"""... and of each."""
 IDLE_S = 30.0
 """A connection that asks nothing for so long is closed, ..."""
 PATIENCE_S = 5.0
 """... one that has begun a request, or has not read an answer, after this."""
 MAX_UNREAD_BYTES = 65_536
 """What waits to be read by a client; before more is built, it has to read."""
-MAX_REQUESTS = 8
-"""Of one connection, being answered."""
-ACCEPTS_PER_S, ACCEPTS_AT_ONCE = 20.0, 40.0
-STATES_PER_S, STATES_AT_ONCE = 4.0, 8.0
-PINGS_PER_S, PINGS_AT_ONCE = 50.0, 100.0
-"""Requests, of all clients together; what leaves an interface is bounded there too (`sidecar/core/pinging.py`)."""
+STATES = Rates(owner=Rate(4.0, 8.0), members=Rate(2.0, 8.0), member=Rate(1.0, 4.0))
+PING_REQUESTS = Rates(owner=Rate(50.0, 100.0), members=Rate(40.0, 80.0), member=Rate(20.0, 40.0))
+PINGS = Rates(owner=Rate(50.0, 100.0), members=Rate(10.0, 30.0), member=Rate(5.0, 15.0))
+"""Over each interface, which sends few (`sidecar/core/pinging.py`): members leave half of them to root."""
+MAX_INTERFACES = 64
+"""Of which it is remembered how many pings they were asked for."""
 MAX_PINGS_OUT = 256
+MAX_OUT_OF_MEMBERS, MAX_OUT_OF_A_USER = 192, 64
 PONG_WAIT_S = 10.0
 """A ping is answered within this, or not at all: a round trip of 10 s is the longest that has to work."""
 PAUSE_S = 0.001
 """After each piece of an answer, for the other threads."""
 LOOK_S = 1.0
 """How often overdue connections are looked for."""
-ACCEPT_PAUSE_S = 0.1
+ERROR_PAUSE_S = 0.1
 STOP_S = 1.0
 
 REFUSALS = ("full", "user_full", "not_allowed", "bad_request", "too_often", "too_slow", "pongs_full")
 """The keys of `LocalServer.refused`."""
 
-_SO_PEERGROUPS = 59
-_MAX_GROUPS_BYTES = 1024
-"""What Python asks the kernel for at most: 256 groups."""
-_CREDENTIALS = struct.Struct("iII")
+_TOO_MANY_PINGS = "too many pings of users other than root: wait a second"
 
 
 class LocalSource(Protocol):
@@ -109,7 +112,8 @@ class _PingRound:
 @dataclass(slots=True, eq=False)
 class _Client:
     sock: socket.socket
-    user: int
+    user: int | None
+    """None: the owner."""
     heard_at: float
     """When it last made a whole request, read something or came (s)."""
     received: bytearray = field(default_factory=bytearray)
@@ -118,6 +122,7 @@ class _Client:
     rounds: dict[int, _PingRound] = field(default_factory=dict)
     """By the request's id."""
     events: int = selectors.EVENT_READ
+    """What it is watched for; 0: nothing."""
     closing: bool = False
     """Nothing more is read from it."""
 
@@ -130,8 +135,8 @@ class LocalServer:
         self.refused: Counter[str] = Counter()
         """Connections and requests refused, by REFUSALS."""
         self._source = source
-        self._listening: socket.socket | None = None
-        self._inode = 0
+        self._lock = SocketLock(path)
+        self._entrances: tuple[Entrance, ...] = ()
         self._group: int | None = None
         self._clients: dict[int, _Client] = {}
         """By file descriptor."""
@@ -142,10 +147,10 @@ class LocalServer:
         self._out: dict[int, tuple[_Client, int, PathId]] = {}
         """Pings that are out, by number: who asked, and in which request."""
         now = time.monotonic()
-        self._accepts = TokenBucket(rate=ACCEPTS_PER_S, burst=ACCEPTS_AT_ONCE, now=now)
-        self._states = TokenBucket(rate=STATES_PER_S, burst=STATES_AT_ONCE, now=now)
-        self._ping_requests = TokenBucket(rate=PINGS_PER_S, burst=PINGS_AT_ONCE, now=now)
-        self._accept_again_at: float | None = None
+        self._states = Shares(STATES, now)
+        self._ping_requests = Shares(PING_REQUESTS, now)
+        self._pings: dict[str, Shares] = {}
+        """By interface."""
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="plr-local", daemon=True)
 
@@ -154,19 +159,17 @@ class LocalServer:
         try:
             self._listen()
         except OSError as error:
+            self._stop_listening()
             raise LocalSocketError(error.strerror or str(error)) from error
         self._thread.start()
 
     def close(self) -> None:
-        """Stop serving, and remove the socket."""
+        """Stop serving, and remove the sockets."""
         self._stopping = True
         if self._thread.is_alive():
             self._ring()
             self._thread.join(STOP_S)
-        if self._listening is not None:
-            with contextlib.suppress(OSError):
-                if self.path.stat().st_ino == self._inode:  # not one that took our place
-                    self.path.unlink()
+        self._stop_listening()
 
     def on_pong(self, pong: Pong) -> None:
         """What became of a ping; from any thread, which does not wait."""
@@ -181,49 +184,27 @@ class LocalServer:
             os.eventfd_write(self._bell, 1)
 
     def _listen(self) -> None:
-        if len(os.fsencode(self.path)) > 107:
-            raise OSError(errno.ENAMETOOLONG, "the path of a socket has at most 107 bytes")
-        self._remove_stale()
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
-        try:
-            # What the node in the file system will have: nobody else gets in before its group is set.
-            os.fchmod(sock.fileno(), stat.S_IRUSR | stat.S_IWUSR)
-            sock.bind(str(self.path))
-            self._open_to_group()
-            self._inode = self.path.stat().st_ino
-            sock.listen(MAX_CONNECTIONS)
-        except OSError:
-            sock.close()
-            raise
-        self._listening = sock
-        self._selector.register(sock, selectors.EVENT_READ)
+        self._lock.take()
+        now = time.monotonic()
+        self._group = _group()
+        self._open(Entrance(self.path), now)
+        if self._group is not None:
+            try:
+                self._open(Entrance(for_group(self.path), self._group), now)
+            except OSError as error:
+                log.warning("%s: members of %s cannot ask: %s", for_group(self.path), GROUP, error.strerror or error)
         self._selector.register(self._bell, selectors.EVENT_READ)
 
-    def _remove_stale(self) -> None:
-        """A socket that nobody listens at was left by a run that was killed."""
-        try:
-            if not stat.S_ISSOCK(self.path.lstat().st_mode):
-                raise OSError(errno.EEXIST, "something else than a socket is there")
-        except FileNotFoundError:
-            return
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
-            answer = probe.connect_ex(str(self.path))
-        if answer == errno.ECONNREFUSED:
-            self.path.unlink(missing_ok=True)
-        elif answer != errno.ENOENT:
-            raise OSError(errno.EADDRINUSE, "another sidecar listens there: set local_socket in one of them")
+    def _open(self, entrance: Entrance, now: float) -> None:
+        entrance.open(now)
+        assert entrance.sock is not None
+        self._entrances += (entrance,)
+        self._selector.register(entrance.sock, selectors.EVENT_READ, entrance)
 
-    def _open_to_group(self) -> None:
-        try:
-            group = grp.getgrnam(GROUP).gr_gid
-        except KeyError:
-            return
-        if self.path.stat().st_gid != group:
-            if os.geteuid() != 0 and group not in os.getgroups():
-                return
-            os.chown(self.path, -1, group)
-        self.path.chmod(stat.S_IRUSR | stat.S_IWUSR | stat.S_IRGRP | stat.S_IWGRP)
-        self._group = group
+    def _stop_listening(self) -> None:
+        for entrance in self._entrances:
+            entrance.close()
+        self._lock.release()
 
     # Runs on the thread ------------------------------------------------------------------------------------------
 
@@ -234,18 +215,16 @@ class LocalServer:
                     self._turn()
                 except Exception:
                     log.exception("internal error; the local socket goes on")
-                    time.sleep(ACCEPT_PAUSE_S)
+                    time.sleep(ERROR_PAUSE_S)
         finally:
             for client in list(self._clients.values()):
                 self._drop(client)
             self._selector.close()
-            if self._listening is not None:
-                self._listening.close()
 
     def _turn(self) -> None:
         for key, events in self._selector.select(self._wait_s()):
-            if key.fileobj is self._listening:
-                self._accept()
+            if isinstance(key.data, Entrance):
+                self._accept(key.data)
             elif key.fd == self._bell:
                 os.eventfd_read(self._bell)
             else:
@@ -254,50 +233,50 @@ class LocalServer:
                     self._serve(client, events)
         self._deliver_pongs()
         now = time.monotonic()
-        if self._accept_again_at is not None and now >= self._accept_again_at and self._listening is not None:
-            self._accept_again_at = None
-            self._selector.register(self._listening, selectors.EVENT_READ)
+        for entrance in self._entrances:
+            if entrance.sock is not None and entrance.again_at is not None and now >= entrance.again_at:
+                entrance.again_at = None
+                self._selector.register(entrance.sock, selectors.EVENT_READ, entrance)
         self._look_for_overdue(now)
 
     def _wait_s(self) -> float:
-        if self._accept_again_at is not None:
-            return ACCEPT_PAUSE_S
+        paused = [entrance.again_at for entrance in self._entrances if entrance.again_at is not None]
+        if paused:
+            return max(0.0, min(paused) - time.monotonic())
         return LOOK_S if self._clients else 60.0
 
-    def _accept(self) -> None:
-        assert self._listening is not None
+    def _accept(self, entrance: Entrance) -> None:
         now = time.monotonic()
-        if not self._accepts.take(now):
-            # They wait in the kernel, which holds few.
-            self._selector.unregister(self._listening)
-            self._accept_again_at = now + ACCEPT_PAUSE_S
+        sock = entrance.accept(now)
+        if sock is None:
+            if entrance.again_at is not None and entrance.sock is not None:
+                # They wait in the kernel, which holds few.
+                self._selector.unregister(entrance.sock)
             return
-        try:
-            sock, _ = self._listening.accept()
-        except OSError:
-            return
-        sock.setblocking(False)
-        refusal = self._refusal(sock)
+        user = user_of(sock)
+        owner = user in (0, os.geteuid())
+        refusal = self._refusal(sock, None if owner else user)
         if refusal is not None:
             why, text = refusal
             self.refused[why] += 1
             with contextlib.suppress(OSError):
-                sock.send(encode_error(None, text))
+                sock.send(encode_error(None, text, busy=why != "not_allowed"))
             sock.close()
             return
-        client = _Client(sock, _user(sock), now)
-        self._clients[sock.fileno()] = client
+        self._clients[sock.fileno()] = _Client(sock, None if owner else user, now)
         self._selector.register(sock, selectors.EVENT_READ)
 
-    def _refusal(self, sock: socket.socket) -> tuple[str, str] | None:
-        user = _user(sock)
+    def _refusal(self, sock: socket.socket, user: int | None) -> tuple[str, str] | None:
+        others = [client.user for client in self._clients.values()]
+        if user is None:
+            return ("full", "too many ask at once: try again") if others.count(None) >= MAX_OWN else None
         # The socket's mode says the same; a folder that was opened wider, or a descriptor passed on, does not undo it.
-        if user not in (0, os.geteuid()) and (self._group is None or self._group not in _groups(sock)):
+        if self._group is None or self._group not in groups_of(sock):
             return "not_allowed", f"only root and members of the group {GROUP} may ask"
-        if len(self._clients) >= MAX_CONNECTIONS:
-            return "full", "too many ask at once: try again"
-        if user != 0 and sum(client.user == user for client in self._clients.values()) >= MAX_OF_A_USER:
+        if others.count(user) >= MAX_OF_A_USER:
             return "user_full", "too many of this user ask at once: try again"
+        if len(others) - others.count(None) >= MAX_MEMBERS:
+            return "full", "too many ask at once: try again"
         return None
 
     def _serve(self, client: _Client, events: int) -> None:
@@ -320,7 +299,8 @@ class LocalServer:
         except BlockingIOError:  # the event was of another connection, which had its number before
             return
         if not data:
-            raise ConnectionResetError
+            self._end_of_requests(client)
+            return
         client.received += data
         while not client.closing and (end := client.received.find(b"\n")) >= 0:
             line = bytes(client.received[:end])
@@ -329,6 +309,17 @@ class LocalServer:
             self._take(client, line)
         if len(client.received) > MAX_REQUEST_BYTES:
             self._refuse_for_good(client, f"a request is a line of at most {MAX_REQUEST_BYTES} bytes")
+
+    def _end_of_requests(self, client: _Client) -> None:
+        """It asks nothing more (shutdown(2), as `nc -N` does), and may still read what it has asked for."""
+        if _is_gone(client.sock):
+            raise ConnectionResetError
+        client.closing = True
+        if client.received:
+            # The last line needs no end.
+            line = bytes(client.received)
+            client.received.clear()
+            self._take(client, line)
 
     def _take(self, client: _Client, line: bytes) -> None:
         try:
@@ -340,22 +331,25 @@ class LocalServer:
         if len(client.answers) + len(client.rounds) >= MAX_REQUESTS or request.id in client.rounds:
             self._too_often(client, request.id)
         elif isinstance(request, StateRequest):
-            if self._states.take(now):
+            if self._states.take(client.user, now):
                 client.answers.append(self._state(request.id))
             else:
                 self._too_often(client, request.id)
-        elif self._ping_requests.take(now):
+        elif self._ping_requests.take(client.user, now):
             self._ping(client, request, now)
         else:
             self._too_often(client, request.id)
 
     def _too_often(self, client: _Client, request: int) -> None:
         self.refused["too_often"] += 1
-        client.unread += encode_error(request, "too many requests: wait a second")
+        client.unread += encode_error(request, "too many requests: wait a second", busy=True)
 
     def _refuse_for_good(self, client: _Client, text: str) -> None:
         self.refused["bad_request"] += 1
         client.received.clear()
+        client.answers.clear()
+        client.rounds.clear()
+        self._forget_pings(client)
         client.unread += encode_error(None, text)
         client.closing = True
 
@@ -372,7 +366,7 @@ class LocalServer:
                 request.id, f"there is no path to {request.peer}{over}: plr doctor names the peers"
             )
             return
-        if len(self._out) + len(paths) > MAX_PINGS_OUT:
+        if not self._may_be_out(client.user, len(paths)):
             self._too_often(client, request.id)
             return
         client.rounds[request.id] = _PingRound(request.id, len(paths), now + PONG_WAIT_S)
@@ -381,7 +375,28 @@ class LocalServer:
         for path in paths:
             self._next_number += 1
             self._out[self._next_number] = client, request.id, path
-            self._source.ping(path, self._next_number, request.size)
+            if self._shares_of(path.interface, now).take(client.user, now):
+                self._source.ping(path, self._next_number, request.size)
+            else:
+                self.refused["too_often"] += 1
+                self._pongs.append(Pong(self._next_number, path, problem=_TOO_MANY_PINGS))
+
+    def _may_be_out(self, user: int | None, more: int) -> bool:
+        users = [client.user for client, _, _ in self._out.values()]
+        if len(users) + more > MAX_PINGS_OUT:
+            return False
+        return user is None or (
+            users.count(user) + more <= MAX_OUT_OF_A_USER
+            and len(users) - users.count(None) + more <= MAX_OUT_OF_MEMBERS
+        )
+
+    def _shares_of(self, interface: str, now: float) -> Shares:
+        shares = self._pings.get(interface)
+        if shares is None:
+            if len(self._pings) >= MAX_INTERFACES:
+                del self._pings[next(iter(self._pings))]
+            shares = self._pings[interface] = Shares(PINGS, now)
+        return shares
 
     def _deliver_pongs(self) -> None:
         while self._pongs:
@@ -400,36 +415,41 @@ class LocalServer:
             self._serve(client, 0)
 
     def _write(self, client: _Client) -> None:
-        while True:
-            if client.unread:
-                try:
-                    sent = client.sock.send(client.unread)
-                except BlockingIOError:
-                    return
-                client.heard_at = time.monotonic()
-                del client.unread[:sent]
-                if client.unread:
-                    return
-            if not client.answers:
+        if client.unread:
+            try:
+                sent = client.sock.send(client.unread)
+            except BlockingIOError:
                 return
-            piece = next(client.answers[0], None)
-            if piece is None:
-                client.answers.popleft()
-            else:
-                client.unread += piece
-                time.sleep(PAUSE_S)
+            client.heard_at = time.monotonic()
+            del client.unread[:sent]
+        if client.unread or not client.answers:
+            return
+        # One piece: those of others, and root's, come in between.
+        piece = next(client.answers[0], None)
+        if piece is None:
+            client.answers.popleft()
+        else:
+            client.unread += piece
+            time.sleep(PAUSE_S)
 
     def _follow(self, client: _Client) -> None:
         """Wait for what the client may do next."""
-        if client.closing and not client.unread:
+        busy = bool(client.unread or client.answers)
+        if client.closing and not busy and not client.rounds:
             self._drop(client)
             return
         # Who does not read is not read from.
         reading = not client.closing and len(client.unread) < MAX_UNREAD_BYTES
-        events = (selectors.EVENT_READ if reading else 0) | (selectors.EVENT_WRITE if client.unread else 0)
-        if events and events != client.events:
+        events = (selectors.EVENT_READ if reading else 0) | (selectors.EVENT_WRITE if busy else 0)
+        if events == client.events:
+            return
+        if not events:
+            self._selector.unregister(client.sock)
+        elif not client.events:
+            self._selector.register(client.sock, events)
+        else:
             self._selector.modify(client.sock, events)
-            client.events = events
+        client.events = events
 
     def _look_for_overdue(self, now: float) -> None:
         for client in list(self._clients.values()):
@@ -439,6 +459,11 @@ class LocalServer:
                     self._forget_pings(client, request)
                     client.unread += encode_end(request)
                     self._serve(client, 0)
+            if client.sock.fileno() < 0:
+                continue
+            if not client.events and _is_gone(client.sock):
+                self._drop(client)
+                continue
             stuck = client.unread or client.received
             if not client.rounds and now >= client.heard_at + (PATIENCE_S if stuck else IDLE_S):
                 if stuck:
@@ -454,20 +479,22 @@ class LocalServer:
         if self._clients.pop(client.sock.fileno(), None) is None:
             return
         self._forget_pings(client)
-        self._selector.unregister(client.sock)
+        if client.events:
+            self._selector.unregister(client.sock)
         client.sock.close()
 
 
-def _user(sock: socket.socket) -> int:
-    credentials = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    return int(_CREDENTIALS.unpack(credentials)[1])
+def _is_gone(sock: socket.socket) -> bool:
+    """Whether the other end is closed, and not only its way to us."""
+    poll = select.poll()
+    poll.register(sock, 0)
+    return bool(poll.poll(0))
 
 
-def _groups(sock: socket.socket) -> set[int]:
-    """The groups of who connected, as they were then."""
-    own = int(_CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[2])
+def _group() -> int | None:
+    """The group whose members may ask; None: there is none, or the sidecar may not give a socket to it."""
     try:
-        packed = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _MAX_GROUPS_BYTES)
-    except OSError:  # before Linux 4.13, or more groups than anybody has
-        return {own}
-    return {own, *(group for (group,) in struct.iter_unpack("I", packed))}
+        group = grp.getgrnam(GROUP).gr_gid
+    except KeyError:
+        return None
+    return group if os.geteuid() == 0 or group in {os.getegid(), *os.getgroups()} else None

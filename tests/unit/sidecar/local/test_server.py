@@ -10,61 +10,22 @@ import socket
 import stat
 import subprocess
 import sys
-import threading
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import InterfaceId, InterfaceName, NodeName
-from sidecar.core.path_id import PathId
-from sidecar.core.pinging import Pong
 from sidecar.local import server as server_module
 from sidecar.local.client import LocalClient, LocalError
-from sidecar.local.server import (
-    MAX_CONNECTIONS,
-    MAX_OF_A_USER,
-    MAX_PINGS_OUT,
-    STATES_AT_ONCE,
-    LocalServer,
-    LocalSocketError,
-)
+from sidecar.local.entrance import for_group
+from sidecar.local.server import MAX_OWN, MAX_PINGS_OUT, STATES, LocalServer, LocalSocketError
+from tests.unit.sidecar.local.world import NOBODY, PATIENCE_S, ROOT, Source, raw, reachable, wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 pytestmark = pytest.mark.audit("ops-14")
-
-PATIENCE_S = 20.0
-NOBODY = 65534
-ROOT = Path(__file__).parents[4]
-
-
-class Source:
-    """Answers pings itself, unless it is `mute`."""
-
-    def __init__(self) -> None:
-        self.server: LocalServer | None = None
-        self.mute = False
-        self.parts = 3
-        self.threads: set[str] = set()
-
-    def state(self) -> Iterator[tuple[str, Any]]:
-        self.threads.add(threading.current_thread().name)
-        yield "node", {"name": "robot-1"}
-        for number in range(self.parts):
-            yield "paths", [{"number": number, "filling": "x" * 100}]
-
-    def paths_to(self, peer: str, interface: str | None) -> list[PathId]:
-        over = ["wlan0", "wwan0"] if interface is None else [interface]
-        known = peer == "cloud-1"
-        return [PathId(InterfaceName(name), NodeName(peer), InterfaceId(0)) for name in over] if known else []
-
-    def ping(self, path: PathId, number: int, size: int) -> None:
-        assert self.server is not None
-        if not self.mute:
-            self.server.on_pong(Pong(number, path, 0.012))
 
 
 @pytest.fixture
@@ -83,26 +44,12 @@ def server(tmp_path: Path, source: Source) -> Iterator[LocalServer]:
     assert not server.path.exists()
 
 
-def raw(server: LocalServer) -> socket.socket:
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    sock.settimeout(PATIENCE_S)
-    sock.connect(str(server.path))
-    return sock
-
-
-def wait_until(what: Any) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not what():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def test_the_state_comes_in_parts(server: LocalServer, source: Source) -> None:
     source.parts = 500
     with LocalClient(server.path) as client:
         state = client.state()
     assert state["node"] == {"name": "robot-1"}
-    assert [path["number"] for path in state["paths"]] == list(range(500))
+    assert [path["remote"] for path in state["paths"]] == list(range(500))
     assert source.threads == {"plr-local"}
 
 
@@ -131,13 +78,8 @@ def test_a_ping_to_nobody_is_an_error(server: LocalServer) -> None:
 
 
 def test_only_owner_root_and_group_may_open_it(server: LocalServer) -> None:
-    mode = stat.S_IMODE(server.path.stat().st_mode)
-    assert mode == (0o660 if server._group is not None else 0o600)
-
-
-def reachable(folder: Path) -> list[Path]:
-    """The folders of pytest that others may not enter, as many as there are on the way."""
-    return [one for one in (folder, *folder.parents) if one.name.startswith(("pytest-", "popen-", "test_"))]
+    assert stat.S_IMODE(server.path.stat().st_mode) == 0o600
+    assert for_group(server.path).exists() is (server._group is not None)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="becoming another user takes root")
@@ -173,7 +115,7 @@ def test_a_member_of_the_group_may_ask_and_others_may_not(
     server = LocalServer(tmp_path / "sidecar.sock", source)
     server.open()
     try:
-        status = server.path.stat()
+        status = for_group(server.path).stat()
         assert (stat.S_IMODE(status.st_mode), status.st_gid) == (0o660, group.gr_gid)
         for groups, allowed in (([group.gr_gid], True), ([], False)):
             script = f"""
@@ -244,8 +186,7 @@ def test_who_does_not_read_costs_a_buffer_and_is_let_go(
         assert client.state()["node"]
 
 
-def test_a_thousand_connections_leave_room_for_root_and_none_stays(server: LocalServer) -> None:
-    """All are this user's, so that (without being root) they are held to its share."""
+def test_of_a_thousand_connections_few_are_taken_and_none_stays(server: LocalServer) -> None:
     socks: list[socket.socket] = []
     try:
         for _ in range(1000):
@@ -254,9 +195,7 @@ def test_a_thousand_connections_leave_room_for_root_and_none_stays(server: Local
             with contextlib.suppress(BlockingIOError):
                 sock.connect(str(server.path))
             socks.append(sock)
-        most = MAX_CONNECTIONS if os.geteuid() == 0 else MAX_OF_A_USER
-        wait_until(lambda: len(server._clients) == most)
-        assert len(server._clients) <= MAX_CONNECTIONS
+        wait_until(lambda: len(server._clients) == MAX_OWN)
     finally:
         for sock in socks:
             sock.close()
@@ -272,10 +211,43 @@ def test_a_thousand_connections_leave_room_for_root_and_none_stays(server: Local
             time.sleep(0.1)
 
 
+@pytest.mark.parametrize("end", [b"\n", b""])
+@pytest.mark.parametrize("ask", ["state", "ping"])
+def test_who_has_nothing_more_to_ask_is_answered_all_the_same(
+    server: LocalServer, source: Source, ask: str, end: bytes
+) -> None:
+    """As `echo ... | nc -N -U` and socat do."""
+    source.parts = 300
+    with raw(server) as half:
+        half.sendall(json.dumps({"id": 7, "ask": ask, "peer": "cloud-1", "size": 64}).encode() + end)
+        half.shutdown(socket.SHUT_WR)
+        answer = b""
+        while data := half.recv(65_536):
+            answer += data
+    lines = [json.loads(line) for line in answer.splitlines()]
+    assert lines[-1] == {"id": 7, "end": True}
+    assert len(lines) == (302 if ask == "state" else 4)
+    wait_until(lambda: not server._clients)
+
+
+def test_who_waits_for_pongs_and_goes_is_let_go(
+    server: LocalServer, source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_module, "LOOK_S", 0.05)
+    source.mute = True
+    with raw(server) as half:
+        half.sendall(b'{"id":1,"ask":"ping","peer":"cloud-1","size":64}\n')
+        half.shutdown(socket.SHUT_WR)
+        wait_until(lambda: server._clients and not any(client.events for client in server._clients.values()))
+        assert len(server._out) == 2
+    wait_until(lambda: not server._clients)
+    assert not server._out
+
+
 def test_too_many_requests_are_refused(server: LocalServer) -> None:
     with raw(server) as greedy, greedy.makefile("rb") as lines:
         errors = 0
-        for number in range(int(STATES_AT_ONCE) + 2):
+        for number in range(int(STATES.owner.at_once) + 2):
             greedy.sendall(json.dumps({"id": number, "ask": "state"}).encode() + b"\n")
             while not (line := json.loads(lines.readline())).get("end"):
                 if "error" in line:
