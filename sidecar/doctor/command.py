@@ -18,6 +18,7 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+from protos.log_lines import escaped
 from sidecar.doctor.examination import examine
 from sidecar.doctor.finding import Level
 from sidecar.doctor.options import parser_of, where_of
@@ -50,15 +51,10 @@ def as_text(findings: Iterable[Finding]) -> str:
     lines = []
     for one in findings:
         remedy = f"; do: {one.remedy}" if one.remedy else ""
-        lines.append(f"{one.level.value:<4}  {one.check:<{width}}  {_one_line(one.text + remedy)}")
+        lines.append(f"{one.level.value:<4}  {one.check:<{width}}  {escaped(one.text + remedy)}")
     counts = Counter(one.level for one in findings)
     lines.append(f"{counts[Level.FAIL]} failures, {counts[Level.WARN]} warnings, {counts[Level.OK]} ok")
     return "\n".join(lines) + "\n"
-
-
-def _one_line(text: str) -> str:
-    """What others wrote (a name, an error) may hold anything."""
-    return "".join(character if character.isprintable() else " " for character in text)
 
 
 def as_json(seen: Examination) -> str:

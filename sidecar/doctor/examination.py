@@ -20,7 +20,8 @@ from sidecar.core.rules import Rules
 from sidecar.doctor import host, node_checks, running_checks
 from sidecar.doctor.finding import fail, ok, warn
 from sidecar.doctor.running_checks import Pinged
-from sidecar.local.client import LocalClient, LocalError
+from sidecar.local.client import LocalBusyError, LocalClient, LocalError, LocalRefusedError
+from sidecar.local.protocol import MAX_REQUESTS
 from sidecar.net.interfaces import choose, list_interfaces
 from sidecar.ros import environment
 from sidecar.ros.errors import RosBridgeError
@@ -96,13 +97,25 @@ def _as_written(path: Path) -> tuple[str | None, Path]:
 
 def connect(where: Where, config: SidecarConfig | None) -> LocalClient:
     """Return a connection to the running sidecar; raises LocalError, which says why there is none."""
-    said = []
+    said: list[LocalError] = []
     for path in sockets(where, config):
         try:
-            return LocalClient(path)
+            return LocalClient(path, _owners(where.config))
         except LocalError as error:
-            said.append(str(error))
-    raise LocalError(" and ".join(said) or "local_socket is null in the configuration")
+            said.append(error)
+    for kind in (LocalBusyError, LocalRefusedError):
+        for one in said:
+            if isinstance(one, kind):
+                raise one
+    raise LocalError(" and ".join(map(str, said)) or "local_socket is null in the configuration")
+
+
+def _owners(config: Path) -> frozenset[int]:
+    """Whose sidecar it may be: who wrote the configuration says what is asked anyway."""
+    try:
+        return frozenset({config.stat().st_uid})
+    except (OSError, ValueError):
+        return frozenset()
 
 
 def read_config(where: Where, told: Mapping[str, Any] | None = None) -> SidecarConfig:
@@ -171,8 +184,11 @@ def _wrong(problem: ConfigError) -> Finding:
 
 
 def _not_running(error: LocalError, where: Where) -> Finding:
-    if "may not ask" in str(error):
+    if isinstance(error, LocalRefusedError):
         return fail("sidecar", f"not asked: {error}", "sudo plr doctor; or: usermod -aG plr $USER, and log in again")
+    if isinstance(error, LocalBusyError):
+        text = f"no answer: {error}; what follows is seen without it"
+        return fail("sidecar", text, "try again; who asks so much: sudo ss -xp | grep sidecar.sock")
     remedy = "systemctl start plr-sidecar, and see: journalctl -u plr-sidecar -n 20"
     if where.config != DEFAULT_CONFIG:
         remedy = f"plr-sidecar --config {where.config}"
@@ -291,28 +307,31 @@ def _ping_all(client: LocalClient, state: dict[str, Any]) -> dict[PathKey, Pinge
     chosen: Counter[str] = Counter()
     pings: dict[PathKey, Pinged] = {}
     peers: dict[str, None] = {}
-    for path in state.get("paths") or ():
-        if path.get("state") != "down" and chosen[path["interface"]] < MAX_PATHS_OF_AN_INTERFACE:
+    for path in state["paths"]:
+        if path["state"] != "down" and chosen[path["interface"]] < MAX_PATHS_OF_AN_INTERFACE:
             chosen[path["interface"]] += 1
             peers[path["peer"]] = None
-            pings[path["interface"], path["peer"], path["remote"]] = Pinged(sent=PINGS)
+            pings[path["interface"], path["peer"], path["remote"]] = Pinged()
     try:
         asked: dict[int, str] = {}
         for turn in range(PINGS):
             for peer in peers:
+                # It answers so many requests at once, and may take its time over some.
+                _listen(client, asked, pings, PING_PATIENCE_S, until=MAX_REQUESTS - 1)
                 asked[client.ping(peer, None, PING_BYTES)] = peer
             last = turn == PINGS - 1
-            _listen(client, asked, pings, PING_PATIENCE_S if last else PING_EVERY_S, until_answered=last)
+            _listen(client, asked, pings, PING_PATIENCE_S if last else PING_EVERY_S, until=0 if last else -1)
     except LocalError:
         pass  # what was answered until then is told
     return pings
 
 
 def _listen(
-    client: LocalClient, asked: dict[int, str], pings: dict[PathKey, Pinged], patience_s: float, *, until_answered: bool
+    client: LocalClient, asked: dict[int, str], pings: dict[PathKey, Pinged], patience_s: float, *, until: int
 ) -> None:
+    """Take what is answered, until no more than `until` requests are out."""
     end = time.monotonic() + patience_s
-    while asked if until_answered else True:
+    while len(asked) > until:
         line = client.next_line(end - time.monotonic())
         if line is None:
             return
@@ -321,12 +340,11 @@ def _listen(
             continue
         if line.get("end") or "error" in line:
             del asked[line["id"]]
-            continue
-        if line.get("part") != "pong":
-            continue
-        pong = line["value"]
-        pinged = pings.setdefault((pong["interface"], peer, pong["remote"]), Pinged())
-        if pong["problem"]:
-            pinged.problem = pong["problem"]
-        else:
-            pinged.rtts_s.append(pong["rtt_s"])
+        elif line.get("part") == "pinged":
+            for one in line["value"]:
+                if (pinged := pings.get((one["interface"], peer, one["remote"]))) is not None:
+                    pinged.sent += 1
+        elif line.get("part") == "pong":
+            pong = line["value"]
+            if (pinged := pings.get((pong["interface"], peer, pong["remote"]))) is not None:
+                pinged.take(pong["rtt_s"], pong["problem"])

@@ -22,12 +22,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from protos.errors import ConfigError
+from protos.log_lines import escaped
 from sidecar.core.pinging import LEAST_BYTES
 from sidecar.core.pmtu import MAX_BYTES
 from sidecar.doctor.examination import connect, read_config
 from sidecar.doctor.finding import share
 from sidecar.doctor.options import number, parser_of, where_of, whole
-from sidecar.local.client import LocalError
+from sidecar.local.client import LocalError, refusal
 
 if TYPE_CHECKING:
     import argparse
@@ -42,21 +43,34 @@ EXIT_NO_ANSWER = 1
 LEAST_INTERVAL_S = 0.1
 """The sidecar sends 20 pings a second over an interface, at most."""
 DEFAULT_BYTES = 64
+MAX_PATHS = 4096
+"""To one peer: more are not counted."""
+MAX_WAITING = 128
+"""Turns of which answers are waited for."""
 
 
 @dataclass(slots=True)
 class PathTally:
     """What came of the pings over one path."""
 
-    sent: int = 0
+    asked: int = 0
     rtts_s: list[float] = field(default_factory=list)
     unsent: int = 0
-    """Of the sent: those that did not leave, for a reason that was told."""
+    """Of those asked for: those that did not leave, for a reason that was told. They are not lost."""
+    waiting: set[int] = field(default_factory=set)
+    """Turns that nothing was told of yet, the last ones."""
+
+    @property
+    def sent(self) -> int:
+        """How many left, as far as is known."""
+        return self.asked - self.unsent
 
     def line(self) -> str:
         """Return the statistics in one line."""
         lost = 1.0 - len(self.rtts_s) / self.sent if self.sent else 0.0
         text = f"{self.sent} sent, {len(self.rtts_s)} answered, {share(max(0.0, lost))} lost"
+        if self.unsent:
+            text += f", {self.unsent} not sent"
         if self.rtts_s:
             ordered = sorted(self.rtts_s)
             figures = (ordered[0], sum(ordered) / len(ordered), quantile(ordered, 0.99), ordered[-1])
@@ -82,6 +96,8 @@ class Pinger:
         self._interface = interface
         self._size = size
         self._say = say
+        self.refused = 0
+        """Requests that the sidecar did not take: it had others to answer."""
         self._rounds: dict[int, int] = {}
         """Turn of each request that is out."""
 
@@ -109,20 +125,32 @@ class Pinger:
         turn = self._rounds.get(request, 0)
         if "error" in line:
             self._rounds.pop(request, None)
-            if not self.tallies or not turn:
-                raise LocalError(str(line["error"]))
+            if not turn or not (self.tallies or line.get("busy")):
+                raise refusal(line)
+            self.refused += 1
             self._say(f"seq={turn}: {line['error']}")
         elif line.get("end"):
             self._rounds.pop(request, None)
         elif line.get("part") == "pinged":
-            for one in line["value"]:
-                self.tallies.setdefault((one["interface"], one["remote"]), PathTally()).sent += 1
+            for one in line["value"][:MAX_PATHS]:
+                self._pinged(turn, (one["interface"], one["remote"]))
         elif line.get("part") == "pong" and turn:
             self._pong(turn, line["value"])
 
+    def _pinged(self, turn: int, key: tuple[str, int]) -> None:
+        if len(self.tallies) >= MAX_PATHS and key not in self.tallies:
+            return
+        tally = self.tallies.setdefault(key, PathTally())
+        if turn and turn not in tally.waiting:
+            tally.asked += 1
+            tally.waiting = {one for one in tally.waiting if one > turn - MAX_WAITING} | {turn}
+
     def _pong(self, turn: int, pong: dict[str, Any]) -> None:
         key = pong["interface"], pong["remote"]
-        tally = self.tallies.setdefault(key, PathTally())
+        tally = self.tallies.get(key)
+        if tally is None or turn not in tally.waiting:
+            return
+        tally.waiting.discard(turn)
         name = self.name(*key)
         if pong["problem"]:
             tally.unsent += 1
@@ -176,7 +204,7 @@ def _connect(where: Where) -> LocalClient:
 def _ping(client: LocalClient, options: argparse.Namespace) -> int:
     def say(text: str) -> None:
         if not options.json:
-            sys.stdout.write(text + "\n")
+            sys.stdout.write(escaped(text) + "\n")
             sys.stdout.flush()
 
     pinger = Pinger(client, options.peer, options.interface, options.size, say)
@@ -188,6 +216,8 @@ def _ping(client: LocalClient, options: argparse.Namespace) -> int:
         sys.stdout.write(json.dumps(_figures(pinger), indent=2) + "\n")
     for key, tally in sorted(pinger.tallies.items()):
         say(f"{pinger.name(*key)}: {tally.line()}")
+    if pinger.refused:
+        say(f"{pinger.refused} requests were not taken: the sidecar was busy with others")
     return EXIT_OK if any(tally.rtts_s for tally in pinger.tallies.values()) else EXIT_NO_ANSWER
 
 

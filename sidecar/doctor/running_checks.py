@@ -41,7 +41,17 @@ class Pinged:
 
     rtts_s: list[float] = field(default_factory=list)
     sent: int = 0
+    """Those that left, as far as is known."""
     problem: str = ""
+    """Why the last one did not leave."""
+
+    def take(self, rtt_s: float, problem: str) -> None:
+        """Note an answer; with a problem: that one of them did not leave, and so is not lost."""
+        if problem:
+            self.problem = problem
+            self.sent -= 1
+        elif len(self.rtts_s) < self.sent:
+            self.rtts_s.append(rtt_s)
 
 
 PathKey = tuple[str, str, int]
@@ -234,10 +244,12 @@ def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
     text = f"{name}: {path['state']}{since}, {measured}, {share(lost)} lost"
     if path["rests"]:
         text += f", at rest (last heard {duration(path['proven_s'])} ago)"
-    if pinged is not None and pinged.sent:
+    if pinged is not None and pinged.sent <= 0 and pinged.problem:
+        text += f"; not pinged: {pinged.problem}"
+    elif pinged is not None and pinged.sent > 0:
         if not pinged.rtts_s:
-            why = pinged.problem or "not answered"
-            return warn("path", f"{text}; {pinged.sent} pings: {why}", f"try again: plr ping {path['peer']}")
+            text += f"; {pinged.sent} pings: not answered"
+            return warn("path", text, f"try again: plr ping {path['peer']}")
         slowest, fastest = milliseconds(max(pinged.rtts_s)), milliseconds(min(pinged.rtts_s))
         text += f"; ping {fastest} to {slowest}, {pinged.sent - len(pinged.rtts_s)} of {pinged.sent} lost"
     if path["state"] != "up":

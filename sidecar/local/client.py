@@ -1,43 +1,75 @@
-"""Asks a running sidecar over its local socket."""
+"""Asks a running sidecar over its local socket, and believes nobody else.
+
+What listens there may be anybody's, in a folder that others may write: whose it is, is the kernel's to say, and what it
+says is read within bounds and checked.
+"""
 
 from __future__ import annotations
 
 import json
+import os
+import pwd
 import socket
+import struct
 import time
 from typing import TYPE_CHECKING, Any
+
+from protos.errors import DecodeError
+from protos.log_lines import escaped
+from sidecar.local.answers import decode_line
+from sidecar.local.entrance import MAX_SOCKET_BYTES, for_group
+from sidecar.local.peer import user_of
 
 if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
+    from sidecar.local.answers import Line
+
 CONNECT_S = 3.0
 STATE_S = 10.0
 """How long the answer to how everything is may take; thousands of paths come in a second."""
 MAX_LINE_BYTES = 1 << 20
-_TIMES = frozenset({"paths", "interfaces", "mapped", "pong"})
+MAX_STATE_BYTES = 8 << 20
+"""Of the whole answer: some 20,000 paths."""
+ACCOUNT = "plr"
+"""The unit's user."""
+_REPEATED = frozenset({"paths", "interfaces", "mapped"})
 """Parts that come repeatedly."""
-
-Line = dict[str, Any]
+_BUSY = "the sidecar is busy with others: try again"
+_STRANGER = "what answers at the socket is no sidecar"
+_TIMEVAL = struct.Struct("ll")
 
 
 class LocalError(Exception):
-    """There is no answer; the text is one line."""
+    """There is no answer; the text is one line, fit for a terminal."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(escaped(text))
+
+
+class LocalBusyError(LocalError):
+    """The sidecar runs, and answers others."""
+
+
+class LocalRefusedError(LocalError):
+    """This user may not ask."""
 
 
 class LocalClient:
-    """A connection to the socket at `path`; raises LocalError when there is none."""
+    """A connection to the sidecar whose socket is at `path`; raises LocalError when there is none.
 
-    def __init__(self, path: Path) -> None:
+    `owners`: users whose sidecar it may be, beside root, the unit's and this one.
+    """
+
+    def __init__(self, path: Path, owners: frozenset[int] = frozenset()) -> None:
         self._received = bytearray()
         self._id = 0
-        self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        self._sock.settimeout(CONNECT_S)
-        try:
-            self._sock.connect(str(path))
-        except OSError as error:
+        self._sock = _connect(path)
+        user = user_of(self._sock)
+        if user not in {0, os.geteuid(), *_unit_user(), *owners}:
             self._sock.close()
-            raise LocalError(_why(path, error)) from error
+            raise LocalError(f"{path}: user {user} listens there, who is neither root nor {ACCOUNT} nor this user")
 
     def __enter__(self) -> LocalClient:
         return self
@@ -53,19 +85,25 @@ class LocalClient:
         """Return the parts of how everything is, those that come repeatedly as one list."""
         mine = self._ask({"ask": "state"})
         end = time.monotonic() + STATE_S
-        state: dict[str, Any] = {name: [] for name in _TIMES}
+        state: dict[str, Any] = {name: [] for name in _REPEATED}
+        size = 0
         while True:
-            line = self.next_line(end - time.monotonic())
+            line, line_bytes = self._next(end - time.monotonic())
+            size += line_bytes
+            if size > MAX_STATE_BYTES:
+                raise LocalError(f"{_STRANGER}: more than {MAX_STATE_BYTES} bytes")
+            if not line_bytes:
+                raise LocalBusyError("the sidecar does not answer: it is stopped, or very busy")
             if line is None:
-                raise LocalError("the sidecar does not answer")
+                continue
             if "error" in line:
-                raise LocalError(str(line["error"]))
+                raise refusal(line)
             if line.get("id") != mine:
                 continue
             if line.get("end"):
                 return state
             part, value = line.get("part"), line.get("value")
-            if part not in _TIMES:
+            if part not in _REPEATED:
                 state[str(part)] = value
             elif isinstance(value, list):
                 state[part] += value
@@ -80,23 +118,35 @@ class LocalClient:
         """Return the next line; None: none came in time."""
         end = time.monotonic() + timeout_s
         while True:
-            position = self._received.find(b"\n")
+            line, line_bytes = self._next(end - time.monotonic())
+            if line is not None or not line_bytes:
+                return line
+
+    def _next(self, timeout_s: float) -> tuple[Line | None, int]:
+        """Return the next line (None: nothing that is known here) and how many bytes it has (0: none came in time)."""
+        end = time.monotonic() + timeout_s
+        searched = 0
+        while True:
+            position = self._received.find(b"\n", searched)
             if position >= 0:
                 line = bytes(self._received[:position])
                 del self._received[: position + 1]
-                return _parse(line)
+                return _parse(line), position + 1
+            searched = len(self._received)
+            if searched > MAX_LINE_BYTES:
+                raise LocalError(f"{_STRANGER}: a line of more than {MAX_LINE_BYTES} bytes")
             left_s = end - time.monotonic()
-            if left_s <= 0 or len(self._received) > MAX_LINE_BYTES:
-                return None
+            if left_s <= 0:
+                return None, 0
             self._sock.settimeout(left_s)
             try:
                 data = self._sock.recv(65_536)
             except TimeoutError:
-                return None
+                return None, 0
             except OSError as error:
                 raise LocalError(f"the sidecar closed the connection: {error.strerror}") from error
             if not data:
-                raise LocalError("the sidecar closed the connection: it ended, or is busy with others")
+                raise LocalBusyError("the sidecar closed the connection: it ended, or is busy with others")
             self._received += data
 
     def _ask(self, request: dict[str, Any]) -> int:
@@ -104,26 +154,67 @@ class LocalClient:
         self._sock.settimeout(CONNECT_S)
         try:
             self._sock.sendall(json.dumps({"id": self._id, **request}).encode() + b"\n")
+        except TimeoutError:
+            raise LocalBusyError("the sidecar reads nothing: it is stopped, or very busy") from None
         except OSError as error:
             # What it said before it closed tells more.
             line = self.next_line(CONNECT_S)
-            raise LocalError(str((line or {}).get("error") or error.strerror or error)) from error
+            raise LocalError(str(error.strerror)) if line is None else refusal(line) from error
         return self._id
 
 
-def _parse(line: bytes) -> Line:
+def refusal(line: Line) -> LocalError:
+    """Return the error for a line that refuses a request."""
+    kind = LocalBusyError if line.get("busy") else LocalError
+    return kind(str(line.get("error")))
+
+
+def _parse(line: bytes) -> Line | None:
     try:
-        value = json.loads(line)
-    except ValueError as error:
-        raise LocalError("what answers at the socket is no sidecar") from error
-    if not isinstance(value, dict):
-        raise LocalError("what answers at the socket is no sidecar")
-    return value
+        return decode_line(line)
+    except DecodeError as error:
+        raise LocalError(f"{_STRANGER} of this version: {error}") from error
 
 
-def _why(path: Path, error: OSError) -> str:
+def _connect(path: Path) -> socket.socket:
+    if b"\0" in os.fsencode(path) or len(os.fsencode(for_group(path))) > MAX_SOCKET_BYTES:
+        raise LocalError(f"{path}: no path of a socket")
+    try:
+        return _connect_at(path)
+    except PermissionError:
+        pass  # for root and the sidecar's own user
+    except OSError as error:
+        raise _why(path, error) from error
+    try:
+        return _connect_at(for_group(path))
+    except OSError as error:
+        raise _why(path, error) from error
+
+
+def _connect_at(path: Path) -> socket.socket:
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+    try:
+        # With this, and no time limit of Python's own, the kernel waits for a place in a queue that is full.
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(int(CONNECT_S), 0))
+        sock.connect(str(path))
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def _why(path: Path, error: OSError) -> LocalError:
     if isinstance(error, PermissionError):
-        return f"{path}: this user may not ask the sidecar: be root, or a member of the group plr"
+        return LocalRefusedError(f"{path}: this user may not ask the sidecar: be root, or a member of the group plr")
     if isinstance(error, FileNotFoundError | ConnectionRefusedError):
-        return f"nothing listens at {path}"
-    return f"{path}: {error.strerror or error}"
+        return LocalError(f"nothing listens at {path}")
+    if isinstance(error, BlockingIOError):
+        return LocalBusyError(f"{path}: {_BUSY}")
+    return LocalError(f"{path}: {error.strerror or error}")
+
+
+def _unit_user() -> set[int]:
+    try:
+        return {pwd.getpwnam(ACCOUNT).pw_uid}
+    except KeyError:
+        return set()

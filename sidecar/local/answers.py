@@ -1,0 +1,224 @@
+"""What a sidecar's answers consist of, as whoever asks checks them: what does not fit was written by something else.
+
+Keys may be missing in the answer of another version, but for those that say what an entry is about. Keys and parts that
+are not known here are left out.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from protos.config_file import key_path
+from protos.errors import DecodeError
+
+Text = Annotated[str, Field(max_length=4096)]
+Whole = Annotated[int, Field(ge=-(1 << 63), le=(1 << 63) - 1)]
+Address = Annotated[list[Text | Whole], Field(min_length=2, max_length=2)]
+"""Host and port."""
+Line = dict[str, Any]
+"""The keys of `_Line` that are there."""
+
+
+class _Entry(BaseModel):
+    """What has a default may be missing, and is then missing here too."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False, frozen=True)
+
+
+class _Line(_Entry):
+    """The frame of all of them."""
+
+    id: Whole | None = None
+    part: Text = ""
+    value: Any = None
+    """What that part is made of."""
+    end: bool = False
+    error: Text = ""
+    busy: bool = False
+
+
+class _Node(_Entry):
+    protocol: Whole = 0
+    name: Text = ""
+    role: Text = ""
+    version: Text = ""
+    python: Text = ""
+    pid: Whole = 0
+    up_s: float = 0.0
+    insecure: bool = False
+    stun: bool = True
+    environment: dict[Text, Text] = {}
+
+
+class _Clock(_Entry):
+    floor: float = 0.0
+
+
+class _TermProblem(_Entry):
+    in_force: bool
+    text: Text
+
+
+class _RevocationList(_Entry):
+    number: Whole
+    signed_at: float
+
+
+class _Certificate(_Entry):
+    name: Text
+    role: Text
+    not_after: float
+    directory: Text = ""
+    serial: Text = ""
+    not_before: float = 0.0
+    judged_at: float = 0.0
+    problem: _TermProblem | None = None
+    revocation_lists: list[_RevocationList] = []
+
+
+class _Stun(_Entry):
+    family: Whole
+    mapping: Address | None = None
+    server: Address | None = None
+    answered_s: float | None = None
+    changes: Whole = 0
+    problem: Text | None = None
+
+
+class _Interface(_Entry):
+    name: Text
+    suspended: bool = False
+    addresses: list[Text] = []
+    port: Whole = 0
+    mtu: Whole = 0
+    bound_to: Text = ""
+    hangs: Whole = 0
+    stun: list[_Stun] = []
+
+
+class _Control(_Entry):
+    names: list[Text] = []
+    connected: bool = False
+    since_s: float = 0.0
+    way: Text | None = None
+    interface: Text | None = None
+    last_failure: Text | None = None
+    retry_in_s: float | None = None
+
+
+class _Services(_Entry):
+    carried: dict[Text, Text] = {}
+    left_alone: dict[Text, list[Text]] = {}
+    missing_types: dict[Text, Text] = {}
+    unmet: list[Text] = []
+    configured: list[Text] = []
+
+
+class _Mapping(_Entry):
+    version: Whole = 0
+    source: Text | None = None
+    age_s: float | None = None
+
+
+class _Pair(_Entry):
+    interface: Text
+    server: Text
+
+
+class _Mapped(_Entry):
+    service: Text
+    pairs: list[_Pair]
+    predicted_miss: float | None = None
+    reason: Text = ""
+    deadline_s: float | None = None
+
+
+class _RefusedPeer(_Entry):
+    name: Text
+    why: Text
+
+
+class _Gone(_Entry):
+    interface: Text
+    peer: Text
+    since_s: float
+    reason: Text
+
+
+class _Path(_Entry):
+    interface: Text
+    peer: Text
+    remote: Whole
+    state: Text
+    address: Address | None = None
+    candidates: Whole = 0
+    since_s: float | None = None
+    reason: Text | None = None
+    rtt_s: float | None = None
+    sent: Whole = 0
+    lost: Whole = 0
+    max_datagram: Whole = 0
+    proven_s: float = 0.0
+    rests: bool = False
+
+
+class _PathName(_Entry):
+    interface: Text
+    remote: Whole
+
+
+class _Pong(_Entry):
+    interface: Text
+    remote: Whole
+    rtt_s: Annotated[float, Field(ge=0)]
+    problem: Text
+
+
+_KINDS: dict[str, Any] = {
+    "node": _Node,
+    "clock": _Clock,
+    "certificate": _Certificate,
+    "interfaces": _Interface,
+    "idle": list[Text],
+    "control": _Control,
+    "services": _Services,
+    "mapping": _Mapping,
+    "mapped": list[_Mapped],
+    "refused_peers": list[_RefusedPeer],
+    "gone": list[_Gone],
+    "paths": list[_Path],
+    "pinged": list[_PathName],
+    "pong": _Pong,
+}
+
+
+def decode_line(line: bytes) -> Line | None:
+    """Return what a line says; None: of a part that is not known here. Raises DecodeError."""
+    try:
+        said: Line = _checked("", json.loads(line))
+        part = said.get("part", "")
+        if not part:
+            return said
+        if part not in _KINDS:
+            return None
+        return {**said, "value": _checked(part, said.get("value"))}
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        raise DecodeError(f"{key_path(first['loc']) or 'a line'}: {first['msg']}") from None
+    except (ValueError, RecursionError) as error:
+        raise DecodeError("a line is no JSON") from error
+
+
+def _checked(part: str, value: Any) -> Any:
+    adapter = _adapter(part)
+    return adapter.dump_python(adapter.validate_python(value), exclude_unset=True)
+
+
+@cache
+def _adapter(part: str) -> TypeAdapter[Any]:
+    """What checks the value of a part; of the frame itself, if it is empty."""
+    return TypeAdapter(_KINDS[part] if part else _Line)
