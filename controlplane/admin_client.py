@@ -14,6 +14,7 @@ from protos.errors import ConfigError, DecodeError
 from protos.host_port import check_remote
 from protos.identity import CONTROL_PLANE_DNS
 from protos.plr.v1 import admin_pb2_grpc
+from protos.printable import escaped
 from protos.tls_files import load_tls_files
 
 if TYPE_CHECKING:
@@ -39,10 +40,10 @@ _OPTIONS = (
 
 
 class AskError(Exception):
-    """There is no answer; the text is one line, and `code` the exit code for it."""
+    """There is no answer; the text is one line, fit for a terminal, and `code` the exit code for it."""
 
     def __init__(self, text: str, code: int) -> None:
-        super().__init__(text)
+        super().__init__(escaped(text))
         self.code = code
 
 

@@ -32,13 +32,16 @@ def check_security(tls_dir: Path | None, insecure: bool) -> None:
         raise ValueError("insecure: expected without tls_dir: it is one or the other")
 
 
-def _check_absolute(path: Path) -> Path:
+def check_absolute(path: Path) -> Path:
+    """Return `path`; raises ValueError when it is relative, or no path at all."""
     if not path.is_absolute():
         raise ValueError(f"expected an absolute path, got '{path}'")
+    if "\0" in str(path):
+        raise ValueError(f"expected a path, got one with a NUL: '{path}'")
     return path
 
 
-AbsolutePath = Annotated[Path, AfterValidator(_check_absolute)]
+AbsolutePath = Annotated[Path, AfterValidator(check_absolute)]
 """A folder: relative to what, a service would not know."""
 
 TlsDir = AbsolutePath

@@ -1,6 +1,6 @@
 """Strict YAML: no key written twice, and every problem as one line that names file, key and expectation.
 
-Both planes read their configuration with it. `read_text` is the only thing in this package that touches a file.
+Both planes read their configuration with it. What it costs is bounded: aliases do not multiply, no number is endless.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from protos.errors import ConfigError
+from protos.regular_file import open_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -23,6 +24,12 @@ Model = TypeVar("Model", bound=BaseModel)
 
 MAX_CONFIG_BYTES = 1 << 20
 """A configuration is written by hand; a larger file is some other file."""
+
+MAX_VALUES = 100_000
+"""In one file, those that an alias repeats counted each time."""
+
+_MAX_WHOLE = (1 << 63) - 1
+_MAX_NUMBER_CHARACTERS = 64
 
 _SHOWN_INPUT_CHARACTERS = 60
 
@@ -39,7 +46,25 @@ _EXPECTED = {
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader that refuses a key written twice, where YAML would silently keep the last one."""
+    """SafeLoader that refuses too much, and a key written twice, where YAML would silently keep the last one."""
+
+    def get_single_data(self) -> Any:
+        node = self.get_single_node()
+        if node is None:
+            return None
+        _count(node, {})
+        return self.construct_document(node)
+
+    def whole_number(self, node: yaml.ScalarNode) -> int:
+        _refuse_long(node)
+        value = self.construct_yaml_int(node)
+        if abs(value) > _MAX_WHOLE:
+            raise _refused("no number may have more than 64 bits", node)
+        return value
+
+    def number(self, node: yaml.ScalarNode) -> float:
+        _refuse_long(node)
+        return self.construct_yaml_float(node)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
@@ -55,10 +80,46 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.whole_number)
+_StrictLoader.add_constructor("tag:yaml.org,2002:float", _StrictLoader.number)
+
+
+def _count(node: yaml.Node, known: dict[int, int | None]) -> int:
+    """Return how many values a node stands for, aliases followed; raises ConstructorError for too many, or a circle.
+
+    `known`: those counted before, by their identity, None for one that is being counted.
+    """
+    if id(node) in known:
+        before = known[id(node)]
+        if before is None:
+            raise _refused("no alias may stand in what it names", node)
+        return before
+    known[id(node)] = None
+    count = 1
+    if isinstance(node, yaml.SequenceNode):
+        count += sum(_count(one, known) for one in node.value)
+    elif isinstance(node, yaml.MappingNode):
+        count += sum(_count(key, known) + _count(value, known) for key, value in node.value)
+    if count > MAX_VALUES:
+        raise _refused(f"no more than {MAX_VALUES} values, where an alias counts as what it names", node)
+    known[id(node)] = count
+    return count
+
+
+def _refuse_long(node: yaml.ScalarNode) -> None:
+    # A long one takes long: PyYAML multiplies the parts of 1:59:59 one by one, and Python refuses to print it.
+    if len(node.value) > _MAX_NUMBER_CHARACTERS:
+        raise _refused("no number may have more than 64 bits", node)
+
+
+def _refused(rule: str, node: yaml.Node) -> yaml.constructor.ConstructorError:
+    return yaml.constructor.ConstructorError(None, None, rule, node.start_mark)
+
+
 def read_text(path: Path) -> str:
     """Return the file's text; raises ConfigError."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             data = file.read(MAX_CONFIG_BYTES + 1)
     except OSError as error:
         raise ConfigError(str(path), "", f"cannot be read: {error.strerror or error}") from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from protos.printable import escaped
+
 
 class DecodeError(ValueError):
     """Bytes or messages from the network break their format; the text tells which rule of it."""
@@ -12,10 +14,13 @@ class UnknownKindError(DecodeError):
 
 
 class ConfigError(ValueError):
-    """A configuration is refused; the text is one line that names the file, the key and what was expected."""
+    """A configuration is refused; the text is one line that names the file, the key and what was expected.
+
+    It is fit for a terminal: what is not printable, in a key of the file or in a path, is escaped.
+    """
 
     def __init__(self, source: str, key: str, problem: str) -> None:
-        super().__init__(": ".join(part for part in (source, key, problem) if part))
+        super().__init__(escaped(": ".join(part for part in (source, key, problem) if part)))
         self.source = source
         self.key = key
         self.problem = problem

@@ -11,6 +11,8 @@ import os
 import time
 from typing import TYPE_CHECKING
 
+from protos.printable import escaped
+
 if TYPE_CHECKING:
     from typing import TextIO
 
@@ -69,10 +71,3 @@ class JournalFormatter(LineFormatter):
         """Return the line."""
         priority = f"<{_PRIORITIES.get(record.levelno, 5)}>"
         return priority + self._told(record).replace("\n", f"\n{priority}")
-
-
-def escaped(text: str) -> str:
-    """`text` on one line, with escapes in place of what is not printable."""
-    if text.isprintable():
-        return text
-    return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from protos.config_fields import IpAddress, ListenAddress, RemoteAddress, TlsDir, check_security, refuse_duplicates
+from protos.config_fields import (
+    AbsolutePath,
+    IpAddress,
+    ListenAddress,
+    RemoteAddress,
+    TlsDir,
+    check_absolute,
+    check_security,
+    refuse_duplicates,
+)
 from protos.config_file import key_path, parse_yaml, read_text, validate
 from protos.errors import ConfigError
 from protos.host_port import is_loopback
@@ -110,7 +119,7 @@ class SidecarConfig(Section):
     """Cloud behind a 1:1 NAT: its public addresses."""
     stun: StunConfig = StunConfig()
     """How the sidecar learns its addresses as seen from outside."""
-    state_dir: Annotated[Path, converted] = Path("/var/lib/plr")
+    state_dir: Annotated[AbsolutePath, converted] = Path("/var/lib/plr")
     """Absolute path of the folder for the identity and the last good mapping."""
     max_revocation_age_s: Annotated[int, Field(ge=60, le=365 * 86_400)] | None = None
     """Seconds: peers whose CA signed no revocation list in this time, as far as is known here, are not talked to; null:
@@ -189,9 +198,11 @@ def parse_config(text: str, source: str, identify: Callable[[Path], Identity] | 
     data = parse_yaml(text, source)
     folder = data.get("tls_dir")
     if identify is not None and isinstance(folder, str):
-        if not Path(folder).is_absolute():
+        try:
             # Before name and role are missed that stand in there.
-            raise ConfigError(source, "tls_dir", f"expected an absolute path, got '{folder}'")
+            check_absolute(Path(folder))
+        except ValueError as error:
+            raise ConfigError(source, "tls_dir", str(error)) from error
         data = _with_identity(data, identify(Path(folder)), source)
     config = validate(SidecarConfig, data, source)
     for location, problem in _cross_checks(config):
@@ -234,8 +245,6 @@ _Problem = tuple[tuple[str | int, ...], str]
 
 def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
     """Yield what single fields cannot know; a key that would have no effect is refused, not ignored."""
-    if not config.state_dir.is_absolute():
-        yield ("state_dir",), f"expected an absolute path, got '{config.state_dir}'"
     if config.max_revocation_age_s is not None and config.tls_dir is None:
         yield ("max_revocation_age_s",), "expected beside tls_dir only: nothing is checked in insecure mode"
     for index, service in enumerate(config.services):

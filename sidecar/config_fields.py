@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from typing import Annotated
 
@@ -28,7 +29,8 @@ _COPIES_WORDS = {"each": EVERY_INTERFACE, "at_most": AT_MOST_EVERY_INTERFACE}
 
 
 def _check_local_socket(text: str) -> str:
-    if text != "auto" and not (text.startswith("/") and len(text.encode()) <= _MAX_SOCKET_BYTES):
+    is_path = text.startswith("/") and "\0" not in text and len(os.fsencode(text)) <= _MAX_SOCKET_BYTES
+    if text != "auto" and not is_path:
         raise ValueError(f"expected auto, null or an absolute path of at most {_MAX_SOCKET_BYTES} bytes, got {text!r}")
     return text
 

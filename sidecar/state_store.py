@@ -10,7 +10,6 @@ import fcntl
 import logging
 import os
 import secrets
-import stat
 import threading
 import time
 from collections import Counter
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from protos.errors import DecodeError
 from protos.model import TOKEN_BYTES
+from protos.regular_file import open_regular
 from sidecar.state_file import (
     MAX_FILE_BYTES,
     ControlAddresses,
@@ -168,7 +168,8 @@ class StateStore:
     def _read(self, name: str, decode: Callable[[bytes], T]) -> T | None:
         path = self._folder / name
         try:
-            data = _read_file(path)
+            with open_regular(path) as file:
+                data = file.read(MAX_FILE_BYTES + 1)
             if len(data) > MAX_FILE_BYTES:
                 raise DecodeError(f"more than {MAX_FILE_BYTES} bytes")
             return decode(data)
@@ -203,15 +204,6 @@ class StateStore:
         except OSError as error:
             self.failures["write_failed"] += 1
             log.error("%s not written: %s; a restart will not know it", path, error)
-
-
-def _read_file(path: Path) -> bytes:
-    """Read a file, one byte more than MAX_FILE_BYTES at most; raises OSError, also for what may block."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError("it is no regular file")
-        return file.read(MAX_FILE_BYTES + 1)
 
 
 def _lock(folder: Path) -> int:

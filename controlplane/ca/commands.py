@@ -14,8 +14,8 @@ from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityEr
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
 from protos.errors import ConfigError, DecodeError
 from protos.identity import IdentityRole
-from protos.log_lines import escaped
 from protos.names import node_name, text
+from protos.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -18,7 +18,7 @@ from controlplane.ca.key_file import clear_pem
 from controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_request, fingerprint, parse_request
 from protos.errors import ConfigError, DecodeError
 from protos.identity import IdentityRole
-from protos.log_lines import escaped
+from protos.printable import escaped
 from protos.tls_files import KEY_FILE
 
 if TYPE_CHECKING:

@@ -7,9 +7,12 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from protos.regular_file import open_regular
+
 STA_UNSYNC = 0x0040
 CLOCK_KEPT_S = 16.0
 """The kernel's bound of its error grows to this where nobody keeps the clock (ntp_adjtime(3): NTP_PHASE_LIMIT)."""
+MAX_ENVIRONMENT_BYTES = 1 << 16
 CONF = Path("/proc/sys/net/ipv4/conf")
 
 
@@ -69,8 +72,9 @@ def unit_environment(config: Path) -> dict[str, str]:
     """
     environment = dict(os.environ)
     try:
-        lines = config.with_name("sidecar.env").read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
+        with open_regular(config.with_name("sidecar.env")) as file:
+            lines = file.read(MAX_ENVIRONMENT_BYTES).decode().splitlines()
+    except (OSError, ValueError):
         return environment
     for line in lines:
         key, separator, value = line.strip().partition("=")

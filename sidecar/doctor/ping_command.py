@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from protos.errors import ConfigError
-from protos.log_lines import escaped
+from protos.printable import escaped
 from sidecar.core.pinging import LEAST_BYTES
 from sidecar.core.pmtu import MAX_BYTES
 from sidecar.doctor.examination import connect, read_config

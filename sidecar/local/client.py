@@ -15,7 +15,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from protos.errors import DecodeError
-from protos.log_lines import escaped
+from protos.printable import escaped
 from sidecar.local.answers import decode_line
 from sidecar.local.entrance import MAX_SOCKET_BYTES, for_group
 from sidecar.local.peer import user_of

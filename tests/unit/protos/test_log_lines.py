@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.log_lines import JournalFormatter, LineFormatter, escaped, is_journal, line_formatter
+from protos.log_lines import JournalFormatter, LineFormatter, is_journal, line_formatter
+from protos.printable import escaped
 from sidecar.core.events import RejectReason
 from sidecar.core.messages import RejectionMessage, decode_message, encode_message
 from tests.unit.sidecar.core.builders import request_id

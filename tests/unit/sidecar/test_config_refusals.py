@@ -135,6 +135,9 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (ROBOT | {"stun": {"servers": ["s"]}}, "stun.servers[0]", "expected host:port"),
     (ROBOT | {"stun": None}, "stun", "expected keys and values, got nothing"),
     (ROBOT | {"state_dir": "plr"}, "state_dir", "absolute path, got 'plr'"),
+    (ROBOT | {"state_dir": "/a\0b"}, "state_dir", r"expected a path, got one with a NUL: '/a\x00b'"),
+    (ROBOT | {"tls_dir": "/a\0b"}, "tls_dir", r"expected a path, got one with a NUL: '/a\x00b'"),
+    (ROBOT | {"local_socket": "/a\0b"}, "local_socket", "expected auto, null or an absolute path"),
     (ROBOT | {"metrics_listen": "localhost:9464"}, "metrics_listen", "expected an IP address"),
     (ROBOT | {"log_level": "loud"}, "log_level", "expected 'debug', 'info'"),
 ]
