@@ -23,6 +23,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, load_pem_priv
 
 from protos.errors import ConfigError
 from protos.identity import CertificateError, Identity, Trust
+from protos.regular_file import open_regular
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -80,7 +81,7 @@ def load_tls_files(directory: Path) -> TlsFiles:
 def _load(directory: Path) -> TlsFiles:
     if not directory.is_dir():
         raise ConfigError(str(directory), "", "expected a folder with cert.pem, key.pem and ca.pem; see: plr ca issue")
-    _refuse_permissions(directory, directory.stat(), FORBIDDEN)
+    _refuse_shared(directory)
     ca_path, crl_path = directory / CA_FILE, directory / CRL_FILE
     ca_pem = _read(ca_path, FORBIDDEN)
     crl_pem = _read(crl_path, FORBIDDEN) if crl_path.exists() else None
@@ -142,7 +143,7 @@ def _read(path: Path, forbidden: int) -> bytes:
 def read_guarded(path: Path, forbidden: int, *, most: int = MAX_FILE_BYTES) -> bytes:
     """Return what the file holds, `most` bytes; raises ConfigError, also if it has any `forbidden` permission."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             # What was opened is checked, not what stood under the name a moment before.
             _refuse_permissions(path, os.fstat(file.fileno()), forbidden)
             data = file.read(most + 1)
@@ -175,6 +176,15 @@ def _refuse_permissions(path: Path, status: os.stat_result, forbidden: int) -> N
     if mode & forbidden:
         problem = "others may read or change it" if forbidden & _READABLE else "everybody may change it"
         raise ConfigError(str(path), "", f"{problem}; do: chmod {mode & ~forbidden:o} {path}")
+
+
+def _refuse_shared(folder: Path) -> None:
+    status = folder.stat()
+    if status.st_mode & FORBIDDEN and (status.st_mode & stat.S_ISVTX or status.st_uid not in (0, os.geteuid())):
+        # Such as /tmp, which has to stay so.
+        problem = "everybody may write there: copy what plr ca issue wrote to a folder of its own, and name that"
+        raise ConfigError(str(folder), "", problem)
+    _refuse_permissions(folder, status, FORBIDDEN)
 
 
 class TlsWatch:

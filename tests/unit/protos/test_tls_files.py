@@ -88,7 +88,9 @@ BREAKAGES: list[Breakage] = [
     ("crl.pem", lambda path: path.chmod(0o666), "everybody may change it"),
     ("crl.pem", lambda path: path.write_bytes(b""), "copy the crl.pem of the CA's folder there"),
     ("crl.pem", lambda path: path.write_bytes(other_ca().crl_pem()), "of another CA; copy the crl.pem"),
-    ("", lambda path: path.chmod(0o777), "everybody may change it"),
+    ("", lambda path: path.chmod(0o777), "everybody may change it; do: chmod 775 "),
+    # Such as /tmp, which has to stay as it is.
+    ("", lambda path: path.chmod(0o1777), "everybody may write there: copy what plr ca issue wrote to a folder of its"),
     ("", lambda path: path.rename(path.with_name("elsewhere")), "expected a folder with cert.pem, key.pem and ca.pem"),
 ]
 
