@@ -21,13 +21,16 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from controlplane.certificates import load_own_files
-from controlplane.config import load_config, refuse_exposed
-from protos import extras, interpreter
-from protos.certificate_term import term_problem
-from protos.errors import ConfigError
-from protos.log_lines import line_formatter
-from protos.version_option import ShowVersion, describe
+from protos import extras, interpreter, program
+
+with extras.required("plr-controlplane", "controlplane"):
+    from controlplane.certificates import load_own_files
+    from controlplane.config import load_config, refuse_exposed
+    from protos.certificate_term import term_problem
+    from protos.errors import ConfigError
+    from protos.log_lines import line_formatter
+    from protos.printable import escaped
+    from protos.version_option import ShowVersion, describe
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,6 +56,7 @@ class _OneLineParser(argparse.ArgumentParser):
         self.exit(EXIT_USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
+@program.ends_quietly("plr-controlplane")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     arguments = _parser().parse_args(argv)
@@ -75,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if not problem.in_force:
                 return EXIT_USAGE
         _warn_of_what_is_legal(config)
-        sys.stdout.write(f"{arguments.config}: ok\n")
+        sys.stdout.write(f"{escaped(str(arguments.config))}: ok\n")
         return EXIT_OK
     _start_logging(config.log_level)
     if problem is not None:

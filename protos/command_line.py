@@ -11,6 +11,8 @@ import sys
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
+from protos import extras, program
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -20,19 +22,17 @@ OPERATOR = "operator"
 EXIT_FAILURE = 1
 
 
+@program.ends_quietly("plr")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     commands = {one.name: one for one in entry_points(group=GROUP)}
     name = given[0] if given and given[0] in commands and given[0] != OPERATOR else OPERATOR
     try:
-        run = commands[name].load()
+        with extras.required("plr", "controlplane" if name == OPERATOR else "sidecar"):
+            run = commands[name].load()
     except KeyError:
         sys.stderr.write("plr: it is not installed as it should be: pip install --force-reinstall fogros2-plr\n")
-        return EXIT_FAILURE
-    except ModuleNotFoundError as error:
-        extra = "controlplane" if name == OPERATOR else "sidecar"
-        sys.stderr.write(f"plr: {error.name} is missing: pip install 'fogros2-plr[{extra}]'\n")
         return EXIT_FAILURE
     code: int = run(given if name == OPERATOR else given[1:])
     return code

@@ -1,21 +1,46 @@
-"""Which packages a program needs beyond the distribution's own dependencies: its extra in pyproject.toml."""
+"""Which packages a program needs: the distribution's own dependencies, and those of its extra in pyproject.toml."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import sys
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from protos.program import ended_by_ctrl_c
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+BASE = ("cryptography", "google", "grpc", "pydantic", "yaml")
 SIDECAR = ("prometheus_client", "pyroute2", "sdnotify", "zfec")
 CONTROL_PLANE = ("grpc_health", "grpc_reflection", "numpy", "ortools", "prometheus_client", "sdnotify")
 PLAN = ("numpy",)
 
+EXIT_MISSING = 2
+_OURS = frozenset({"protos", "sidecar", "controlplane"})
+
 
 def missing(extra: str, modules: Sequence[str]) -> str | None:
     """Return one line that says what to install, None if all of these modules are there. Imports none of them."""
-    absent = [module for module in modules if importlib.util.find_spec(module) is None]
-    if not absent:
-        return None
+    absent = [module for module in (*BASE, *modules) if importlib.util.find_spec(module) is None]
+    return advice(extra, absent) if absent else None
+
+
+def advice(extra: str, absent: Sequence[str]) -> str:
+    """Return one line that says what to install for these modules of an extra."""
     return f"{', '.join(absent)} not installed: needs the extra {extra}; in the checkout: pip install '.[{extra}]'"
+
+
+@contextlib.contextmanager
+def required(program: str, extra: str) -> Iterator[None]:
+    """What is imported in the block is there, or the program ends with a line that says what to install."""
+    try:
+        with ended_by_ctrl_c():
+            yield
+    except ModuleNotFoundError as error:
+        name = (error.name or "").partition(".")[0]
+        if not name or name in _OURS:
+            raise
+        sys.stderr.write(f"{program}: {advice(extra, [name])}\n")
+        sys.exit(EXIT_MISSING)

@@ -15,15 +15,18 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from protos import commit, extras
-from protos.certificate_term import term_problem
-from protos.errors import ConfigError, StartError
-from protos.tls_files import load_tls_files
-from protos.version_option import ShowVersion
-from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
-from sidecar.logging_setup import Logging
-from sidecar.ros import environment
-from sidecar.stop_request import StopRequest
+from protos import commit, extras, program
+
+with extras.required("plr-sidecar", "sidecar"):
+    from protos.certificate_term import term_problem
+    from protos.errors import ConfigError, StartError
+    from protos.printable import escaped
+    from protos.tls_files import load_tls_files
+    from protos.version_option import ShowVersion
+    from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
+    from sidecar.logging_setup import Logging
+    from sidecar.ros import environment
+    from sidecar.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,6 +66,7 @@ class _OneLineParser(argparse.ArgumentParser):
         self.exit(EXIT_BAD_CONFIG, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
+@program.ends_quietly(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     options = _parser().parse_args(arguments)
@@ -84,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _warn_of_short_deadlines(config)
             _check_certificate(config)
             _check_ros(thorough=True)
-            sys.stdout.write(f"{options.config}: ok\n")
+            sys.stdout.write(f"{escaped(str(options.config))}: ok\n")
             return EXIT_OK
         return _run(config)
     except ConfigError as error:

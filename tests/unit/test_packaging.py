@@ -84,6 +84,23 @@ def test_a_program_without_its_extra_says_which(module: str, name: str, absent: 
     assert done.stderr == f"{name}: {what}\n"
 
 
+@pytest.mark.audit("ops-4")
+@pytest.mark.parametrize(
+    ("module", "name", "extra", "absent"),
+    [
+        ("controlplane", "plr-controlplane", "controlplane", "cryptography"),
+        ("sidecar", "plr-sidecar", "sidecar", "yaml"),
+        ("protos.command_line", "plr", "sidecar", "pydantic"),
+    ],
+)
+def test_a_program_without_a_dependency_says_what_to_install(module: str, name: str, extra: str, absent: str) -> None:
+    """Even where it takes all that it prints from modules that need it."""
+    done = start(module, (absent,), *(["doctor"] if name == "plr" else []), "--help")
+    assert done.returncode == 2
+    what = f"{absent} not installed: needs the extra {extra}; in the checkout: pip install '.[{extra}]'"
+    assert done.stderr == f"{name}: {what}\n"
+
+
 @pytest.mark.audit("ops-9")
 def test_planning_without_its_extra_says_which() -> None:
     done = start("controlplane.cli", ("numpy",), "plan", "--recorded", "none.json")

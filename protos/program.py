@@ -1,0 +1,86 @@
+"""How our programs end where they are not at fault: by Ctrl-C, when nobody reads what they print, at a full disk."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import os
+import signal
+import sys
+import threading
+from typing import TYPE_CHECKING, ParamSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+P = ParamSpec("P")
+
+EXIT_FAILURE = 1
+EXIT_NO_READER = 128 + signal.SIGPIPE
+"""As the shell tells of a program that SIGPIPE ended, ..."""
+EXIT_INTERRUPTED = 128 + signal.SIGINT
+"""... or Ctrl-C."""
+_NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+
+
+def ends_quietly(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
+    """Decorate a program's main function, which returns its exit code; `name` begins a line of error."""
+
+    def decorate(main: Callable[P, int]) -> Callable[P, int]:
+        @functools.wraps(main)
+        def run(*args: P.args, **kwargs: P.kwargs) -> int:
+            _have_streams()
+            try:
+                try:
+                    return main(*args, **kwargs)
+                finally:
+                    # Here, where it can be answered for: the interpreter's own at its end prints a traceback.
+                    sys.stdout.flush()
+            except BrokenPipeError:
+                _write_nowhere()
+                return EXIT_NO_READER
+            except KeyboardInterrupt:
+                return EXIT_INTERRUPTED
+            except OSError as error:
+                if error.errno not in _NO_ROOM or error.filename is not None:
+                    raise
+                _write_nowhere()
+                sys.stderr.write(f"{name}: what it prints cannot be written: {error.strerror}\n")
+                return EXIT_FAILURE
+
+        return run
+
+    return decorate
+
+
+@contextlib.contextmanager
+def ended_by_ctrl_c() -> Iterator[None]:
+    """In the block, which has nothing to tidy up, Ctrl-C ends the program as it ends one in C: imports take their time,
+    and Python loses an exception, or prints it, that comes within one."""
+    ours = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL) if ours else None
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, before)
+
+
+def _have_streams() -> None:
+    """A shell may start us without them (>&-)."""
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))
+
+
+def _write_nowhere() -> None:
+    """Let go what is still to be written, by us and by the interpreter at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+            continue
+        with contextlib.suppress(OSError, ValueError):  # a test's has no number
+            os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
