@@ -33,6 +33,8 @@ import yaml
 
 from protos.config_file import parse_yaml, read_text
 from protos.errors import ConfigError
+from protos.printable import escaped
+from sidecar.config import SidecarConfig
 from sidecar.doctor.command import as_json, as_text
 from sidecar.doctor.examination import examine
 from sidecar.doctor.options import parser_of, where_of
@@ -41,14 +43,12 @@ from sidecar.doctor.scrub import scrubbed, scrubbed_value
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from sidecar.config import SidecarConfig
     from sidecar.doctor.examination import Examination, Where
 
 EXIT_OK = 0
 EXIT_FAILURE = 1
 _NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """The metrics are this host's own."""
-MAX_LINE, MAX_KEY = 2000, 64
 MAX_PART_BYTES = 8 << 20
 """Of each file; a longer one loses its middle."""
 COMMAND_S = 15.0
@@ -86,9 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         write(output, stem, seen, where)
     except OSError as error:
-        sys.stderr.write(f"plr bugreport: {output} cannot be written: {error.strerror or error}\n")
+        sys.stderr.write(escaped(f"plr bugreport: {output} cannot be written: {error.strerror or error}") + "\n")
         return EXIT_FAILURE
-    sys.stdout.write(f"{output}: look through it before you publish it: tar tzf {output}\n")
+    sys.stdout.write(escaped(f"{output}: look through it before you publish it: tar tzf {output}") + "\n")
     return EXIT_OK
 
 
@@ -98,7 +98,7 @@ def write(output: Path, stem: str, seen: Examination, where: Where) -> None:
     try:
         with open(descriptor, "wb") as file, tarfile.open(fileobj=file, mode="w:gz") as tar:
             for name, text in parts(seen, where):
-                data = scrubbed(_shortened(text)).encode(errors="replace")
+                data = text.encode(errors="replace")
                 info = tarfile.TarInfo(f"{stem}/{name}")
                 info.size, info.mtime, info.mode = len(data), int(time.time()), 0o600
                 tar.addfile(info, io.BytesIO(data))
@@ -108,20 +108,23 @@ def write(output: Path, stem: str, seen: Examination, where: Where) -> None:
 
 
 def parts(seen: Examination, where: Where) -> Iterator[tuple[str, str]]:
-    """Yield name and text of each file; what cannot be had says why."""
-    yield "doctor.txt", as_text(seen.findings)
+    """Yield name and text of each file, without secrets; what cannot be had says why."""
+    yield "doctor.txt", _free(as_text(seen.findings))
     yield "doctor.json", json.dumps(scrubbed_value(json.loads(as_json(seen))), indent=2)
     yield "configuration.yaml", _configuration(where.config, seen.config)
-    yield "versions.txt", _versions()
+    yield "versions.txt", _free(_versions())
     for name, command in COMMANDS.items():
-        yield name, _output(command)
-    yield "sysctl.txt", _sysctls()
-    yield "metrics.txt", _metrics(seen)
+        yield name, _free(_output(command))
+    yield "sysctl.txt", _free(_sysctls())
+    yield "metrics.txt", _free(_metrics(seen))
+
+
+def _free(text: str) -> str:
+    """Free text without secrets, of MAX_PART_BYTES and a line at most."""
+    return scrubbed(_shortened(text))
 
 
 def _shortened(text: str) -> str:
-    # Looking for secrets takes long in long lines, and no line that helps is so long.
-    text = "\n".join(line if len(line) <= MAX_LINE else f"{line[:MAX_LINE]}..." for line in text.split("\n"))
     if len(text) <= MAX_PART_BYTES:
         return text
     half = MAX_PART_BYTES // 2
@@ -129,14 +132,17 @@ def _shortened(text: str) -> str:
 
 
 def _configuration(path: Path, config: SidecarConfig | None) -> str:
-    """The configuration's known keys with their values. Of one that is wrong the keys: its values may be anything."""
+    """The configuration's known keys with their values, which are checked. Of one that is wrong the known keys alone:
+    what else stands there may be anything."""
     if config is not None:
         return yaml.safe_dump(scrubbed_value(config.model_dump(mode="json", warnings=False)), sort_keys=False)
     try:
         content = parse_yaml(read_text(path), str(path))
     except ConfigError as error:
-        return f"{error}\n"
-    return "".join(f"{str(key)[:MAX_KEY]!r}: (left out, as the configuration is wrong)\n" for key in content)
+        return _free(f"{error}\n")
+    known = [key for key in content if key in SidecarConfig.model_fields]
+    lines = [f"{key}: (left out, as the configuration is wrong)" for key in known]
+    return "\n".join([*lines, f"# {len(content) - len(known)} keys that are not known", ""])
 
 
 def _versions() -> str:
