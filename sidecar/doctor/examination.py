@@ -189,7 +189,9 @@ def _not_running(error: LocalError, where: Where) -> Finding:
         return fail("sidecar", f"not asked: {error}", "sudo plr doctor; or: usermod -aG plr $USER, and log in again")
     if isinstance(error, LocalBusyError):
         text = f"no answer: {error}; what follows is seen without it"
-        return fail("sidecar", text, "try again; who asks so much: sudo ss -xp | grep sidecar.sock")
+        return fail(
+            "sidecar", text, "try again; systemctl status plr-sidecar; who asks: sudo ss -xp | grep sidecar.sock"
+        )
     remedy = "systemctl start plr-sidecar, and see: journalctl -u plr-sidecar -n 20"
     if where.config != DEFAULT_CONFIG:
         remedy = f"plr-sidecar --config {where.config}"

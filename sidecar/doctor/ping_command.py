@@ -28,7 +28,7 @@ from sidecar.core.pmtu import MAX_BYTES
 from sidecar.doctor.examination import connect, read_config
 from sidecar.doctor.finding import share
 from sidecar.doctor.options import number, parser_of, where_of, whole
-from sidecar.local.client import LocalError, refusal
+from sidecar.local.client import LocalBusyError, LocalError, refusal
 
 if TYPE_CHECKING:
     import argparse
@@ -212,6 +212,8 @@ def _ping(client: LocalClient, options: argparse.Namespace) -> int:
         pinger.run(options.count, options.interval, options.wait)
     except KeyboardInterrupt:
         say("")
+    if not pinger.tallies and not pinger.refused:
+        raise LocalBusyError("the sidecar does not answer: it is stopped, or very busy")
     if options.json:
         sys.stdout.write(json.dumps(_figures(pinger), indent=2) + "\n")
     for key, tally in sorted(pinger.tallies.items()):

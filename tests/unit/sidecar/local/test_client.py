@@ -153,6 +153,12 @@ def test_what_is_printed_moves_no_cursor(
     assert (shown.out + shown.err).replace("\n", "").isprintable()
 
 
+def test_ping_says_that_nobody_answers(tmp_path: Path, impostor: Impostor, capsys: pytest.CaptureFixture[str]) -> None:
+    at = ["--socket", str(tmp_path / "s"), "--config", str(tmp_path / "none")]
+    assert ping_command.main(["cloud-1", "-c", "1", "-W", "0.2", *at]) == 1
+    assert capsys.readouterr().err == "plr ping: the sidecar does not answer: it is stopped, or very busy\n"
+
+
 def test_pings_that_were_refused_are_not_lost(
     tmp_path: Path, impostor: Impostor, capsys: pytest.CaptureFixture[str]
 ) -> None:

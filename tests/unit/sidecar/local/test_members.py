@@ -130,7 +130,7 @@ def test_a_member_who_pings_without_end_leaves_root_its_pings(server: LocalServe
         try:
             assert greedy.stdout is not None
             assert greedy.stdout.readline() == "ready\n"
-            assert server.refused["too_often"] > 50
+            wait_until(lambda: server.refused["too_often"] > 50)
             with LocalClient(server.path) as client:
                 for _ in range(20):
                     client.ping("cloud-1", "wlan0", 64)
@@ -165,7 +165,7 @@ def test_a_queue_that_is_full_is_called_busy(server: LocalServer, monkeypatch: p
     began = time.monotonic()
     with pytest.raises(LocalBusyError, match="busy with others"):
         LocalClient(server.path)
-    assert time.monotonic() - began >= 1.0
+    assert time.monotonic() - began >= 0.9
     for sock in socks:
         sock.close()
 
