@@ -46,6 +46,8 @@ PINGS = 3
 PING_EVERY_S = 0.2
 PING_BYTES = 64
 PING_PATIENCE_S = 2.0
+PINGING_S = 10.0
+"""All together, however many peers do not answer."""
 MAX_PATHS_OF_AN_INTERFACE = 12
 """Pinged: three times as many pings at once as an interface lets through."""
 
@@ -315,10 +317,13 @@ def _ping_all(client: LocalClient, state: dict[str, Any]) -> dict[PathKey, Pinge
             chosen[path["interface"]] += 1
             peers[path["peer"]] = None
             pings[path["interface"], path["peer"], path["remote"]] = Pinged()
+    end = time.monotonic() + PINGING_S
     try:
         asked: dict[int, str] = {}
         for turn in range(PINGS):
             for peer in peers:
+                if time.monotonic() > end:
+                    return pings
                 # It answers so many requests at once, and may take its time over some.
                 _listen(client, asked, pings, PING_PATIENCE_S, until=MAX_REQUESTS - 1)
                 asked[client.ping(peer, None, PING_BYTES)] = peer

@@ -70,6 +70,8 @@ MAX_PINGS_OUT = 256
 MAX_OUT_OF_MEMBERS, MAX_OUT_OF_A_USER = 192, 64
 PONG_WAIT_S = 10.0
 """A ping is answered within this, or not at all: a round trip of 10 s is the longest that has to work."""
+REST_S = 0.2
+"""Who asks too often is not read from for so long: refusing takes time as well."""
 PAUSE_S = 0.001
 """After each piece of an answer, for the other threads."""
 LOOK_S = 1.0
@@ -123,8 +125,12 @@ class _Client:
     """By the request's id."""
     events: int = selectors.EVENT_READ
     """What it is watched for; 0: nothing."""
+    rests_until: float = 0.0
+    """Nothing is read from it until then; 0: it does not rest."""
+    ended: bool = False
+    """It says nothing more, and may still read."""
     closing: bool = False
-    """Nothing more is read from it."""
+    """Nothing more is taken from it."""
 
 
 class LocalServer:
@@ -243,7 +249,9 @@ class LocalServer:
         paused = [entrance.again_at for entrance in self._entrances if entrance.again_at is not None]
         if paused:
             return max(0.0, min(paused) - time.monotonic())
-        return LOOK_S if self._clients else 60.0
+        if not self._clients:
+            return 60.0
+        return min(LOOK_S, REST_S) if any(client.rests_until for client in self._clients.values()) else LOOK_S
 
     def _accept(self, entrance: Entrance) -> None:
         now = time.monotonic()
@@ -283,6 +291,7 @@ class LocalServer:
         try:
             if events & selectors.EVENT_READ:
                 self._read(client)
+            self._take_lines(client)
             self._write(client)
         except OSError:
             self._drop(client)
@@ -298,28 +307,29 @@ class LocalServer:
             data = client.sock.recv(MAX_REQUEST_BYTES)
         except BlockingIOError:  # the event was of another connection, which had its number before
             return
-        if not data:
-            self._end_of_requests(client)
-            return
+        if not data and _is_gone(client.sock):
+            raise ConnectionResetError
+        # Else it has shut down its side (as `nc -N` does), and may still read what it has asked for.
+        client.ended = not data
         client.received += data
-        while not client.closing and (end := client.received.find(b"\n")) >= 0:
+
+    def _take_lines(self, client: _Client) -> None:
+        while not client.closing and not client.rests_until and (end := client.received.find(b"\n")) >= 0:
             line = bytes(client.received[:end])
             del client.received[: end + 1]
             client.heard_at = time.monotonic()
             self._take(client, line)
+        if client.closing or client.rests_until:
+            return
         if len(client.received) > MAX_REQUEST_BYTES:
             self._refuse_for_good(client, f"a request is a line of at most {MAX_REQUEST_BYTES} bytes")
-
-    def _end_of_requests(self, client: _Client) -> None:
-        """It asks nothing more (shutdown(2), as `nc -N` does), and may still read what it has asked for."""
-        if _is_gone(client.sock):
-            raise ConnectionResetError
-        client.closing = True
-        if client.received:
-            # The last line needs no end.
-            line = bytes(client.received)
-            client.received.clear()
-            self._take(client, line)
+        elif client.ended:
+            client.closing = True
+            if client.received:
+                # The last line needs no end.
+                line = bytes(client.received)
+                client.received.clear()
+                self._take(client, line)
 
     def _take(self, client: _Client, line: bytes) -> None:
         try:
@@ -343,6 +353,7 @@ class LocalServer:
     def _too_often(self, client: _Client, request: int) -> None:
         self.refused["too_often"] += 1
         client.unread += encode_error(request, "too many requests: wait a second", busy=True)
+        client.rests_until = time.monotonic() + REST_S
 
     def _refuse_for_good(self, client: _Client, text: str) -> None:
         self.refused["bad_request"] += 1
@@ -439,7 +450,8 @@ class LocalServer:
             self._drop(client)
             return
         # Who does not read is not read from.
-        reading = not client.closing and len(client.unread) < MAX_UNREAD_BYTES
+        silent = client.closing or client.ended or client.rests_until
+        reading = not silent and len(client.unread) < MAX_UNREAD_BYTES
         events = (selectors.EVENT_READ if reading else 0) | (selectors.EVENT_WRITE if busy else 0)
         if events == client.events:
             return
@@ -464,6 +476,9 @@ class LocalServer:
             if not client.events and _is_gone(client.sock):
                 self._drop(client)
                 continue
+            if client.rests_until and now >= client.rests_until:
+                client.rests_until = 0.0
+                self._serve(client, 0)
             stuck = client.unread or client.received
             if not client.rounds and now >= client.heard_at + (PATIENCE_S if stuck else IDLE_S):
                 if stuck:

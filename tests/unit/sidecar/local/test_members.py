@@ -51,9 +51,8 @@ PING = """
 path = pathlib.Path({path!r})
 sock = socket.socket(socket.AF_UNIX)
 sock.connect(path.as_posix())
-for number in range(200):
-    sock.sendall(json.dumps(dict(id=number, ask="ping", peer="cloud-1", size=64)).encode() + b"\\n")
-    time.sleep(0.001)
+asked = [dict(id=number, ask="ping", peer="cloud-1", size=64) for number in range(200)]
+sock.sendall(b"".join(json.dumps(one).encode() + b"\\n" for one in asked))
 print("ready", flush=True)
 time.sleep(100)
 """
@@ -130,7 +129,7 @@ def test_a_member_who_pings_without_end_leaves_root_its_pings(server: LocalServe
         try:
             assert greedy.stdout is not None
             assert greedy.stdout.readline() == "ready\n"
-            wait_until(lambda: server.refused["too_often"] > 50)
+            wait_until(lambda: server.refused["too_often"] >= 3)
             with LocalClient(server.path) as client:
                 for _ in range(20):
                     client.ping("cloud-1", "wlan0", 64)

@@ -257,11 +257,29 @@ def test_too_many_requests_are_refused(server: LocalServer) -> None:
     assert server.refused["too_often"] == errors
 
 
+def test_who_asks_without_end_takes_little_time(server: LocalServer) -> None:
+    """Each refusal takes time of the interpreter, which the data plane needs."""
+    began = time.monotonic()
+    with raw(server) as greedy:
+        greedy.setblocking(False)
+        while server.refused["too_often"] < 4:
+            assert time.monotonic() < began + PATIENCE_S
+            with contextlib.suppress(BlockingIOError):
+                greedy.sendall(b'{"id":1,"ask":"state"}\n' * 20)
+            with contextlib.suppress(BlockingIOError):
+                greedy.recv(65_536)
+        assert server.refused["too_often"] <= (time.monotonic() - began) / server_module.REST_S + 1
+        greedy.settimeout(PATIENCE_S)
+        answer = b""
+        while answer.count(b'"end":true') < 1:
+            answer = answer[-100:] + greedy.recv(65_536)
+
+
 def test_pings_that_are_out_are_bounded_and_forgotten(server: LocalServer, source: Source) -> None:
     source.mute = True
     with raw(server) as greedy:
-        for number in range(200):
-            greedy.sendall(json.dumps({"id": number, "ask": "ping", "peer": "cloud-1", "size": 64}).encode() + b"\n")
+        asked = [{"id": number, "ask": "ping", "peer": "cloud-1", "size": 64} for number in range(200)]
+        greedy.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in asked))
         wait_until(lambda: server.refused["too_often"] > 0)
         assert len(server._out) <= MAX_PINGS_OUT
     wait_until(lambda: not server._clients)
