@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from sidecar.doctor import command, ping_command
-from sidecar.local.client import MAX_LINE_BYTES, MAX_STATE_BYTES, LocalClient, LocalError
+from sidecar.local.client import MAX_LINE_BYTES, LocalClient, LocalError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -100,24 +100,28 @@ def test_strange_answers_are_one_line_of_error(tmp_path: Path, impostor: Imposto
         assert str(failed.value).isprintable()
 
 
-def test_an_answer_without_end_costs_little_memory(tmp_path: Path, impostor: Impostor) -> None:
+def test_an_answer_without_end_costs_little_memory(
+    tmp_path: Path, impostor: Impostor, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def without_end(number: int) -> Iterator[bytes]:
         part = line(id=number, part="paths", value=[PATH] * 400)
         while True:
             yield part
 
     impostor.say = without_end
+    most_bytes = 1 << 20
+    monkeypatch.setattr("sidecar.local.client.MAX_STATE_BYTES", most_bytes)
     tracemalloc.start()
     try:
         with (
             LocalClient(tmp_path / "s") as client,
-            pytest.raises(LocalError, match=f"more than {MAX_STATE_BYTES} bytes"),
+            pytest.raises(LocalError, match=f"more than {most_bytes} bytes"),
         ):
             client.state()
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert most < 20 * MAX_STATE_BYTES
+    assert most < 20 * most_bytes
 
 
 @pytest.mark.parametrize("kind", STRANGE)
