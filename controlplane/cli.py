@@ -29,7 +29,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from protos.program import ended_by_ctrl_c
+from protos import extras
 from protos.version_option import ShowVersion
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    with ended_by_ctrl_c():
+    with extras.required("plr", "controlplane"):
         parser = _parser(argv[0] if argv else "")
     arguments = parser.parse_args(argv)
     code: int = arguments.run(arguments)

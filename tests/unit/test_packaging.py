@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 
 SOLVER = ("ortools", "pandas", "grpc_health", "grpc_reflection")
+_COMMAND = {"protos.command_line": ("doctor",), "controlplane.cli": ("status",)}
 SIDECAR = ("pyroute2", "sdnotify", "zfec", "prometheus_client")
 
 
@@ -91,11 +92,12 @@ def test_a_program_without_its_extra_says_which(module: str, name: str, absent: 
         ("controlplane", "plr-controlplane", "controlplane", "cryptography"),
         ("sidecar", "plr-sidecar", "sidecar", "yaml"),
         ("protos.command_line", "plr", "sidecar", "pydantic"),
+        ("controlplane.cli", "plr", "controlplane", "grpc"),
     ],
 )
 def test_a_program_without_a_dependency_says_what_to_install(module: str, name: str, extra: str, absent: str) -> None:
     """Even where it takes all that it prints from modules that need it."""
-    done = start(module, (absent,), *(["doctor"] if name == "plr" else []), "--help")
+    done = start(module, (absent,), *_COMMAND.get(module, ()), "--help")
     assert done.returncode == 2
     what = f"{absent} not installed: needs the extra {extra}; in the checkout: pip install '.[{extra}]'"
     assert done.stderr == f"{name}: {what}\n"
