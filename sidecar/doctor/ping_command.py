@@ -208,10 +208,15 @@ def _ping(client: LocalClient, options: argparse.Namespace) -> int:
             sys.stdout.flush()
 
     pinger = Pinger(client, options.peer, options.interface, options.size, say)
+    ended: LocalError | None = None
     try:
         pinger.run(options.count, options.interval, options.wait)
     except KeyboardInterrupt:
         say("")
+    except LocalError as error:
+        if not pinger.tallies:
+            raise
+        ended = error
     if not pinger.tallies and not pinger.refused:
         raise LocalBusyError("the sidecar does not answer: it is stopped, or very busy")
     if options.json:
@@ -220,6 +225,9 @@ def _ping(client: LocalClient, options: argparse.Namespace) -> int:
         say(f"{pinger.name(*key)}: {tally.line()}")
     if pinger.refused:
         say(f"{pinger.refused} requests were not taken: the sidecar was busy with others")
+    if ended is not None:
+        sys.stderr.write(f"plr ping: {ended}\n")
+        return EXIT_NO_ANSWER
     return EXIT_OK if any(tally.rtts_s for tally in pinger.tallies.values()) else EXIT_NO_ANSWER
 
 

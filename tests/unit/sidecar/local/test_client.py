@@ -163,6 +163,24 @@ def test_ping_says_that_nobody_answers(tmp_path: Path, impostor: Impostor, capsy
     assert capsys.readouterr().err == "plr ping: the sidecar does not answer: it is stopped, or very busy\n"
 
 
+def test_statistics_are_told_of_a_sidecar_that_ended(
+    tmp_path: Path, impostor: Impostor, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def say(number: int) -> Iterator[bytes]:
+        if number == 2:
+            raise ConnectionError
+        yield line(id=number, part="pinged", value=[{"interface": "wlan0", "remote": 0}])
+        yield line(id=number, part="pong", value={"interface": "wlan0", "remote": 0, "rtt_s": 0.1, "problem": ""})
+        yield line(id=number, end=True)
+
+    impostor.say = say
+    at = ["--socket", str(tmp_path / "s"), "--config", str(tmp_path / "none")]
+    assert ping_command.main(["cloud-1", "-c", "4", "-i", "0.1", *at]) == 1
+    shown = capsys.readouterr()
+    assert "1 sent, 1 answered, 0 % lost" in shown.out
+    assert shown.err == "plr ping: the sidecar closed the connection: it ended, or is busy with others\n"
+
+
 def test_pings_that_were_refused_are_not_lost(
     tmp_path: Path, impostor: Impostor, capsys: pytest.CaptureFixture[str]
 ) -> None:
