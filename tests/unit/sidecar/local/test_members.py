@@ -1,4 +1,4 @@
-"""Several users at one local socket: none keeps another out, and all together not root."""
+"""Several users at one local socket: each has a share of it, and root one that all of them together do not touch."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def server(tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> I
     assert not for_group(server.path).exists()
 
 
-def test_a_member_who_floods_keeps_neither_root_nor_another_out(server: LocalServer) -> None:
+def test_a_member_who_floods_does_not_keep_root_out(server: LocalServer) -> None:
     path = for_group(server.path)
     with as_user(NOBODY, [GROUP.gr_gid], FLOOD.format(path=str(path))) as flood:
         try:
@@ -97,12 +97,23 @@ def test_a_member_who_floods_keeps_neither_root_nor_another_out(server: LocalSer
             for _ in range(5):
                 with LocalClient(server.path) as client:
                     assert client.state()["node"] == {"name": "robot-1"}
+        finally:
+            flood.kill()
+
+
+def test_a_member_who_holds_his_places_leaves_another_some(server: LocalServer) -> None:
+    script = HOLD.format(path=str(for_group(server.path)), count=2 * MAX_OF_A_USER)
+    with as_user(NOBODY, [GROUP.gr_gid], script) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == "ready\n"
+            wait_until(lambda: server.refused["user_full"] == MAX_OF_A_USER)
             script = ASK.format(path=str(server.path), patience=PATIENCE_S)
             with as_user(NOBODY - 1, [GROUP.gr_gid], script) as other:
                 out, err = other.communicate(timeout=60)
             assert out == "robot-1\n", err
         finally:
-            flood.kill()
+            holder.kill()
 
 
 def test_members_who_hold_all_their_places_leave_root_its_own(server: LocalServer) -> None:
