@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import grp
 import os
+import tempfile
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,11 +15,10 @@ from sidecar.local import server as server_module
 from sidecar.local.client import LocalBusyError, LocalClient, LocalError
 from sidecar.local.entrance import for_group
 from sidecar.local.server import MAX_OF_A_USER, MAX_OWN, LocalServer
-from tests.unit.sidecar.local.world import NOBODY, PATIENCE_S, Source, as_user, raw, reachable, wait_until
+from tests.unit.sidecar.local.world import NOBODY, PATIENCE_S, Source, as_user, raw, wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 pytestmark = [
     pytest.mark.audit("ops-14"),
@@ -75,11 +76,17 @@ def source() -> Source:
 
 
 @pytest.fixture
-def server(tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalServer]:
+def folder() -> Iterator[Path]:
+    """Where other users come by. Not pytest's: each session that starts closes the one of all to them."""
+    with tempfile.TemporaryDirectory(prefix="plr-") as name:
+        Path(name).chmod(0o755)
+        yield Path(name)
+
+
+@pytest.fixture
+def server(folder: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalServer]:
     monkeypatch.setattr(server_module, "GROUP", GROUP.gr_name)
-    for folder in reachable(tmp_path):
-        folder.chmod(0o755)
-    server = LocalServer(tmp_path / "sidecar.sock", source)
+    server = LocalServer(folder / "sidecar.sock", source)
     source.server = server
     server.open()
     yield server
@@ -180,8 +187,8 @@ def test_a_queue_that_is_full_is_called_busy(server: LocalServer, monkeypatch: p
         sock.close()
 
 
-def test_a_stranger_s_socket_is_not_asked(server: LocalServer, tmp_path: Path) -> None:
-    path = tmp_path / "sub"
+def test_a_stranger_s_socket_is_not_asked(folder: Path) -> None:
+    path = folder / "sub"
     path.mkdir()
     os.chown(path, NOBODY, NOBODY)
     script = f"""
