@@ -31,6 +31,8 @@ def encode(event: FleetEvent) -> str:
         shown["role"] = event.role.value
     if event.why is not None:
         shown["why"] = event.why.value
+    if event.seen_at is not None:
+        shown["seen"] = timestamp(event.seen_at)
     if event.text:
         shown["text"] = event.text
     return json.dumps(shown, ensure_ascii=False)
@@ -64,6 +66,7 @@ def decode(line: bytes) -> FleetEvent:
         text=text,
         role=_member(Role, shown, "role"),
         why=_member(Why, shown, "why"),
+        seen_at=_seconds(shown["seen"]) if shown.get("seen") is not None else None,
     )
 
 

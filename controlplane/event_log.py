@@ -1,7 +1,7 @@
 """The log of events: remembered here, and kept in a file that outlives the program.
 
     state_dir/events.jsonl   one event a line, JSON (`event_lines`); appended to
-    state_dir/lock           held while the program runs
+    state_dir/lock           held while the program runs, and touched: its time tells the next run when this one ended
 
 The file is bounded: when it has grown to MAX_FILE_BYTES it is written anew, with what is remembered. So it is also when
 writing has failed: a full disk costs nothing but time, as long as the program lives. Lines that are damaged (a power
@@ -47,6 +47,9 @@ MAX_UNWRITTEN = 4096
 RETRY_S = 10.0
 """From a failed writing to the next attempt."""
 
+TOUCH_EVERY_S = 10.0
+"""How exactly the next run knows when this one ended, if nothing happened shortly before."""
+
 CLOSE_TIMEOUT_S = 2.0
 """For the last lines: a slow disk must not hold up a stop."""
 
@@ -78,6 +81,8 @@ class EventLog:
         self._file: IO[bytes] | None = None
         self._lock: IO[bytes] | None = None
         self._writer: threading.Thread | None = None
+        self.ran_until: float | None = None
+        """When the run before was there last, in seconds since 1970; None if none is remembered."""
         if folder is None:
             return
         if self._open(folder):
@@ -103,8 +108,9 @@ class EventLog:
         *,
         role: Role | None = None,
         why: Why | None = None,
+        seen_s: float | None = None,
     ) -> None:
-        """Something happened."""
+        """Something happened; `seen_s`: how long ago one that departed was heard of last."""
         if not self._memory.admits(node, self._clock()):
             if node is not None and (node in self._suppressed or len(self._suppressed) < MAX_UNWRITTEN):
                 self._suppressed[node] = self._suppressed.get(node, 0) + 1
@@ -114,7 +120,8 @@ class EventLog:
         at = self._wall()
         # Grows also over a log that was lost: who asks for what is new must not wait for numbers to catch up.
         number = max(self._memory.last_number + 1, int(at * 1e6))
-        event = FleetEvent(number, at, kind, node, clean_text(text.strip()), role, why)
+        seen_at = at - seen_s if seen_s is not None else None
+        event = FleetEvent(number, at, kind, node, clean_text(text.strip()), role, why, seen_at)
         with self._condition:
             self._memory.add(event)
             if self._writer is None:
@@ -186,6 +193,8 @@ class EventLog:
         if self._problem:
             self._unlock()
             return False
+        assert self._lock is not None
+        touched_at = os.fstat(self._lock.fileno()).st_mtime
         try:
             for event in self._read(folder / FILE):
                 self._memory.add(event)
@@ -194,7 +203,17 @@ class EventLog:
         except OSError as error:
             log.error("%s cannot be read: %s; events begin anew", folder / FILE, error.strerror or error)
         self._write_all |= self._damaged > 0
+        last = self._memory.last(1)
+        if last:
+            self.ran_until = min(max(last[0].at, touched_at), self._wall())
         return True
+
+    def _touch(self) -> None:
+        assert self._lock is not None
+        # Whoever cannot even do this loses no event; the next run dates by the last event then.
+        with contextlib.suppress(OSError, ValueError):
+            at = self._wall()
+            os.utime(self._lock.fileno(), (at, at))
 
     def _read(self, path: Path) -> Iterator[FleetEvent]:
         with path.open("rb") as file:
@@ -222,9 +241,11 @@ class EventLog:
     def _write(self) -> None:
         failed_at: float | None = None
         while True:
+            self._touch()
             with self._condition:
                 while not (self._closing or self._unwritten or self._write_all):
-                    self._condition.wait()
+                    if not self._condition.wait(TOUCH_EVERY_S):
+                        self._touch()
                 if failed_at is not None and not self._closing:
                     # Everything waits for the disk; what comes meanwhile is written with the rest.
                     self._condition.wait_for(lambda: self._closing, self._retry_s)

@@ -172,11 +172,15 @@ def _members(fleet: Fleet) -> Iterator[Metric]:
     def why() -> Iterator[tuple[Labels, float]]:
         yield from (((one.name, one.role.value, one.why.value), 1.0) for one in fleet.gone)
 
+    def went() -> Iterator[tuple[Labels, float]]:
+        yield from (((one.name, one.role.value), round(fleet.now_wall - one.gone_s, 3)) for one in fleet.gone)
+
     labels = ("sidecar", "role")
     yield _gauge("plr_sidecar_up", "1 while the sidecar's control stream is open.", labels, up)
     yield _gauge("plr_sidecar_last_seen_timestamp_seconds", "When the sidecar was heard of last.", labels, seen)
     yield _gauge("plr_sidecar_certificate_expiry_timestamp_seconds", "When its certificate ends.", labels, ends)
     yield _info("plr_sidecar_gone", "Sidecars that are gone, and why.", (*labels, "why"), why)
+    yield _gauge("plr_sidecar_gone_timestamp_seconds", "When the sidecar was found to be gone.", labels, went)
 
 
 def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:

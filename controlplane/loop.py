@@ -145,7 +145,8 @@ class ControlLoop:
         self.events = events
         now = self._loop.time()
         self._core = ControlCore(config.settings(), version_epoch=wall_clock_epoch(), now=now)
-        self._core.remember(*departures(events.events(), now_wall=time.time(), now=now), now)
+        before = departures(events.events(), ran_until=events.ran_until, now_wall=time.time(), now=now)
+        self._core.remember(*before, now)
         self._mailboxes: dict[StreamId, Mailbox] = {}
         self._callers: dict[NodeName, Caller] = {}
         self._earliest_end = EarliestEnd()
@@ -304,7 +305,8 @@ class ControlLoop:
                     self._record(EventKind.UNMET, name, _few(services))
                 case DepartureNotice(sidecar=name, departure=gone):
                     log.info("%s is gone: %s", name, gone.why.value)
-                    self.events.record(EventKind.DEPARTED, name, gone.text, role=gone.role, why=gone.why)
+                    seen_s = max(0.0, self._loop.time() - gone.seen_at)
+                    self.events.record(EventKind.DEPARTED, name, gone.text, role=gone.role, why=gone.why, seen_s=seen_s)
                     self._callers.pop(name, None)
                 case StreamLostNotice(sidecar=name, role=role) if not self._closing:
                     self.events.record(EventKind.STREAM_LOST, name, role=role)

@@ -13,10 +13,13 @@ if TYPE_CHECKING:
     from protos.model import NodeName
 
 
-def departures(events: Sequence[FleetEvent], *, now_wall: float, now: float) -> tuple[list[Departure], list[Departure]]:
+def departures(
+    events: Sequence[FleetEvent], *, ran_until: float | None, now_wall: float, now: float
+) -> tuple[list[Departure], list[Departure]]:
     """Who was gone, who went first first; and who was there, as a departure to be noted if it does not come back.
 
-    `now_wall` is seconds since 1970, `now` the same moment in the monotonic seconds of what is returned.
+    `ran_until` is when the run before ended, `now_wall` is now, both in seconds since 1970; `now` is the same moment in
+    the monotonic seconds of what is returned.
     """
     gone: dict[NodeName, FleetEvent] = {}
     present: dict[NodeName, FleetEvent] = {}
@@ -29,16 +32,16 @@ def departures(events: Sequence[FleetEvent], *, now_wall: float, now: float) -> 
         present.pop(node, None)
         (gone if event.kind is EventKind.DEPARTED else present)[node] = event
     # Had it fallen silent before the end of that run, the log would tell.
-    ended_at = events[-1].at if events else now_wall
+    ended_at = now_wall if ran_until is None else ran_until
 
-    def departure(event: FleetEvent, at_wall: float) -> Departure:
-        at = now - max(0.0, now_wall - at_wall)
+    def departure(event: FleetEvent, at_wall: float, seen_wall: float) -> Departure:
+        at, seen_at = (now - max(0.0, now_wall - wall) for wall in (at_wall, seen_wall))
         assert event.node is not None
         assert event.role is not None
         text = event.text if event.kind is EventKind.DEPARTED else ""
-        return Departure(event.node, event.role, event.why or Why.LEASE_EXPIRED, at, at, text)
+        return Departure(event.node, event.role, event.why or Why.LEASE_EXPIRED, at, seen_at, text)
 
     return (
-        [departure(event, event.at) for event in gone.values()],
-        [departure(event, ended_at) for event in present.values()],
+        [departure(event, event.at, event.at if event.seen_at is None else event.seen_at) for event in gone.values()],
+        [departure(event, ended_at, ended_at) for event in present.values()],
     )

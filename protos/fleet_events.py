@@ -68,6 +68,8 @@ class FleetEvent:
     role: Role | None = None
     why: Why | None = None
     """Of a departure."""
+    seen_at: float | None = None
+    """When one that departed was heard of last, by the same clock."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,7 +105,9 @@ class Plane:
         self._core = ControlCore(settings, version_epoch=int(self._wall()) << 20, now=now)
         self._matcher = Matcher()
         self.events = EventLog(self._folder, wall=self._wall, clock=lambda: self._timeline.now)
-        self._core.remember(*departures(self.events.events(), now_wall=self._wall(), now=now), now)
+        wall = self._wall()
+        before = departures(self.events.events(), ran_until=self.events.ran_until, now_wall=wall, now=now)
+        self._core.remember(*before, now)
         self._core.relay_revocations(self.crl, now)
         self.started_at = now
         self.starts += 1
@@ -246,7 +248,8 @@ class Plane:
                 case UnmetNotice(sidecar=name, services=services):
                     events.record(EventKind.UNMET, name, services[0])
                 case DepartureNotice(sidecar=name, departure=gone):
-                    events.record(EventKind.DEPARTED, name, gone.text, role=gone.role, why=gone.why)
+                    seen_s = self._timeline.now - gone.seen_at
+                    events.record(EventKind.DEPARTED, name, gone.text, role=gone.role, why=gone.why, seen_s=seen_s)
                 case StreamLostNotice(sidecar=name, role=role):
                     events.record(EventKind.STREAM_LOST, name, role=role)
                 case CutOffNotice(sidecar=name, role=role, lifted=lifted):

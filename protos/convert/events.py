@@ -95,6 +95,7 @@ def _event_from_proto(message: admin_pb2.FleetEvent) -> FleetEvent:
         text=text(message.text, "text"),
         role=role_from_proto(message.role) if message.role else None,
         why=why_from_proto(message.reason) if message.reason else None,
+        seen_at=at_most(message.seen_us, MAX_TIME_US, "seen_us") / US_PER_S if message.seen_us else None,
     )
 
 
@@ -108,6 +109,7 @@ def event_to_proto(event: FleetEvent) -> admin_pb2.FleetEvent:
         role=role_to_proto(event.role) if event.role is not None else types_pb2.ROLE_UNSPECIFIED,
         reason=why_to_proto(event.why),
         text=clean_text(event.text),
+        seen_us=microseconds(event.seen_at) if event.seen_at is not None else 0,
     )
 
 

@@ -381,6 +381,7 @@ class FleetEvent(_message.Message):
     ROLE_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
     TEXT_FIELD_NUMBER: _builtins.int
+    SEEN_US_FIELD_NUMBER: _builtins.int
     number: _builtins.int
     """Only grows, also over restarts of the control plane."""
     at_us: _builtins.int
@@ -392,6 +393,8 @@ class FleetEvent(_message.Message):
     reason: Global___DepartureReason.ValueType
     """Of a departure."""
     text: _builtins.str
+    seen_us: _builtins.int
+    """Of a departure: when it was heard of last, since 1970; 0: not known."""
     def __init__(
         self,
         *,
@@ -402,10 +405,11 @@ class FleetEvent(_message.Message):
         role: _types_pb2.Role.ValueType = ...,
         reason: Global___DepartureReason.ValueType = ...,
         text: _builtins.str = ...,
+        seen_us: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_us", b"at_us", "kind", b"kind", "node", b"node", "number", b"number", "reason", b"reason", "role", b"role", "text", b"text"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_us", b"at_us", "kind", b"kind", "node", b"node", "number", b"number", "reason", b"reason", "role", b"role", "seen_us", b"seen_us", "text", b"text"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -210,6 +210,37 @@ def test_who_was_gone_and_who_was_there_follows_from_it() -> None:
         event(6, EventKind.REFUSED, "gone"),
         event(7, EventKind.REFUSED, "stranger"),
     ]
-    gone, present = departures(events, now_wall=207.0, now=50.0)
+    gone, present = departures(events, ran_until=197.0, now_wall=207.0, now=50.0)
     assert [(one.name, one.why, one.at) for one in gone] == [("gone", Why.REVOKED, 50.0 - 104.0)]
-    assert [(one.name, one.seen_at) for one in present] == [("there", -50.0), ("back", -50.0)]
+    assert [(one.name, one.seen_at) for one in present] == [("there", 40.0), ("back", 40.0)]
+
+
+def test_it_knows_when_the_run_before_ended_also_if_nothing_happened_for_long(tmp_path: Path) -> None:
+    wall = 1_000_000.0
+    log = EventLog(tmp_path, wall=lambda: wall)
+    assert log.ran_until is None
+    log.record(EventKind.CONNECTED, ROBOT, role=Role.ROBOT)
+    wait_for(lambda: (tmp_path / FILE).exists())
+    wall += 30 * 3600.0
+    log._touch()
+    # As after a kill: the file says no more, and another process may have the lock.
+    assert log._lock is not None
+    log._lock.close()
+    wall += 60.0
+    again = EventLog(tmp_path, wall=lambda: wall)
+    assert again.ran_until == wall - 60.0
+    _, present = departures(again.events(), ran_until=again.ran_until, now_wall=wall, now=500.0)
+    assert [(one.name, one.seen_at) for one in present] == [(ROBOT, 440.0)]
+    again.close()
+    log.close()
+
+
+def test_when_one_was_seen_last_outlives_a_restart(tmp_path: Path) -> None:
+    wall = 1_000_000.0
+    log = EventLog(tmp_path, wall=lambda: wall)
+    log.record(EventKind.DEPARTED, ROBOT, role=Role.ROBOT, why=Why.LEASE_EXPIRED, seen_s=3600.0)
+    log.close()
+    again = EventLog(tmp_path, wall=lambda: wall)
+    ((gone,), present) = departures(again.events(), ran_until=again.ran_until, now_wall=wall + 100.0, now=0.0)
+    assert (gone.at, gone.seen_at, present) == (-100.0, -3700.0, [])
+    again.close()

@@ -14,6 +14,7 @@ import pytest
 from controlplane import turns
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.control_events import Settings
+from controlplane.core.departed import Departure
 from controlplane.core.fading import FadedHistogram
 from controlplane.core.fleet_view import MemberView, MissView, PathView
 from controlplane.core.registry import Refusal
@@ -171,10 +172,24 @@ def test_who_is_gone_has_series_that_say_so() -> None:
     assert value(found, "plr_sidecar_gone_info", why="lease_expired", **member) == 1.0
     seen = value(found, "plr_sidecar_last_seen_timestamp_seconds", **member)
     assert seen == pytest.approx(1.7e9 - world.settings.lease_s - 100.0, abs=world.settings.lease_s)
+    assert value(found, "plr_sidecar_gone_timestamp_seconds", **member) == pytest.approx(1.7e9 - 100.0, abs=0.5)
     world.robot()
     found = series(families(fleet_of(world)))
     assert value(found, "plr_sidecar_up", **member) == 1.0
     assert value(found, "plr_sidecar_gone_info", why="lease_expired", **member) is None
+
+
+def test_who_died_together_with_the_control_plane_is_gone_since_it_was_found_out() -> None:
+    """However long before that anything was heard of it: the alerts look at who went within a day."""
+    world = World(Settings(warm_up_s=0.0))
+    lost = Departure(NodeName("a"), Role.CLOUD, Why.LEASE_EXPIRED, world.now - 1e6, world.now - 1e6)
+    world.core.remember([], [lost], world.now)
+    world.run(world.settings.lease_s + 1.0)
+    found = series(families(fleet_of(world)))
+    member = {"sidecar": "a", "role": "cloud"}
+    assert value(found, "plr_sidecar_gone_info", why="lease_expired", **member) == 1.0
+    assert value(found, "plr_sidecar_gone_timestamp_seconds", **member) == pytest.approx(1.7e9, abs=2.0)
+    assert value(found, "plr_sidecar_last_seen_timestamp_seconds", **member) == pytest.approx(1.699e9, abs=10.0)
 
 
 def test_a_member_is_told_of_once_also_where_the_policy_cut_it_off() -> None:
