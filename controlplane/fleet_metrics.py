@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, cast
 
-from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.samples import Sample
 
 from protos.model import Role
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 MAX_SERIES = 100_000
 """Of all members."""
 
-SERIES_OF_MEMBER = 4
-"""Of each at most, there or gone, beside a robot's own."""
+SERIES_OF_MEMBER = 6
+"""Of each at most, there or gone, beside a robot's own: a server's."""
 
 MAX_GONE = 1024
 """Members that are gone and still have series, those that went last."""
@@ -60,6 +61,8 @@ class Fleet:
 class _Room:
     """How many series of each kind a robot may have."""
 
+    served: int
+    counted: int
     misses: int
     paths: int
     interfaces: int
@@ -116,15 +119,17 @@ def families(fleet: Fleet) -> Iterable[Metric]:
     free = MAX_SERIES - SERIES_OF_MEMBER * (len(fleet.members) + len(fleet.gone))
     share = max(0, free) // max(1, len(robots))
     rooms = [(robot, _room(robot, share)) for robot in robots]
-    return (*_members(fleet), *_robots(rooms))
+    return (*_members(fleet), _servers(fleet), *_robots(rooms))
 
 
 def _room(robot: MemberView, share: int) -> _Room:
     """Share it out, to what is needed most first."""
     wanted = (
+        len(robot.paths_of_services),
+        2 * len(robot.misses),
         sum((miss.predicted is not None) + (miss.observed is not None) + (miss.target > 0.0) for miss in robot.misses),
         len(robot.paths),
-        len(robot.carriers),
+        2 * len(robot.interfaces),
         sum(len(mapping.assignments) for mapping in robot.mapping),
         len(robot.paths),
     )
@@ -133,7 +138,16 @@ def _room(robot: MemberView, share: int) -> _Room:
     for count in wanted:
         given.append(min(count, left))
         left -= given[-1]
-    return _Room(given[0], given[1], given[2], given[3], given[4], left_out=sum(wanted) - sum(given))
+    return _Room(
+        served=given[0],
+        counted=given[1] // 2,
+        misses=given[2],
+        paths=given[3],
+        interfaces=given[4] // 2,
+        mapped=given[5],
+        round_trips=given[6],
+        left_out=sum(wanted) - sum(given),
+    )
 
 
 def _gauge(name: str, text: str, labels: Labels, rows: Rows) -> Metric:
@@ -142,6 +156,10 @@ def _gauge(name: str, text: str, labels: Labels, rows: Rows) -> Metric:
 
 def _info(name: str, text: str, labels: Labels, rows: Rows) -> Metric:
     return _lazy(InfoMetricFamily(name, text, labels=labels), f"{name}_info", labels, rows)
+
+
+def _counter(name: str, text: str, labels: Labels, rows: Rows) -> Metric:
+    return _lazy(CounterMetricFamily(name, text, labels=labels), name, labels, rows)
 
 
 def _lazy(family: Metric, name: str, labels: Labels, rows: Rows) -> Metric:
@@ -183,6 +201,25 @@ def _members(fleet: Fleet) -> Iterator[Metric]:
     yield _gauge("plr_sidecar_gone_timestamp_seconds", "When the sidecar was found to be gone.", labels, went)
 
 
+def _servers(fleet: Fleet) -> Metric:
+    def reach() -> Iterator[tuple[Labels, float]]:
+        counts: Counter[tuple[NodeName, str]] = Counter()
+        for robot in fleet.members:
+            reaches = {path.server for path in robot.paths if path.up}
+            # Who reaches nobody has a trouble of its own.
+            if reaches:
+                counts.update((server, "up") for server in reaches)
+                counts.update((server, "lost") for server in robot.lost)
+                counts.update((server, "never") for server in robot.unproven)
+        for member in fleet.members:
+            if member.role is Role.CLOUD:
+                for path in ("up", "lost", "never"):
+                    yield (member.name, path), float(counts[member.name, path])
+
+    text = "Robots that reach the server (up), or only others: those that reached it before (lost), or all (never)."
+    return _gauge("plr_server_robots", text, ("server", "path"), reach)
+
+
 def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     def misses(pick: Callable[[MissView], float | None], before: Sequence[Callable[[MissView], float | None]]) -> Rows:
         def rows() -> Iterator[tuple[Labels, float]]:
@@ -203,6 +240,19 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     def target(miss: MissView) -> float | None:
         return miss.target or None
 
+    def served() -> Iterator[tuple[Labels, float]]:
+        for robot, room in rooms:
+            for name, paths in robot.paths_of_services[: room.served]:
+                yield (robot.name, name), float(paths)
+
+    def counted(pick: Callable[[MissView], int]) -> Rows:
+        def rows() -> Iterator[tuple[Labels, float]]:
+            for robot, room in rooms:
+                for miss in robot.misses[: room.counted]:
+                    yield (robot.name, miss.service), float(pick(miss))
+
+        return rows
+
     def up() -> Iterator[tuple[Labels, float]]:
         for robot, room in rooms:
             for path in robot.paths[: room.paths]:
@@ -210,8 +260,13 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
 
     def interfaces() -> Iterator[tuple[Labels, float]]:
         for robot, room in rooms:
-            for interface, carrier in robot.carriers[: room.interfaces]:
-                yield (robot.name, interface, carrier), 1.0
+            for interface in robot.interfaces[: room.interfaces]:
+                yield (robot.name, interface.name, interface.carrier), 1.0
+
+    def carrying() -> Iterator[tuple[Labels, float]]:
+        for robot, room in rooms:
+            for interface in robot.interfaces[: room.interfaces]:
+                yield (robot.name, interface.name), float(interface.up)
 
     def follows() -> Iterator[tuple[Labels, float]]:
         yield from (((robot.name,), float(robot.follows)) for robot, _ in rooms)
@@ -232,6 +287,24 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
         yield (), float(sum(room.left_out for _, room in rooms))
 
     path, service = ("robot", "interface", "server"), ("robot", "service")
+    yield _gauge(
+        "plr_robot_service_paths",
+        "Over how many paths requests of the robot's service go; 0: it wants the service, and none can be answered.",
+        service,
+        served,
+    )
+    yield _counter(
+        "plr_robot_requests_total",
+        "Requests of the robot that have ended, as it reports them.",
+        service,
+        counted(lambda miss: miss.requests),
+    )
+    yield _counter(
+        "plr_robot_requests_missed_total",
+        "Those of them that missed their deadline or failed.",
+        service,
+        counted(lambda miss: miss.missed),
+    )
     yield _gauge(
         "plr_predicted_miss_probability",
         "Predicted probability that a request misses its deadline, in the way its copies are sent.",
@@ -256,6 +329,12 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
         "Whose network the robot's interface uses: the carrier of its configuration, or the interface's own name.",
         ("robot", "interface", "carrier"),
         interfaces,
+    )
+    yield _gauge(
+        "plr_robot_interface_up",
+        "1 while the robot's interface carries something, 0 while it would be used and does not.",
+        ("robot", "interface"),
+        carrying,
     )
     yield _gauge(
         "plr_robot_mapping_synced", "1 while the robot has confirmed the mapping sent last.", ("robot",), follows

@@ -146,6 +146,7 @@ class Metrics:
             *_events(events),
             *_stun(stun_servers),
             *_certificate(self._own),
+            _loop(),
         )
 
 
@@ -270,6 +271,7 @@ def _drops(core: ControlCore, superseded: int, reports_slowed: int, events: Even
             ("histogram_evicted",): core.estimator.dropped,
             ("mapping_history_evicted",): core.history.dropped,
             ("departure_forgotten",): core.departed.forgotten,
+            ("reach_forgotten",): core.reached.forgotten,
             ("event_evicted",): events.evicted,
             ("event_too_often",): events.too_often,
             ("event_damaged",): events.damaged,
@@ -310,6 +312,12 @@ def _certificate(known: tuple[Identity, Mapping[int, RevocationList | None]] | N
     )
     for name, text, by_ca in revocation_gauges(lists, now_wall):
         yield _gauge(name, text, ["ca"], by_ca)
+
+
+def _loop() -> Metric:
+    """Called on the loop's thread."""
+    text = "Processor time of the thread that serves all streams: it can have one core."
+    return _counter("plr_loop_cpu_seconds_total", text, [], {(): time.thread_time()})
 
 
 def _stun(servers: Sequence[StunServer]) -> Iterable[Metric]:

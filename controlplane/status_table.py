@@ -75,6 +75,8 @@ def _details(status: SidecarStatus) -> Iterator[str]:
             state = "ready on the robot" if use.fallback_up else "MISSING: its node does not run, or has another type"
             yield f"{use.name}: fallback {state}"
     yield from columns([_path(path) for path in status.paths])
+    for interface in status.down:
+        yield f"{interface} DOWN: it would be used, and is not there, or has no link or no address"
 
 
 def _unmet(status: SidecarStatus, offered: Sequence[str]) -> Iterator[str]:

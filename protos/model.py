@@ -308,6 +308,8 @@ class CandidateSet:
     """Grows within a session (64 bits)."""
     signature: bytes = field(default=b"", repr=False)
     """Over candidates, serial and session, for the peers (`protos/candidate_signature.py`); none in insecure mode."""
+    down: tuple[InterfaceLabel, ...] = ()
+    """Interfaces that it would use and that carry nothing now; for the operator's eyes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from protos.model import NO_REVOCATIONS, RevocationSet, Version
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, PathReport, Peer, ServiceMapping, ServiceName, ServiceUse
+    from protos.model import InterfaceName, NodeName, PathReport, Peer, ServiceMapping, ServiceName, ServiceUse
 
 _NONE_YET = Version(0)
 
@@ -63,5 +63,7 @@ class SidecarStatus:
     revocations: RevocationSet = NO_REVOCATIONS
     unmet: tuple[ServiceName, ...] = ()
     """Services that its configuration names and nobody serves."""
+    down: tuple[InterfaceName, ...] = ()
+    """Interfaces that it would use and that carry nothing now."""
     abridged: bool = False
     """Its addresses, mapping and paths are left out, as it is in order and one of many."""

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from protos.candidate_signature import sign_candidates
 from protos.convert.fields import MAX_CANDIDATES
 from protos.model import MAX_CANDIDATES_OF_INTERFACE, CandidateSet
+from protos.preferences import InterfaceLabel
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from protos.model import Candidate, InterfaceName, SessionId
-    from protos.preferences import InterfaceLabel
     from protos.tls_files import TlsFiles
 
 log = logging.getLogger(__name__)
@@ -39,11 +39,17 @@ class Announcer:
         self._labels = labels
         self._serial = 0
         self._candidates: tuple[Candidate, ...] = ()
+        self._down: tuple[InterfaceName, ...] = ()
         self._left_out: dict[InterfaceName, int] = {}
 
-    def announce(self, candidates: Iterable[Candidate]) -> CandidateSet:
-        """Return the announcement of these candidates, of each interface the best first: some 0.1 ms."""
+    def announce(self, candidates: Iterable[Candidate], down: Iterable[InterfaceName] = ()) -> CandidateSet:
+        """Return the announcement of these candidates, of each interface the best first: some 0.1 ms.
+
+        `down`: interfaces that would have candidates if they carried anything.
+        """
         found = tuple(candidates)
+        announced = {candidate.interface for candidate in found}
+        self._down = tuple(islice((name for name in down if name not in announced), MAX_CANDIDATES))
         self._candidates = tuple(islice(_first_of_each(found), MAX_CANDIDATES))
         self._log_left_out(found)
         return self.again()
@@ -55,7 +61,9 @@ class Announcer:
         if self._tls is not None:
             signature = sign_candidates(self._tls().private_key, self._session, self._serial, self._candidates)
         labels = self._labels(candidate.interface for candidate in self._candidates)
-        return CandidateSet(self._candidates, labels, self._serial, signature)
+        known = {label.interface: label for label in self._labels(self._down)}
+        down = tuple(known.get(name) or InterfaceLabel(name) for name in self._down)
+        return CandidateSet(self._candidates, labels, self._serial, signature, down)
 
     def _log_left_out(self, found: tuple[Candidate, ...]) -> None:
         left_out = Counter(one.interface for one in found) - Counter(one.interface for one in self._candidates)

@@ -15,8 +15,8 @@ from protos.host_port import check_remote
 from protos.names import domain_label, node_name
 from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 
-_INTERFACE = re.compile(r"[^\s/]{1,15}")
-_INTERFACE_GLOB = re.compile(r"[^\s/]{1,64}")
+_INTERFACE = re.compile(r"[!-.0-~]{1,15}")
+_INTERFACE_GLOB = re.compile(r"[!-.0-~]{1,64}")
 _SERVICE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _SERVICE_GLOB = re.compile(r"[/*?\[][A-Za-z0-9_/*?\[\]!-]*")
 _GLOB_CHARACTERS = frozenset("*?[")

@@ -311,9 +311,9 @@ class Sidecar:
     def _on_stun(self, interface: InterfaceName, event: StunEvent) -> None:
         self._interfaces.on_stun_event(interface, event)
 
-    def _tell_candidates(self, candidates: tuple[Candidate, ...]) -> None:
+    def _tell_candidates(self, candidates: tuple[Candidate, ...], down: tuple[InterfaceName, ...]) -> None:
         with self._announcing:
-            self._control.set_candidates(self._announcer.announce(candidates))
+            self._control.set_candidates(self._announcer.announce(candidates, down))
         own: dict[InterfaceName, list[str]] = {}
         for candidate in candidates:
             if candidate.kind is CandidateKind.HOST:

@@ -42,6 +42,7 @@ from controlplane.core.picture import Picture
 from controlplane.core.plan import Plan
 from controlplane.core.problem import BlockKey, Problem
 from controlplane.core.publisher import Publisher
+from controlplane.core.reached import Reached
 from controlplane.core.reconcile import changed_robots
 from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry import Admission, Refusal, Registry, StreamId
@@ -49,7 +50,7 @@ from controlplane.core.report_filter import believable
 from controlplane.core.restlessness import Restlessness
 from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
-from controlplane.core.status import statuses
+from controlplane.core.status import is_met, statuses
 from controlplane.core.urgency import Urgency
 from protos.errors import DecodeError
 from protos.fleet_events import Why
@@ -152,6 +153,7 @@ class ControlCore:
         self._refused_offers = RefusedOffers()
         self.restlessness = Restlessness()
         self.urgency = Urgency()
+        self.reached = Reached()
         self._publish_at: float | None = None
         self._publications: deque[Iterator[Send | None]] = deque()
         """Begun, and told to some; the first one goes on first."""
@@ -244,6 +246,9 @@ class ControlCore:
         report, left_out = believable(report, name, self.registry, self.permits)
         self.counters.reports += not report.continues
         self.counters.report_entries_forbidden += left_out
+        for path in report.paths:
+            if path.up:
+                self.reached.note(name, path.server)
         surprised = self._drawing.reported(name, report)
         change = Change.MISSES if surprised else Change.REPORT
         if self.estimator.merge(name, report, now):
@@ -632,7 +637,8 @@ class ControlCore:
             self.plan,
             self._picture,
             self.estimator,
-            is_there=lambda server: self.registry.get(server) is not None,
+            self.reached,
+            is_there=lambda server: is_met(name, server, self.registry, self.permits),
             seen_at=self.registry.heard_at(name, now),
             now=now,
         )

@@ -120,6 +120,17 @@ class _Service:
         self.clock = HeardClock(now)
 
 
+class _Outcomes:
+    """What became of one robot's requests of a service: lately, and in all since this is kept."""
+
+    __slots__ = ("faded", "missed", "requests")
+
+    def __init__(self, half_life_s: float, now: float) -> None:
+        self.faded = FadedCount(half_life_s, now)
+        self.requests = 0
+        self.missed = 0
+
+
 class _Pair:
     """Requests of a service over a path, and how often its server had changed when that was looked at last."""
 
@@ -156,7 +167,7 @@ class _Robot:
         self.joints: OrderedDict[JointKey, FadedTrials] = OrderedDict()
         self.fates: OrderedDict[FateKey, SharedFate] = OrderedDict()
         self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
-        self.outcomes: OrderedDict[ServiceName, FadedCount] = OrderedDict()
+        self.outcomes: OrderedDict[ServiceName, _Outcomes] = OrderedDict()
         self.late: OrderedDict[ServiceName, LateFate] = OrderedDict()
         self.penalties = Penalties()
         self.troubles: dict[tuple[ServiceName, float, InterfaceName], InterfaceTrouble] = {}
@@ -222,9 +233,11 @@ class Estimator:
             changed |= network.merge_path(path, now)
         for outcome in report.outcomes:
             bad = outcome.deadline_missed + outcome.failed
-            count = tables.outcomes.get(outcome.service) or FadedCount(self._half_life_s, now)
+            count = tables.outcomes.get(outcome.service) or _Outcomes(self._half_life_s, now)
             self._keep(tables.outcomes, outcome.service, count, MAX_OUTCOMES_PER_ROBOT)
-            count.add(outcome.ok + bad, bad, now)
+            count.faded.add(outcome.ok + bad, bad, now)
+            count.requests += outcome.ok + bad
+            count.missed += bad
             self._late_fate(tables, outcome.service, now).add_requests(outcome.ok + bad, bad, now)
         self._forget_old(tables, now)
         self._dropped += network.dropped - dropped_before
@@ -239,7 +252,7 @@ class Estimator:
         forget_before(tables.joints, since, lambda together: together.at)
         forget_before(tables.fates, since, lambda fate: fate.at)
         forget_before(tables.services, since, lambda of_service: of_service.sizes.at)
-        forget_before(tables.outcomes, since, lambda count: count.at)
+        forget_before(tables.outcomes, since, lambda count: count.faded.at)
         forget_before(tables.late, since, lambda late: late.at)
         while (oldest := next(iter(self._robots.values()))).heard_at < since:
             self._robots.popitem(last=False)
@@ -338,9 +351,16 @@ class Estimator:
         """Share of the robot's recent requests that missed their deadline or failed; None without any."""
         tables = self._robots.get(robot)
         count = tables.outcomes.get(service) if tables is not None else None
-        if count is None or count.weight(now) < IGNORANCE.misses:
+        if count is None or count.faded.weight(now) < IGNORANCE.misses:
             return None
-        return count.ratio()
+        return count.faded.ratio()
+
+    def counted(self, robot: NodeName, service: ServiceName) -> tuple[int, int]:
+        """The robot's requests that ended, and those of them that missed their deadline or failed; they begin at 0
+        again when the robot is not heard of for long."""
+        tables = self._robots.get(robot)
+        count = tables.outcomes.get(service) if tables is not None else None
+        return (count.requests, count.missed) if count is not None else (0, 0)
 
     def estimate(
         self,

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from controlplane.core.estimator import Estimator
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
+    from controlplane.core.reached import Reached
     from controlplane.core.registry import Sidecar
     from controlplane.core.snapshots import Track
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
@@ -40,6 +41,17 @@ class PathView:
 
 
 @dataclass(frozen=True, slots=True)
+class InterfaceView:
+    """One interface of a robot."""
+
+    name: InterfaceName
+    carrier: str
+    """Whose network it uses; its own name where that is not known."""
+    up: bool
+    """Whether it carries anything, as the robot says."""
+
+
+@dataclass(frozen=True, slots=True)
 class MissView:
     """How often requests of a robot's service miss the deadline."""
 
@@ -48,6 +60,10 @@ class MissView:
     observed: float | None
     target: float
     """What its configuration wants; 0: as few as can be."""
+    requests: int
+    """That have ended ..."""
+    missed: int
+    """... and of these the ones that missed the deadline or failed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +77,13 @@ class MemberView:
     paths: tuple[PathView, ...] = ()
     mapping: tuple[ServiceMapping, ...] = ()
     misses: tuple[MissView, ...] = ()
-    carriers: tuple[tuple[InterfaceName, str], ...] = ()
-    """Whose network each of its interfaces uses; its own name where that is not known."""
+    interfaces: tuple[InterfaceView, ...] = ()
+    paths_of_services: tuple[tuple[ServiceName, int], ...] = ()
+    """Over how many paths requests go, of each service that it was told of or cannot have."""
+    lost: frozenset[NodeName] = frozenset()
+    """Servers that it does not reach, and did."""
+    unproven: frozenset[NodeName] = frozenset()
+    """Servers that it does not reach, and nobody ever has."""
     follows: bool = True
     """Whether it has confirmed the mapping that it was sent last, if there is one."""
 
@@ -73,12 +94,14 @@ def view_of(
     plan: Plan,
     picture: Picture,
     estimator: Estimator,
+    reached: Reached,
     *,
     is_there: Callable[[NodeName], bool],
     seen_at: float,
     now: float,
 ) -> MemberView:
-    """Look at one; some 30 us for a robot with 15 paths. `is_there` tells which servers are."""
+    """Look at one; some 30 us for a robot with 15 paths. `is_there` tells which servers the robot has to
+    do with."""
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
         return MemberView(sidecar.name, sidecar.role, connected, seen_at)
@@ -86,20 +109,38 @@ def view_of(
     # gone.
     carriers = dict.fromkeys(interfaces_of(sidecar)[:MAX_VIEWED], "")
     carriers |= {label.interface: label.carrier for label in sidecar.labels if label.interface in carriers}
-    paths = (
+    interfaces = [InterfaceView(name, carrier or name, up=True) for name, carrier in carriers.items()]
+    down = (label for label in sidecar.down if label.interface not in carriers)
+    interfaces += (InterfaceView(label.interface, label.carrier or label.interface, up=False) for label in down)
+    found = (
         path for path in estimator.path_views(sidecar.name) if path.interface in carriers and is_there(path.server)
     )
+    paths = tuple(islice(found, MAX_VIEWED))
+    unreached = {path.server for path in paths} - {path.server for path in paths if path.up}
     return MemberView(
         name=sidecar.name,
         role=sidecar.role,
         connected=connected,
         seen_at=seen_at,
-        paths=tuple(islice(paths, MAX_VIEWED)),
+        paths=paths,
         mapping=(mapping.sent or ())[:MAX_VIEWED],
         misses=tuple(_misses(sidecar.name, use, plan, picture, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
-        carriers=tuple((interface, carrier or interface) for interface, carrier in carriers.items()),
+        interfaces=tuple(interfaces[:MAX_VIEWED]),
+        paths_of_services=_paths_of_services(sidecar, mapping.sent),
+        lost=frozenset(server for server in unreached if reached.by(sidecar.name, server)),
+        unproven=frozenset(server for server in unreached if not reached.by_anyone(server)),
         follows=mapping.state not in (SyncState.STALE, SyncState.REJECTED),
     )
+
+
+def _paths_of_services(
+    sidecar: Sidecar, sent: tuple[ServiceMapping, ...] | None
+) -> tuple[tuple[ServiceName, int], ...]:
+    """What the robot carries, as told last, if it was told; and what it wants and nobody serves."""
+    told = {mapping.service: len(mapping.assignments) for mapping in sent or ()}
+    carried = {use.name: told[use.name] for use in sidecar.uses[:MAX_VIEWED] if use.name in told}
+    unmet = {name: 0 for name in sidecar.unmet if name not in carried}
+    return tuple(islice((carried | unmet).items(), MAX_VIEWED))
 
 
 def _misses(
@@ -110,5 +151,9 @@ def _misses(
     sending = notes.sending if notes is not None else NO_SENDING
     predicted = predicted_miss(use, block, sending) if block is not None else None
     return MissView(
-        use.name, predicted, estimator.observed_miss_ratio(robot, use.name, now), use.wanted_miss or use.target_miss
+        use.name,
+        predicted,
+        estimator.observed_miss_ratio(robot, use.name, now),
+        use.wanted_miss or use.target_miss,
+        *estimator.counted(robot, use.name),
     )

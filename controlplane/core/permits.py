@@ -78,6 +78,10 @@ class Permits:
         self._permits[group, cloud.name] = (cloud.offered, permit)
         return permit
 
+    def may_meet(self, robot: NodeName, cloud: Sidecar) -> bool:
+        """Whether a robot may call anything on a cloud."""
+        return self._policy is None or bool(self.of(self.group(robot), cloud))
+
     def may_offer(self, cloud: NodeName, service: ServiceName) -> bool:
         """Whether a cloud may offer a service."""
         if self._policy is None:

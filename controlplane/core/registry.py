@@ -86,6 +86,8 @@ class Sidecar:
     """Services it has offered since it registered, at most MAX_OFFERED."""
     labels: tuple[InterfaceLabel, ...] = ()
     """What a robot says of its interfaces."""
+    down: tuple[InterfaceLabel, ...] = ()
+    """Interfaces that it would use and that carry nothing now."""
     candidates_serial: int = 0
     candidates_signature: bytes = field(default=b"", repr=False)
     signed_under: bytes = field(default=b"", repr=False)
@@ -267,18 +269,20 @@ class Registry:
         return known is not None and known.stream == stream
 
     def set_candidates(self, name: NodeName, told: CandidateSet) -> bool:
-        """Replace its addresses and what it says of its interfaces; True if they changed."""
+        """Replace its addresses and what it says of its interfaces; True if they changed for others: which ones carry
+        nothing is the operator's business."""
         known = self._sidecars[name]
         changed = replace(
             known,
             candidates=told.candidates,
             labels=told.labels,
+            down=told.down,
             candidates_serial=told.serial,
             candidates_signature=told.signature,
             signed_under=known.registration.credential if told.signature else b"",
         )
         self._sidecars[name] = changed
-        return changed != known
+        return changed != replace(known, down=told.down)
 
     def set_services(self, name: NodeName, services: ServiceSet) -> bool:
         """Replace its services; True if they changed for others: which ones are unmet is the operator's business."""

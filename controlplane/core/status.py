@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from controlplane.core.picture import interfaces_of
 from protos.status import SidecarStatus
 
 if TYPE_CHECKING:
@@ -15,6 +16,12 @@ if TYPE_CHECKING:
     from controlplane.core.publisher import Publisher
     from controlplane.core.registry import Registry
     from protos.model import NodeName
+
+
+def is_met(robot: NodeName, server: NodeName, registry: Registry, permits: Permits) -> bool:
+    """Whether a server is registered and the robot may talk to it: of others it may have told what is over."""
+    cloud = registry.get(server)
+    return cloud is not None and permits.may_meet(robot, cloud)
 
 
 def statuses(
@@ -34,8 +41,14 @@ def statuses(
             continue
         snapshots = publisher[name]
         services = snapshots.mapping.sent or ()
-        paths = tuple(estimator.paths(name))
-        shorter = abridged and all(path.up for path in paths) and all(mapping.assignments for mapping in services)
+        announced = set(interfaces_of(sidecar))
+        paths = tuple(
+            path
+            for path in estimator.paths(name)
+            if path.interface in announced and is_met(name, path.server, registry, permits)
+        )
+        in_order = all(path.up for path in paths) and all(mapping.assignments for mapping in services)
+        shorter = abridged and in_order and not sidecar.down
         yield SidecarStatus(
             peer=replace(sidecar.as_peer(), candidates=()) if shorter else sidecar.as_peer(),
             connected=sidecar.stream is not None,
@@ -49,5 +62,6 @@ def statuses(
             refused_offers=permits.refused_offers(sidecar),
             revocations=sidecar.revocations,
             unmet=sidecar.unmet,
+            down=tuple(label.interface for label in sidecar.down),
             abridged=shorter,
         )

@@ -20,7 +20,14 @@ from protos.convert.fields import (
 )
 from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
 from protos.convert.reports import path_from_proto, path_to_proto
-from protos.convert.types import peer_from_proto, peer_to_proto, service_names, use_from_proto, use_to_proto
+from protos.convert.types import (
+    interface_names,
+    peer_from_proto,
+    peer_to_proto,
+    service_names,
+    use_from_proto,
+    use_to_proto,
+)
 from protos.errors import DecodeError
 from protos.model import MAX_PATHS, MAX_UNMET, NO_REVOCATIONS, RevocationSet
 from protos.names import clean_text, node_name, text
@@ -83,6 +90,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
         revocations=revocations_from_proto(message.revocations),
         unmet=service_names(message.unmet, MAX_UNMET, "unmet"),
+        down=interface_names(message.down, "down"),
         abridged=message.abridged,
     )
 
@@ -101,6 +109,7 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         refused_offers=status.refused_offers,
         revocations=revocations_to_proto(status.revocations),
         unmet=status.unmet,
+        down=status.down,
         abridged=status.abridged,
     )
 

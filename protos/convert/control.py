@@ -24,6 +24,7 @@ from protos.convert.types import (
     announced_from_proto,
     candidate_to_proto,
     credential_from_proto,
+    down_from_proto,
     label_to_proto,
     labels_from_proto,
     offer_to_proto,
@@ -257,6 +258,7 @@ def _candidate_set_from_proto(message: control_pb2.Candidates) -> CandidateSet:
         labels_from_proto(message.labels, candidates),
         message.serial,
         signature_from_proto(message.signature),
+        down_from_proto(message.down, candidates),
     )
 
 
@@ -266,6 +268,7 @@ def _candidate_set_to_proto(value: CandidateSet) -> control_pb2.Candidates:
         labels=map(label_to_proto, value.labels),
         serial=value.serial,
         signature=value.signature,
+        down=map(label_to_proto, value.down),
     )
 
 

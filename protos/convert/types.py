@@ -33,6 +33,7 @@ from protos.model import (
     Candidate,
     CandidateKind,
     InterfaceId,
+    InterfaceName,
     Peer,
     Role,
     ServiceName,
@@ -150,6 +151,19 @@ def labels_from_proto(
         if label.interface not in known_names:
             raise DecodeError(f"labels name {label.interface!a}, which no candidate does")
     return labels
+
+
+def down_from_proto(
+    messages: Sequence[types_pb2.InterfaceLabel], candidates: Sequence[Candidate]
+) -> tuple[InterfaceLabel, ...]:
+    """Check which interfaces carry nothing: none that a candidate names."""
+    down = each(messages, MAX_CANDIDATES, "down", _label_from_proto)
+    names = [label.interface for label in down]
+    unique(names, "down")
+    both = {candidate.interface for candidate in candidates}.intersection(names)
+    if both:
+        raise DecodeError(f"down names {min(both)!a}, which a candidate does too")
+    return down
 
 
 def _label_from_proto(message: types_pb2.InterfaceLabel) -> InterfaceLabel:
@@ -273,6 +287,13 @@ def service_names(values: Sequence[str], limit: int, field: str) -> tuple[Servic
     if len(values) > limit:
         raise DecodeError(f"{field} has {len(values)} elements, more than {limit}")
     return tuple(service_name(value, field) for value in values)
+
+
+def interface_names(values: Sequence[str], field: str) -> tuple[InterfaceName, ...]:
+    """Check a repeated field of names of interfaces."""
+    if len(values) > MAX_CANDIDATES:
+        raise DecodeError(f"{field} has {len(values)} elements, more than {MAX_CANDIDATES}")
+    return tuple(interface_name(value, field) for value in values)
 
 
 def credential_from_proto(value: bytes) -> bytes:

@@ -81,7 +81,7 @@ class InterfaceManager:
         own: OwnSession,
         token: bytes,
         data_plane: ThreadedDataPlane,
-        candidates_changed: Callable[[tuple[Candidate, ...]], None],
+        candidates_changed: Callable[[tuple[Candidate, ...], tuple[InterfaceName, ...]], None],
     ) -> None:
         self._config = config
         self._own = own
@@ -95,6 +95,7 @@ class InterfaceManager:
         self._stun_servers: tuple[Address, ...] = ()
         self._resolver = HostNames("STUN server", self._use_stun_servers)
         self._candidates: tuple[Candidate, ...] = ()
+        self._down: tuple[InterfaceName, ...] = ()
         self._readiness = Readiness(stun_enabled=config.stun.enabled)
         self._skipped: dict[InterfaceName, str] = {}
         self._idle: frozenset[InterfaceName] = frozenset()
@@ -358,10 +359,21 @@ class InterfaceManager:
             candidates: list[Candidate] = []
             for managed in self._managed.values():
                 candidates += managed.candidates(self._advertised(managed.name))
-            if tuple(candidates) == self._candidates:
+            down = self._carry_nothing()
+            if (tuple(candidates), down) == (self._candidates, self._down):
                 return
-            self._candidates = tuple(candidates)
-        self._candidates_changed(self._candidates)
+            self._candidates, self._down = tuple(candidates), down
+        self._candidates_changed(self._candidates, self._down)
+
+    def _carry_nothing(self) -> tuple[InterfaceName, ...]:
+        """Those that should: named by the configuration, or in use earlier in this run.
+
+        A port that was never plugged in is nobody's trouble where all interfaces are used, or a glob matches it.
+        """
+        named = self._config.interfaces or ()
+        idle = {name for name in self._idle if name in named or name in self._numbers}
+        suspended = {name for name, managed in self._managed.items() if managed.suspended}
+        return tuple(sorted(idle | suspended))
 
     def _advertised(self, name: InterfaceName) -> list[str]:
         first = next(iter(self._managed), None)

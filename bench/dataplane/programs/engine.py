@@ -182,7 +182,7 @@ class EngineProgram:
 
     # -- what the control plane would do --------------------------------------------------------------------------
 
-    def _on_candidates(self, candidates: tuple[Candidate, ...]) -> None:
+    def _on_candidates(self, candidates: tuple[Candidate, ...], _: tuple[InterfaceName, ...]) -> None:
         self._candidates = candidates
         if candidates:
             self._have_candidates.set()

@@ -272,6 +272,7 @@ class SidecarStatus(_message.Message):
     REVOCATIONS_FIELD_NUMBER: _builtins.int
     UNMET_FIELD_NUMBER: _builtins.int
     ABRIDGED_FIELD_NUMBER: _builtins.int
+    DOWN_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
@@ -301,6 +302,10 @@ class SidecarStatus(_message.Message):
     def unmet(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Services that its configuration names and nobody serves."""
 
+    @_builtins.property
+    def down(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Interfaces that it would use and that carry nothing now."""
+
     def __init__(
         self,
         *,
@@ -317,10 +322,11 @@ class SidecarStatus(_message.Message):
         revocations: _control_pb2.Revocations | None = ...,
         unmet: _abc.Iterable[_builtins.str] | None = ...,
         abridged: _builtins.bool = ...,
+        down: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unmet", b"unmet", "uses", b"uses"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unmet", b"unmet", "uses", b"uses"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -208,6 +208,7 @@ class Candidates(_message.Message):
     LABELS_FIELD_NUMBER: _builtins.int
     SERIAL_FIELD_NUMBER: _builtins.int
     SIGNATURE_FIELD_NUMBER: _builtins.int
+    DOWN_FIELD_NUMBER: _builtins.int
     serial: _builtins.int
     """Grows with each message of a session."""
     signature: _builtins.bytes
@@ -220,6 +221,10 @@ class Candidates(_message.Message):
     def labels(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.InterfaceLabel]:
         """Of interfaces that candidates name; an interface without one has no carrier and costs 1."""
 
+    @_builtins.property
+    def down(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.InterfaceLabel]:
+        """Interfaces that it would use and that carry nothing now, hence without a candidate; for the operator's eyes."""
+
     def __init__(
         self,
         *,
@@ -227,10 +232,11 @@ class Candidates(_message.Message):
         labels: _abc.Iterable[_types_pb2.InterfaceLabel] | None = ...,
         serial: _builtins.int = ...,
         signature: _builtins.bytes = ...,
+        down: _abc.Iterable[_types_pb2.InterfaceLabel] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "labels", b"labels", "serial", b"serial", "signature", b"signature"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "down", b"down", "labels", b"labels", "serial", b"serial", "signature", b"signature"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -16,12 +16,14 @@ from controlplane.config import ControlPlaneConfig
 from controlplane.core.control_events import Settings
 from controlplane.core.departed import Departure
 from controlplane.core.fading import FadedHistogram
-from controlplane.core.fleet_view import MemberView, MissView, PathView
+from controlplane.core.fleet_view import InterfaceView, MemberView, MissView, PathView
+from controlplane.core.policy import Policy
 from controlplane.core.registry import Refusal
 from controlplane.event_log import EventLog
 from controlplane.fleet_metrics import MAX_GONE, MAX_SERIES, REUSED_S, Fleet, FleetCollector, families
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
+from controlplane.status_table import render
 from protos.fleet_events import DepartedSidecar, Why
 from protos.histogram import Histogram
 from protos.model import (
@@ -38,7 +40,7 @@ from protos.model import (
 )
 from protos.preferences import InterfaceLabel
 from protos.redundancy_mode import RedundancyMode
-from tests.sim.control_world import SETTLED_S, World
+from tests.sim.control_world import SETTLED_S, SimSidecar, World
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, path, registration, use
 
 if TYPE_CHECKING:
@@ -120,6 +122,137 @@ def test_whose_network_an_interface_uses_is_told_by_the_robot_or_by_the_interfac
         {"robot": "robot", "interface": "wlan0", "carrier": "wlan0"},
         {"robot": "robot", "interface": "wwan0", "carrier": "telekom"},
     ]
+
+
+def test_an_interface_that_carries_nothing_is_told_of_and_its_paths_are_not() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    world.cloud("a")
+    robot = world.robot()
+    world.say(robot, Report(paths=(path("wlan0", "a"), path("wwan0", "a"))))
+    world.run(SETTLED_S)
+    down = (InterfaceLabel(InterfaceName("wwan0"), "telekom"), InterfaceLabel(InterfaceName("eth0")))
+    world.say(robot, CandidateSet(interfaces("wlan0"), down=down))
+    found = series(families(fleet_of(world)))
+    told = {dict(key[1])["interface"]: up for key, up in found.items() if key[0] == "plr_robot_interface_up"}
+    assert told == {"wlan0": 1.0, "wwan0": 0.0, "eth0": 0.0}
+    assert value(found, "plr_robot_interface_info", robot="robot", interface="wwan0", carrier="telekom") == 1.0
+    assert value(found, "plr_robot_interface_info", robot="robot", interface="eth0", carrier="eth0") == 1.0
+    paths = {dict(key[1])["interface"] for key in found if key[0] == "plr_robot_path_up"}
+    assert paths == {"wlan0"}
+    (status,) = world.core.status(world.now, [NodeName("robot")], abridged=True)
+    assert (status.down, status.abridged) == (("wwan0", "eth0"), False)
+    assert [one.interface for one in status.paths] == ["wlan0"]
+    assert "wwan0 DOWN" in render([status])
+
+
+def test_nobody_is_told_which_interfaces_carry_nothing() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    cloud = world.cloud("a")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    sets, solvings = len(cloud.peer_sets), world.solvings
+    world.say(robot, CandidateSet(interfaces("wlan0", "wwan0"), down=(InterfaceLabel(InterfaceName("eth0")),)))
+    world.run(SETTLED_S)
+    assert (len(cloud.peer_sets), world.solvings) == (sets, solvings)
+
+
+def test_requests_are_counted_and_the_counts_begin_at_nothing() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    world.cloud("a")
+    robot = world.robot()
+    world.run(SETTLED_S)
+    of_service = {"robot": "robot", "service": PLAN}
+
+    def counted() -> tuple[float | None, float | None]:
+        found = series(families(fleet_of(world)))
+        names = ("plr_robot_requests_total", "plr_robot_requests_missed_total")
+        return tuple(value(found, name, **of_service) for name in names)  # type: ignore[return-value]  # two of them
+
+    assert counted() == (0.0, 0.0)
+    for _ in range(2):
+        world.say(robot, Report(outcomes=(OutcomeReport(PLAN, ok=90, deadline_missed=7, failed=3),)))
+    assert counted() == (200.0, 20.0)
+
+
+def test_a_service_that_nobody_serves_goes_over_no_path_whoever_says_so() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    server = world.cloud("a")
+    robot = world.robot()
+    world.say(robot, Report(paths=(path("wlan0", "a"), path("wwan0", "a"))))
+    world.run(SETTLED_S)
+
+    def paths() -> dict[str, float]:
+        found = series(families(fleet_of(world)))
+        return {dict(key[1])["service"]: n for key, n in found.items() if key[0] == "plr_robot_service_paths"}
+
+    assert paths() == {PLAN: 2.0}
+    world.say(server, ServiceSet())
+    world.run(SETTLED_S)
+    assert paths() == {PLAN: 0.0}, "its ROS server is gone"
+    world.say(robot, ServiceSet(unmet=(PLAN,)))
+    assert paths() == {PLAN: 0.0}, "the robot has withdrawn it"
+    world.say(robot, ServiceSet())
+    assert paths() == {}, "it wants it no more"
+
+
+def test_a_policy_that_forbids_a_service_leaves_it_no_path() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    world.cloud("a")
+    robot = world.robot()
+    world.say(robot, Report(paths=(path("wlan0", "a"),)))
+    world.run(SETTLED_S)
+    world.core.set_policy(Policy(), world.now)
+    world.run(SETTLED_S)
+    found = series(families(fleet_of(world)))
+    assert value(found, "plr_robot_service_paths", robot="robot", service=PLAN) == 0.0
+
+
+def test_who_has_never_reached_a_server_is_no_witness_of_its_end() -> None:
+    """Of two sites, each with a server that the other's robots do not reach."""
+    world = World(Settings(warm_up_s=0.0))
+    for name in ("a", "b", "new"):
+        world.cloud(name)
+    first, second = world.robot("first"), world.robot("second")
+
+    def says(robot: SimSidecar, *up: str) -> None:
+        world.say(robot, Report(paths=tuple(path("wlan0", name, up=name in up) for name in ("a", "b", "new"))))
+
+    def robots(server: str) -> tuple[float | None, ...]:
+        found = series(families(fleet_of(world)))
+        return tuple(value(found, "plr_server_robots", server=server, path=path) for path in ("up", "lost", "never"))
+
+    says(first, "a")
+    says(second, "b")
+    assert [robots(name) for name in ("a", "b", "new")] == [(1, 0, 0), (1, 0, 0), (0, 0, 2)]
+    world.leave(second)
+    assert [robots(name) for name in ("a", "b", "new")] == [(1, 0, 0), (0, 0, 0), (0, 0, 1)]
+    second = world.robot("second")
+    says(second, "a")
+    assert robots("b") == (0, 1, 0), "it did before it was stopped"
+    says(second)
+    assert robots("b") == (0, 0, 0), "who reaches nobody blames nobody"
+
+
+@pytest.mark.audit("ops-11")
+def test_paths_to_who_said_goodbye_or_is_forbidden_are_not_told_of_as_up() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    left, kept = world.cloud("a"), world.cloud("b")
+    robot = world.robot()
+    world.say(robot, Report(paths=(path("wlan0", "a"), path("wlan0", "b"))))
+    world.run(SETTLED_S)
+
+    def told() -> tuple[list[str], list[str]]:
+        found = series(families(fleet_of(world)))
+        (status,) = world.core.status(world.now, [NodeName("robot")])
+        exported = [dict(key[1])["server"] for key in found if key[0] == "plr_robot_path_up"]
+        return exported, [one.server for one in status.paths]
+
+    assert told() == (["a", "b"], ["a", "b"])
+    world.leave(left)
+    assert told() == (["b"], ["b"])
+    world.core.set_policy(Policy(), world.now)
+    assert told() == ([], [])
+    assert kept.stream is not None
 
 
 def test_a_target_is_told_of_also_where_the_mapping_is_not_chosen_by_it() -> None:
@@ -218,8 +351,9 @@ def robot_view(name: str, interfaces: int, servers: int, services: int) -> Membe
             ServiceMapping(service, tuple(Assignment(nic, cloud) for nic, cloud in zip(nics, clouds, strict=False)))
             for service in names
         ),
-        misses=tuple(MissView(service, 0.001, 0.002, 0.01) for service in names),
-        carriers=tuple((nic, "carrier") for nic in nics),
+        misses=tuple(MissView(service, 0.001, 0.002, 0.01, 10, 1) for service in names),
+        paths_of_services=tuple((service, interfaces) for service in names),
+        interfaces=tuple(InterfaceView(nic, "carrier", up=True) for nic in nics),
     )
 
 
@@ -230,7 +364,7 @@ def fleet(robots: list[MemberView], *, gone: int = 0) -> Fleet:
     return Fleet(members, left, {member.name: 1.0 for member in members}, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(("services", "expected"), [(1, 43_016), (4, 61_016)])
+@pytest.mark.parametrize(("services", "expected"), [(1, 49_031), (4, 76_031)])
 def test_a_thousand_robots_take_as_many_series_as_documented(services: int, expected: int) -> None:
     found = series(families(fleet([robot_view(f"robot-{number}", 3, 5, services) for number in range(1000)])))
     assert len(found) == expected
@@ -243,7 +377,7 @@ def test_series_are_bounded_and_one_robot_takes_none_of_others() -> None:
     found = series(families(fleet([greedy, *robots], gone=MAX_GONE)))
     assert len(found) <= MAX_SERIES + 1
     of_robot = Counter(dict(labels).get("robot") for _, labels in found)
-    assert {of_robot[f"robot-{number}"] for number in range(999)} == {58}
+    assert {of_robot[f"robot-{number}"] for number in range(999)} == {73}
     assert of_robot["greedy"] < 100
     assert (value(found, "plr_fleet_series_left_out") or 0.0) > 1000.0
 

@@ -193,7 +193,9 @@ def candidate_sets(draw: st.DrawFn) -> CandidateSet:
     names = sorted({candidate.interface for candidate in candidates})
     labelled = draw(st.lists(st.sampled_from(names), unique=True)) if names else []
     labels = tuple(InterfaceLabel(name, draw(domain_labels), draw(charges)) for name in labelled)
-    return CandidateSet(candidates, labels, draw(uint64), draw(signatures))
+    others = draw(st.lists(interface_names.filter(lambda name: name not in names), unique=True, max_size=4))
+    down = tuple(InterfaceLabel(name, draw(domain_labels), draw(charges)) for name in others)
+    return CandidateSet(candidates, labels, draw(uint64), draw(signatures), down)
 
 
 counts_of = events.flatmap(lambda total: st.tuples(st.just(total), st.integers(0, total)))

@@ -74,3 +74,16 @@ def test_no_more_is_announced_than_is_taken_and_that_is_logged_once(caplog: pyte
         parsed = parse_sidecar_message(sidecar_message_to_proto(announced).SerializeToString())
         assert isinstance(parsed, CandidateSet)
         assert parsed == announced
+
+
+@pytest.mark.audit("ops-13")
+def test_what_carries_nothing_is_named_with_its_carrier() -> None:
+    def known(interfaces: Iterable[InterfaceName]) -> tuple[InterfaceLabel, ...]:
+        return tuple(InterfaceLabel(name, "telekom") for name in interfaces if name == "wwan0")
+
+    names = [InterfaceName(name) for name in ("eth0", "wwan0", "wwan1")]
+    announcer = Announcer(SESSION, None, known)
+    announcer.announce(candidates(0, 1), names)
+    said = announcer.again()
+    assert said.down == (InterfaceLabel(names[1], "telekom"), InterfaceLabel(names[2]))
+    assert parse_sidecar_message(sidecar_message_to_proto(said).SerializeToString()) == said

@@ -35,6 +35,7 @@ class Host:
         self.error: Exception | None = None
         self.links: dict[InterfaceName, InterfaceThread] = {}
         self.candidates: tuple[Candidate, ...] = ()
+        self.down: tuple[InterfaceName, ...] = ()
         self.changes = IDLE
         config = SidecarConfig(
             name="robot",
@@ -66,8 +67,9 @@ class Host:
     def on_link_events(self, events: list[Any]) -> None:
         pass
 
-    def _candidates(self, candidates: tuple[Candidate, ...]) -> None:
+    def _candidates(self, candidates: tuple[Candidate, ...], down: tuple[InterfaceName, ...]) -> None:
         self.candidates = candidates
+        self.down = down
 
 
 @pytest.fixture
@@ -93,6 +95,26 @@ def test_an_interface_without_carrier_keeps_its_thread_and_is_offered_to_nobody(
     host.look(LO)
     assert addresses(host) == ["127.0.0.1"]
     assert host.links[LO.name] is thread
+
+
+@pytest.mark.audit("ops-13")
+def test_a_wanted_interface_that_carries_nothing_is_told_of_by_name(host: Host) -> None:
+    host.look()
+    assert list(host.down) == ["lo"], "named by the configuration, and not there at boot"
+    host.look(LO)
+    assert (addresses(host), list(host.down)) == (["127.0.0.1"], [])
+    host.look(replace(LO, carrier=False))
+    assert (addresses(host), list(host.down)) == ([], ["lo"])
+
+
+@pytest.mark.audit("ops-13")
+def test_a_port_that_a_glob_matches_is_told_of_only_when_it_was_in_use(host: Host) -> None:
+    host.manager._config = host.manager._config.model_copy(update={"interfaces": ("lo*",)})
+    never = replace(LO, name=InterfaceName("lo-spare"), index=77, carrier=False)
+    host.look(LO, never)
+    assert list(host.down) == []
+    host.look(replace(LO, carrier=False), never)
+    assert list(host.down) == ["lo"]
 
 
 def test_an_announced_end_of_a_link_suspends_it_before_any_look(host: Host) -> None:

@@ -1,0 +1,34 @@
+"""Which robots have reached which servers."""
+
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core import reached as module
+from controlplane.core.reached import Reached
+from protos.model import NodeName
+
+pytestmark = pytest.mark.audit("ops-12")
+
+A, B = NodeName("a"), NodeName("b")
+
+
+def test_it_is_remembered_by_robot_and_by_server() -> None:
+    reached = Reached()
+    reached.note(NodeName("robot"), A)
+    assert reached.by(NodeName("robot"), A)
+    assert not reached.by(NodeName("other"), A)
+    assert (reached.by_anyone(A), reached.by_anyone(B)) == (True, False)
+
+
+def test_who_reached_longest_ago_is_forgotten_first_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_PAIRS", 2)
+    reached = Reached()
+    first, second, third = (NodeName(f"robot-{number}") for number in range(3))
+    reached.note(first, A)
+    reached.note(second, B)
+    reached.note(first, A)
+    reached.note(third, A)
+    assert (len(reached), reached.forgotten) == (2, 1)
+    assert reached.by(first, A)
+    assert not reached.by_anyone(B)
