@@ -639,6 +639,7 @@ class ControlCore:
             self.estimator,
             self.reached,
             is_there=lambda server: is_met(name, server, self.registry, self.permits),
+            is_offered=self.registry.is_offered,
             seen_at=self.registry.heard_at(name, now),
             now=now,
         )

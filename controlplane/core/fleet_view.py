@@ -97,11 +97,12 @@ def view_of(
     reached: Reached,
     *,
     is_there: Callable[[NodeName], bool],
+    is_offered: Callable[[ServiceName], bool],
     seen_at: float,
     now: float,
 ) -> MemberView:
     """Look at one; some 30 us for a robot with 15 paths. `is_there` tells which servers the robot has to
-    do with."""
+    do with, `is_offered` which services anybody offers."""
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
         return MemberView(sidecar.name, sidecar.role, connected, seen_at)
@@ -126,7 +127,7 @@ def view_of(
         mapping=(mapping.sent or ())[:MAX_VIEWED],
         misses=tuple(_misses(sidecar.name, use, plan, picture, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
         interfaces=tuple(interfaces[:MAX_VIEWED]),
-        paths_of_services=_paths_of_services(sidecar, mapping.sent),
+        paths_of_services=_paths_of_services(sidecar, mapping.sent, is_offered),
         lost=frozenset(server for server in unreached if reached.by(sidecar.name, server)),
         unproven=frozenset(server for server in unreached if not reached.by_anyone(server)),
         follows=mapping.state not in (SyncState.STALE, SyncState.REJECTED),
@@ -134,13 +135,16 @@ def view_of(
 
 
 def _paths_of_services(
-    sidecar: Sidecar, sent: tuple[ServiceMapping, ...] | None
+    sidecar: Sidecar, sent: tuple[ServiceMapping, ...] | None, is_offered: Callable[[ServiceName], bool]
 ) -> tuple[tuple[ServiceName, int], ...]:
-    """What the robot carries, as told last, if it was told; and what it wants and nobody serves."""
+    """What the robot carries, as told last, if it was told; and what it wants and nobody serves: by what it says, or
+    since it carried that until nobody offered it."""
     told = {mapping.service: len(mapping.assignments) for mapping in sent or ()}
-    carried = {use.name: told[use.name] for use in sidecar.uses[:MAX_VIEWED] if use.name in told}
-    unmet = {name: 0 for name in sidecar.unmet if name not in carried}
-    return tuple(islice((carried | unmet).items(), MAX_VIEWED))
+    carries = [use.name for use in sidecar.uses]
+    found = {name: told[name] for name in carries[:MAX_VIEWED] if name in told}
+    given_up = sorted(name for name in sidecar.carried.difference(carries) if not is_offered(name))
+    lacks = {name: 0 for name in (*sidecar.unmet, *given_up) if name not in found}
+    return tuple(islice((found | lacks).items(), MAX_VIEWED))
 
 
 def _misses(

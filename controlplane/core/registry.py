@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 import heapq
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
@@ -84,6 +84,8 @@ class Sidecar:
     draining: bool = False
     offered: frozenset[ServiceName] = frozenset()
     """Services it has offered since it registered, at most MAX_OFFERED."""
+    carried: frozenset[ServiceName] = frozenset()
+    """Services it has carried in this run since it registered, at most MAX_OFFERED."""
     labels: tuple[InterfaceLabel, ...] = ()
     """What a robot says of its interfaces."""
     down: tuple[InterfaceLabel, ...] = ()
@@ -180,6 +182,8 @@ class Registry:
         self._leases: dict[NodeName, _Lease] = {}
         self._sidecars: dict[NodeName, Sidecar] = {}
         self._sessions: dict[SessionId, NodeName] = {}
+        self._offers: Counter[ServiceName] = Counter()
+        """By how many each is offered."""
         self._removals: OrderedDict[NodeName, tuple[RemovalReason, float]] = OrderedDict()
         """Why, and when each was heard last."""
         # One entry a name, at most as late as its lease ends: renewing a lease does not touch it.
@@ -225,7 +229,8 @@ class Registry:
         if registration.incarnation == before.incarnation and not same_run:
             return self._refuse(Refusal.NAME_TAKEN)
         # What it said last holds until it says it anew, a moment from now: its peers see no gap.
-        self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False)
+        carried = known.carried if same_run else frozenset()
+        self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False, carried=carried)
         del self._sessions[before.session]
         self._sessions[registration.session] = name
         self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
@@ -291,9 +296,25 @@ class Registry:
         offered = known.offered | now_offered
         if len(offered) > MAX_OFFERED:
             offered = now_offered
-        self._sidecars[name] = replace(known, services=services, offered=offered)
+        now_carried = frozenset(use.name for use in services.uses)
+        carried = known.carried | now_carried
+        if len(carried) > MAX_OFFERED:
+            carried = now_carried
         before = known.services
+        self._offers.update(now_offered)
+        self._offers_no_more(known)
+        self._sidecars[name] = replace(known, services=services, offered=offered, carried=carried)
         return before is None or (services.offers, services.uses) != (before.offers, before.uses)
+
+    def _offers_no_more(self, sidecar: Sidecar) -> None:
+        for service in {offer.name for offer in sidecar.offers}:
+            self._offers[service] -= 1
+            if not self._offers[service]:
+                del self._offers[service]
+
+    def is_offered(self, service: ServiceName) -> bool:
+        """Whether anybody who is registered offers it."""
+        return service in self._offers
 
     def set_revocations(self, name: NodeName, held: RevocationSet) -> None:
         """Note which revocation lists it uses."""
@@ -368,7 +389,9 @@ class Registry:
         return gone
 
     def _remove(self, name: NodeName, reason: RemovalReason) -> None:
-        del self._sessions[self._sidecars.pop(name).registration.session]
+        sidecar = self._sidecars.pop(name)
+        del self._sessions[sidecar.registration.session]
+        self._offers_no_more(sidecar)
         heard_at = self._leases.pop(name).heard_at
         self.counters.departed[reason] += 1
         self._removals[name] = reason, heard_at

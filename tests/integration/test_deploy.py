@@ -72,14 +72,22 @@ BEYOND_CONTRACT: dict[str, set[str]] = {
     "plr_revocation_list_age_seconds": {"ca"},
     "plr_revocation_list_max_age_seconds": set(),
     "plr_revocation_lists_too_old": set(),
+    "plr_leases_postponed_total": set(),
+    "plr_loop_cpu_seconds_total": set(),
     "plr_robot_interface_info": {"robot", "interface", "carrier"},
+    "plr_robot_interface_up": {"robot", "interface"},
     "plr_robot_mapping_synced": {"robot"},
     "plr_robot_path_rtt_seconds": {"robot", "interface", "server"},
     "plr_robot_path_up": {"robot", "interface", "server"},
+    "plr_robot_requests_missed_total": {"robot", "service"},
+    "plr_robot_requests_total": {"robot", "service"},
+    "plr_robot_service_paths": {"robot", "service"},
+    "plr_server_robots": {"server", "path"},
+    "plr_service_unmet": {"service"},
     "plr_sidecar_certificate_expiry_timestamp_seconds": {"sidecar", "role"},
     "plr_sidecar_gone_info": {"sidecar", "role", "why"},
     "plr_sidecar_info": {"name", "role", "version"},
-    "plr_sidecar_last_seen_timestamp_seconds": {"sidecar", "role"},
+    "plr_sidecar_gone_timestamp_seconds": {"sidecar", "role"},
     "plr_sidecar_up": {"sidecar", "role"},
     "plr_target_miss_probability": {"robot", "service"},
 }
@@ -208,6 +216,13 @@ def test_prometheus_accepts_its_configuration() -> None:
 
 
 @pytest.mark.audit("ops-12")
+def test_prometheus_knows_where_the_runbook_is_and_tells_the_alertmanager_no_label_of_that() -> None:
+    config = yaml.safe_load((PROMETHEUS / "prometheus.yml").read_text())
+    assert config["global"]["external_labels"]["plr_docs"].startswith("https://")
+    assert {"regex": "plr_docs", "action": "labeldrop"} in config["alerting"]["alert_relabel_configs"]
+
+
+@pytest.mark.audit("ops-12")
 def test_each_alert_fires_when_it_should_and_only_then() -> None:
     run("promtool", "test", "rules", *(path.name for path in RULE_TESTS), cwd=PROMETHEUS / "tests")
     cases = [case for path in RULE_TESTS for case in yaml.safe_load(path.read_text())["tests"]]
@@ -221,7 +236,7 @@ def test_each_alert_has_a_section_in_the_runbook_and_each_section_an_alert() -> 
     assert sorted(sections) == sorted(rule["alert"] for rule in alerts())
     for rule in alerts():
         page, _, anchor = rule["annotations"]["runbook_url"].partition("#")
-        assert DEPLOY.parent / page == RUNBOOK
+        assert page == "{{ $externalLabels.plr_docs }}/" + RUNBOOK.name
         assert anchor == rule["alert"].lower()
     texts = re.split(r"^### ", RUNBOOK.read_text(), flags=re.MULTILINE)[1:]
     assert [text.split()[0] for text in texts if not re.search(r"Meaning.*Look at.*Do\.", text, re.DOTALL)] == []

@@ -41,7 +41,7 @@ from protos.model import (
 from protos.preferences import InterfaceLabel
 from protos.redundancy_mode import RedundancyMode
 from tests.sim.control_world import SETTLED_S, SimSidecar, World
-from tests.unit.controlplane.samples import PLAN, histogram, interfaces, path, registration, use
+from tests.unit.controlplane.samples import PLAN, histogram, interfaces, offer, path, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -192,7 +192,14 @@ def test_a_service_that_nobody_serves_goes_over_no_path_whoever_says_so() -> Non
     world.say(robot, ServiceSet(unmet=(PLAN,)))
     assert paths() == {PLAN: 0.0}, "the robot has withdrawn it"
     world.say(robot, ServiceSet())
-    assert paths() == {}, "it wants it no more"
+    assert paths() == {PLAN: 0.0}, "a glob of its configuration may name it: it carried it until nobody offered it"
+    world.say(server, ServiceSet((offer(),)))
+    assert paths() == {}, "it is served: the robot has another reason"
+    world.leave(server)
+    assert paths() == {PLAN: 0.0}
+    world.leave(robot)
+    world.say(world.join(registration("robot")), ServiceSet())
+    assert paths() == {}, "another run, which may be configured otherwise"
 
 
 def test_a_policy_that_forbids_a_service_leaves_it_no_path() -> None:
