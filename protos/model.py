@@ -83,6 +83,9 @@ MAX_JOINTS = 1024
 MAX_UNMET = 64
 """Services told of that a configuration names and nobody serves."""
 
+MAX_GOODBYES = 64
+"""Servers in one report that said goodbye."""
+
 MAX_PENALTIES = 1024
 """Servers in one report whose answers could not be delivered."""
 
@@ -487,6 +490,8 @@ class Report:
     interface_joints: tuple[InterfaceJointReport, ...] = ()
     penalties: tuple[PenaltyReport, ...] = ()
     """All that are in force."""
+    goodbyes: tuple[NodeName, ...] = ()
+    """Servers that said goodbye to this robot and are listed yet, or were until its last report."""
     continues: bool = False
     """Whether this is a further part of a report, which says nothing of penalties."""
 

@@ -20,6 +20,7 @@ from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED
 from controlplane.core.mapping_history import MAX_CHANGES, MAX_HISTORIES
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.publisher import MAX_GONE_SNAPSHOTS
+from controlplane.core.reached import MAX_PAIRS
 from controlplane.core.registry import MAX_REMEMBERED_REMOVALS
 from controlplane.core.restlessness import MAX_MEMBERS
 from protos.model import InterfaceName, NodeName, RemovalReason, Role, ServiceName, ServiceOffer, ServiceSet, ServiceUse
@@ -57,6 +58,8 @@ CAPPED = {
     "departed._departures": MAX_DEPARTED,
     "departed._last_known": MAX_EXPLAINED,
     "history._histories": MAX_HISTORIES,
+    "reached._pairs": MAX_PAIRS,
+    "reached._robots_of": MAX_PAIRS,
     "history._histories[].changes": MAX_HISTORIES * MAX_CHANGES,
     "restlessness._shares": MAX_MEMBERS,
     "registry._removals": MAX_REMEMBERED_REMOVALS,

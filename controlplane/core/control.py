@@ -12,6 +12,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, assert_never
 
+from controlplane.core import returning
 from controlplane.core.control_events import (
     Close,
     CloseReason,
@@ -241,6 +242,7 @@ class ControlCore:
         if sidecar is None or sidecar.role is not Role.ROBOT:
             self.counters.reports_ignored += 1
             return
+        self._note_goodbyes(report.goodbyes)
         # Before the rest: after a restart a robot reports on servers that are not back yet.
         reaches_again = self._publisher.waits_for(name, (path.server for path in report.paths))
         report, left_out = believable(report, name, self.registry, self.permits)
@@ -261,6 +263,16 @@ class ControlCore:
         self._debounce.note(change, now)
         if reaches_again:
             self._publish_soon(now)
+
+    def _note_goodbyes(self, servers: Iterable[NodeName]) -> None:
+        """What a robot knows of those that went while the control plane was away."""
+        for name in servers:
+            self._returning.said_goodbye(name)
+            gone = self.departed.get(name)
+            if gone is not None and gone.role is Role.CLOUD and gone.text == returning.TEXT:
+                stopped = returning.was_stopped(gone)
+                self.departed.note(stopped)
+                self._events.append(DepartureNotice(name, stopped))
 
     def _receive_ack(self, name: NodeName, ack: Ack) -> None:
         if self._publisher.acked(name, ack):

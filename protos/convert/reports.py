@@ -19,6 +19,7 @@ from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
 from protos.errors import DecodeError
 from protos.model import (
+    MAX_GOODBYES,
     MAX_JOINTS,
     MAX_LATENCIES,
     MAX_PATHS,
@@ -46,6 +47,8 @@ def report_from_proto(message: control_pb2.Report) -> Report:
     """Check a report."""
     penalties = each(message.penalties, MAX_PENALTIES, "penalties", _penalty_from_proto)
     unique((penalty.server for penalty in penalties), "penalties")
+    if len(message.goodbyes) > MAX_GOODBYES:
+        raise DecodeError(f"goodbyes has {len(message.goodbyes)} elements, more than {MAX_GOODBYES}")
     return Report(
         latencies=each(message.latencies, MAX_LATENCIES, "latencies", _latency_from_proto),
         paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
@@ -53,6 +56,7 @@ def report_from_proto(message: control_pb2.Report) -> Report:
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
         interface_joints=each(message.interface_joints, MAX_JOINTS, "interface_joints", _interface_joint_from_proto),
         penalties=penalties,
+        goodbyes=tuple(node_name(server, "goodbyes") for server in message.goodbyes),
     )
 
 
@@ -89,6 +93,7 @@ def report_to_proto(report: Report) -> control_pb2.Report:
         joints=map(_joint_to_proto, report.joints),
         interface_joints=map(_interface_joint_to_proto, report.interface_joints),
         penalties=map(_penalty_to_proto, report.penalties),
+        goodbyes=report.goodbyes,
     )
 
 

@@ -22,6 +22,7 @@ from sidecar.core.events import (
     RequestId,
     WithdrawService,
 )
+from sidecar.core.goodbyes import Goodbyes
 from sidecar.core.inbound import Inbound
 from sidecar.core.link_events import (
     Attend,
@@ -115,6 +116,7 @@ class Engine:
         self.revocations = RevocationExchange(self.routes, self._outbox, self.stats)
         self._measurements = Measurements(self.stats.dropped)
         self._penalties = Penalties()
+        self._goodbyes = Goodbyes()
         self._serving = Serving(
             ServingParts(
                 self._rules,
@@ -266,6 +268,7 @@ class Engine:
             self._forget_session(name, now, may_return=None if over else before[name])
         self._follow_gone(ended, now)
         self._end_away(left, now)
+        self._goodbyes.follow(self.peers.session)
         return None
 
     def _end_away(self, left: Collection[NodeName], now: float) -> None:
@@ -330,7 +333,7 @@ class Engine:
     def take_report(self, now: float) -> Report:
         """Return what was measured since the last report."""
         measured = self._measurements.take(self.routes, self.peers.names())
-        return replace(measured, penalties=self._penalties.report(now))
+        return replace(measured, penalties=self._penalties.report(now), goodbyes=self._goodbyes.report())
 
     @property
     def service_mappings(self) -> tuple[ServiceMapping, ...]:
@@ -379,6 +382,8 @@ class Engine:
                     self._commands.append((None, SetPeers(self.peers.for_links())))
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
+                    if self._config.role is Role.ROBOT:
+                        self._goodbyes.note(peer, session)
                     self._on_peer_closed(peer, now)
             case PeerLied(peer, session):
                 if self.peers.session(peer) == session:
@@ -454,6 +459,7 @@ class Engine:
         self.routes.set_state(path, state)
         self._measurements.note_urgent()
         if state is PathState.UP:
+            self._goodbyes.is_back(path.peer)
             self._backlog.add_steps(self._outbox.on_path_up(path), now)
             self._inbound.on_path_up(path)
             if self._requests.unanswered:  # they wait: the other paths may be back as well, and share them

@@ -526,6 +526,7 @@ class Report(_message.Message):
     JOINTS_FIELD_NUMBER: _builtins.int
     INTERFACE_JOINTS_FIELD_NUMBER: _builtins.int
     PENALTIES_FIELD_NUMBER: _builtins.int
+    GOODBYES_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def latencies(self) -> _containers.RepeatedCompositeFieldContainer[Global___LatencyReport]: ...
     @_builtins.property
@@ -540,6 +541,12 @@ class Report(_message.Message):
     def penalties(self) -> _containers.RepeatedCompositeFieldContainer[Global___PenaltyReport]:
         """All that are in force."""
 
+    @_builtins.property
+    def goodbyes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Servers that said goodbye to this robot and are listed yet, or were until its last report: a control plane that was
+        away then would take them for dead.
+        """
+
     def __init__(
         self,
         *,
@@ -549,10 +556,11 @@ class Report(_message.Message):
         joints: _abc.Iterable[Global___JointReport] | None = ...,
         interface_joints: _abc.Iterable[Global___InterfaceJointReport] | None = ...,
         penalties: _abc.Iterable[Global___PenaltyReport] | None = ...,
+        goodbyes: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["interface_joints", b"interface_joints", "joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths", "penalties", b"penalties"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["goodbyes", b"goodbyes", "interface_joints", b"interface_joints", "joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths", "penalties", b"penalties"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from controlplane.core.control_events import Settings
@@ -156,6 +158,33 @@ def test_only_the_last_ones_can_be_explained(world: World) -> None:
         world.core.departed.note(departure(f"robot-{number}"), last)
     with pytest.raises(UnknownNameError, match="plr events --node robot"):
         world.core.explain(ROBOT, PLAN, world.now)
+
+
+def test_a_server_that_was_stopped_while_the_control_plane_was_away_is_no_dead_one() -> None:
+    """By what robots say, before it is given up or after that."""
+    world = World(Settings(warm_up_s=5.0))
+    present = [replace(departure(name), role=Role.CLOUD) for name in ("soon", "late", "dead", "back")]
+    world.core.remember([], [*present, departure("robot")], world.now)
+    robot = world.robot()
+    world.say(robot, Report(goodbyes=tuple(NodeName(name) for name in ("soon", "back", "stranger"))))
+    world.cloud("back")
+    world.run(5.0 + world.settings.lease_s + 1.0)
+    assert why(world) == {"soon": Why.DRAINED, "late": Why.LEASE_EXPIRED, "dead": Why.LEASE_EXPIRED}
+    for _ in range(2):
+        world.say(robot, Report(goodbyes=(NodeName("late"),)))
+    assert why(world) == {"soon": Why.DRAINED, "late": Why.DRAINED, "dead": Why.LEASE_EXPIRED}
+    assert world.departed == ["soon", "late", "dead", "late"]
+
+
+def test_no_robot_says_of_others_that_they_were_stopped(world: World) -> None:
+    """Of those that the control plane itself has seen go it knows better."""
+    robot = world.robot()
+    server = world.cloud("a")
+    world.run(SETTLED_S)
+    server.silent = True
+    world.run(world.settings.lease_s + 1.0)
+    world.say(robot, Report(goodbyes=(NodeName("a"),)))
+    assert why(world) == {"a": Why.LEASE_EXPIRED}
 
 
 def test_who_does_not_come_back_after_a_restart_is_gone() -> None:

@@ -249,6 +249,7 @@ reports = st.builds(
         max_size=3,
         unique_by=lambda penalty: penalty.server,
     ).map(tuple),
+    st.lists(node_names, max_size=3).map(tuple),
 )
 
 

@@ -299,6 +299,28 @@ def test_a_goodbye_ends_the_requests_there_and_leaves_nothing_in_the_outbox() ->
     assert not sidecar.engine.routes.reaches(A)
 
 
+@pytest.mark.audit("ops-11")
+def test_a_goodbye_is_reported_until_the_control_plane_lists_the_server_no_more_and_once_after() -> None:
+    """One that was away when it was said hears of it before its own view tells what it knows."""
+    sidecar = robot()
+    sidecar.engine.on_link_event(PeerClosed(A, SessionId(1)), 0.2)
+    assert [sidecar.engine.take_report(0.3).goodbyes for _ in range(2)] == [(A,), (A,)]
+    sidecar.view(version=2)
+    assert [sidecar.engine.take_report(0.4).goodbyes for _ in range(2)] == [(A,), ()]
+
+
+@pytest.mark.audit("ops-11")
+def test_a_server_that_is_back_has_said_no_goodbye() -> None:
+    sidecar = robot()
+    sidecar.engine.on_link_event(PeerClosed(A, SessionId(1)), 0.2)
+    sidecar.view(peer(A, session=2, incarnation=2), version=2)
+    assert sidecar.engine.take_report(0.3).goodbyes == ()
+    sidecar.change(PathState.UP)
+    sidecar.engine.on_link_event(PeerClosed(A, SessionId(2)), 0.4)
+    sidecar.change(PathState.UP)
+    assert sidecar.engine.take_report(0.5).goodbyes == ()
+
+
 def test_a_cloud_that_drains_waits_only_for_what_is_awaited() -> None:
     """A local server that died holds its requests for long; their robots may have had their answers from another."""
     sidecar = cloud()

@@ -1,0 +1,51 @@
+"""Robot side: which servers said goodbye, for a control plane that was away then: it would take them for dead.
+
+One is told of while the control plane's view lists the server, and once more after that.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from protos.model import MAX_GOODBYES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from protos.model import NodeName, SessionId
+
+
+class Goodbyes:
+    """Servers, each with the session that ended; the one that went longest ago is forgotten for one too many."""
+
+    def __init__(self) -> None:
+        self._sessions: dict[NodeName, SessionId] = {}
+        self._unlisted: set[NodeName] = set()
+
+    def note(self, server: NodeName, session: SessionId) -> None:
+        """It said goodbye."""
+        self.is_back(server)
+        self._sessions[server] = session
+        if len(self._sessions) > MAX_GOODBYES:
+            self.is_back(next(iter(self._sessions)))
+
+    def is_back(self, server: NodeName) -> None:
+        """It answers."""
+        self._sessions.pop(server, None)
+        self._unlisted.discard(server)
+
+    def follow(self, session_of: Callable[[NodeName], SessionId | None]) -> None:
+        """There is another view of the peers; `session_of` tells a server's session in it, None if it is not there."""
+        for server, ended in list(self._sessions.items()):
+            session = session_of(server)
+            if session is None:
+                self._unlisted.add(server)
+            elif session != ended:
+                self.is_back(server)
+
+    def report(self) -> tuple[NodeName, ...]:
+        """All to tell of now."""
+        told = tuple(self._sessions)
+        for server in list(self._unlisted):
+            self.is_back(server)
+        return told
