@@ -142,7 +142,9 @@ class _Trial:
         pending = await asyncio.to_thread(self._monitoring.firing)
         told = self._monitoring.notifications[before:]
         for one in told:
-            _say(f"notification to {one.receiver}: {', '.join(one.firing) or 'resolved'}")
+            _say(f"notification to {one.receiver}: {', '.join(one.firing) or 'resolved'} {' '.join(one.links)}".rstrip())
+            if not all(link.startswith(f"{self._monitoring.pages}/runbook.md#") for link in one.links):
+                raise MonitoringError("a runbook_url leads nowhere")
         _say(f"{len(told)} notifications; alerts in Prometheus: {dict(pending)}")
         return [text for one in told for text in one.firing]
 

@@ -38,6 +38,8 @@ class Notification:
     receiver: str
     firing: tuple[str, ...]
     """Name and labels of each alert that fires."""
+    links: tuple[str, ...]
+    """Where their runbook_url leads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,8 @@ class Monitoring:
         self.notifications: list[Notification] = []
         self._folder = folder
         self._ports = ports
+        self.pages = ""
+        """What every runbook_url begins with."""
         self._processes: list[subprocess.Popen[bytes]] = []
         self._receiver = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
         threading.Thread(target=self._receiver.serve_forever, daemon=True).start()
@@ -69,8 +73,10 @@ class Monitoring:
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 told = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-                firing = tuple(_text(alert["labels"]) for alert in told["alerts"] if alert["status"] == "firing")
-                notifications.append(Notification(told["receiver"], firing))
+                alerts = [alert for alert in told["alerts"] if alert["status"] == "firing"]
+                firing = tuple(_text(alert["labels"]) for alert in alerts)
+                links = tuple(alert["annotations"]["runbook_url"] for alert in alerts)
+                notifications.append(Notification(told["receiver"], firing, links))
                 self.send_response(200)
                 self.end_headers()
 
@@ -90,8 +96,12 @@ class Monitoring:
     def _write_prometheus(self, scraped: int, scrape_s: float) -> None:
         config = yaml.safe_load((FILES / "prometheus.yml").read_text())
         milliseconds = f"{scrape_s * 1000:.0f}ms"
-        config["global"] = {"scrape_interval": milliseconds, "scrape_timeout": milliseconds}
-        config["global"]["evaluation_interval"] = "1s"
+        config["global"] |= {
+            "scrape_interval": milliseconds,
+            "scrape_timeout": milliseconds,
+            "evaluation_interval": "1s",
+        }
+        self.pages = str(config["global"]["external_labels"]["plr_docs"])
         config["alerting"]["alertmanagers"][0]["static_configs"][0]["targets"] = [_local(self._ports.alertmanager)]
         job = next(job for job in config["scrape_configs"] if job["job_name"] == "plr-controlplane")
         job["static_configs"][0]["targets"] = [_local(scraped)]
