@@ -101,7 +101,7 @@ def view_of(
     seen_at: float,
     now: float,
 ) -> MemberView:
-    """Look at one; some 30 us for a robot with 15 paths. `is_there` tells which servers the robot has to
+    """Look at one; some 50 us for a robot with 15 paths. `is_there` tells which servers the robot has to
     do with, `is_offered` which services anybody offers."""
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
