@@ -263,6 +263,18 @@ def test_the_alertmanager_accepts_its_configuration() -> None:
                 assert any(re.fullmatch(pattern, name) for name in names), pattern
 
 
+@pytest.mark.audit("ops-12")
+def test_what_a_stranger_can_cause_keeps_back_next_to_nothing() -> None:
+    config = yaml.safe_load((PROMETHEUS / "alertmanager.yml").read_text())
+    causes = re.compile('alertname="(PlrControlPlaneOverloaded|PlrConnectionsRefused)"')
+    kept_back = [
+        inhibits["target_matchers"]
+        for inhibits in config["inhibit_rules"]
+        if causes.match(inhibits["source_matchers"][0])
+    ]
+    assert kept_back == [['alertname="PlrMappingStale"']]
+
+
 def alerts() -> list[dict[str, Any]]:
     return [rule for rule in rules() if "alert" in rule]
 
