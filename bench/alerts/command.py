@@ -142,7 +142,8 @@ class _Trial:
         pending = await asyncio.to_thread(self._monitoring.firing)
         told = self._monitoring.notifications[before:]
         for one in told:
-            _say(f"notification to {one.receiver}: {', '.join(one.firing) or 'resolved'} {' '.join(one.links)}".rstrip())
+            text = ", ".join(one.firing) or "resolved"
+            _say(f"notification to {one.receiver}: {text} {' '.join(one.links)}".rstrip())
             if not all(link.startswith(f"{self._monitoring.pages}/runbook.md#") for link in one.links):
                 raise MonitoringError("a runbook_url leads nowhere")
         _say(f"{len(told)} notifications; alerts in Prometheus: {dict(pending)}")
