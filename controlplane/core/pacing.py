@@ -1,8 +1,8 @@
 """How often sidecars report and how long their leases last: by how many they are, and how busy the control plane is.
 
-A report costs the same in a fleet of ten as in one of ten thousand. So its interval grows with the square root of the
-number: ten sidecars report at the configured interval, a thousand at ten times it, and together they send a hundred
-times as much instead of a thousand. What cannot wait is reported at once whatever the interval (`ControlSession`). A
+A report costs the same in a fleet of ten as in one of ten thousand. So its interval grows with about the square root of
+the number: ten sidecars report at the configured interval, a thousand at 12.6 times it, and together they send eight
+times as much instead of a hundred. What cannot wait is reported at once whatever the interval (`ControlSession`). A
 control plane that is busy all the same stretches the interval further.
 """
 
@@ -12,6 +12,9 @@ import math
 
 FULL_PACE = 10
 """So many sidecars report at the configured interval."""
+
+GROWTH = 0.55
+"""The power of their number by which it grows: 1,000 sidecars, at 6.3 s instead of 0.5, take a quarter of a core."""
 
 MAX_INTERVAL_S = 10.0
 """The most that pacing makes of a shorter interval: histograms fade with a minute's half-life."""
@@ -78,7 +81,7 @@ class Pacing:
             elif self._busy < IDLE:
                 self._stretch = max(self._stretch / STRETCH_STEP, 1.0)
         most = max(MAX_INTERVAL_S, self._least_interval_s)
-        paced = self._least_interval_s * math.sqrt(max(sidecars, FULL_PACE) / FULL_PACE)
+        paced = self._least_interval_s * (max(sidecars, FULL_PACE) / FULL_PACE) ** GROWTH
         wanted = min(paced * self._stretch, most)
         if wanted == self.interval_s:
             return

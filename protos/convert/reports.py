@@ -71,7 +71,7 @@ def report_parts(message: control_pb2.Report) -> Iterator[Report]:
     )
     for field, limit in lists:
         check_length(getattr(message, field), limit, field)
-    yield report_from_proto(control_pb2.Report(penalties=message.penalties))
+    yield report_from_proto(control_pb2.Report(penalties=message.penalties, goodbyes=message.goodbyes))
     for field, _ in lists:
         entries = getattr(message, field)
         for begin in range(0, len(entries), PART_ENTRIES):

@@ -62,7 +62,7 @@ HEARTBEATS_PER_LEASE = 3.0
 """Two may get lost before the lease ends."""
 
 URGENT_PART, URGENT_LEAST_S = 0.1, 0.1
-"""What is urgent is reported so soon after the report before: a part of the interval, and at least so much."""
+"""What is urgent is reported so soon after what was urgent before: a part of the interval, and at least so much."""
 
 PERHAPS_UNTOLD_S = 15.0
 """What was urgent so shortly before a stream is told again: the one before may have been dead already, unnoticed."""
@@ -150,6 +150,9 @@ class ControlSession:
         self._report_interval_s = 0.0
         self._reported_at = 0.0
         self._urgent_at = -math.inf
+        self._urgent = False
+        """Whether the next report is."""
+        self._urgent_told_at = -math.inf
         self._heartbeat_at = 0.0
         self._report_at = 0.0
         self._clear_outgoing()
@@ -366,17 +369,20 @@ class ControlSession:
     def report_at_once(self, now: float) -> None:
         """Something happened that cannot wait for the interval: a path went, a deadline was missed.
 
-        The fleet's size counts all the same, as it may have happened to all: two reports are a tenth of it apart.
+        The fleet's size counts all the same, as it may happen to all again and again: two of these reports are a tenth
+        of the interval apart.
         Without a stream it waits for the next one.
         """
-        self._urgent_at = now
+        self._urgent, self._urgent_at = True, now
         self._report_at = min(self._report_at, max(now, self._soonest_report()))
 
     def _soonest_report(self) -> float:
-        return self._reported_at + max(self._report_interval_s * URGENT_PART, URGENT_LEAST_S)
+        return self._urgent_told_at + max(self._report_interval_s * URGENT_PART, URGENT_LEAST_S)
 
     def send_report(self, report: Report, now: float) -> None:
         """Send what was measured since the last report; one that holds nothing is left out."""
+        if self._urgent:
+            self._urgent, self._urgent_told_at = False, now
         self._reported_at = now
         self._report_at = now + self._report_interval_s
         if report != _NOTHING_MEASURED and self.state is ControlState.ONLINE:

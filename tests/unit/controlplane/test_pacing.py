@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
-from controlplane.core.pacing import MAX_INTERVAL_S, REPORTS_PER_LEASE, WORTH_TELLING, Pacing
+from controlplane.core.pacing import GROWTH, MAX_INTERVAL_S, REPORTS_PER_LEASE, WORTH_TELLING, Pacing
 
 pytestmark = pytest.mark.audit("ops-18")
 
@@ -17,7 +15,7 @@ def pacing() -> Pacing:
 
 
 @pytest.mark.parametrize(
-    ("sidecars", "interval_s"), [(0, 0.5), (10, 0.5), (100, 1.58), (1000, 5.0), (4000, 10.0), (10_000, 10.0)]
+    ("sidecars", "interval_s"), [(0, 0.5), (10, 0.5), (100, 1.77), (1000, 6.29), (4000, 10.0), (10_000, 10.0)]
 )
 def test_the_interval_follows_the_number(pacing: Pacing, sidecars: int, interval_s: float) -> None:
     pacing.follow(sidecars, 0.0)
@@ -30,7 +28,8 @@ def test_one_that_comes_changes_nothing_worth_telling(pacing: Pacing) -> None:
     for sidecars in range(1, 4001):
         pacing.follow(sidecars, 0.0)
         told.add(pacing.interval_s)
-        assert 1 / WORTH_TELLING <= pacing.interval_s / (0.5 * math.sqrt(max(sidecars, 10) / 10)) <= WORTH_TELLING
+        wanted = min(0.5 * (max(sidecars, 10) / 10) ** GROWTH, MAX_INTERVAL_S)
+        assert 1 / WORTH_TELLING <= pacing.interval_s / wanted <= WORTH_TELLING
     assert len(told) < 20
 
 
@@ -40,7 +39,7 @@ def test_a_busy_control_plane_is_told_less_and_later_as_much_again(pacing: Pacin
     assert 3.0 < pacing.interval_s <= MAX_INTERVAL_S
     for _ in range(60):
         pacing.follow(100, 0.0, 0.1)
-    assert pacing.interval_s == pytest.approx(1.58, rel=WORTH_TELLING - 1)
+    assert pacing.interval_s == pytest.approx(1.77, rel=WORTH_TELLING - 1)
 
 
 def test_what_is_over_in_two_seconds_stretches_nothing(pacing: Pacing) -> None:

@@ -467,6 +467,21 @@ def test_what_is_urgent_is_reported_before_it_is_due_but_not_all_the_time() -> N
     assert session.next_timer() == 16.0
 
 
+@pytest.mark.audit("ops-20")
+def test_what_is_urgent_does_not_wait_for_having_reported_a_moment_ago() -> None:
+    """Of a fleet whose server dies, a tenth has just reported as a matter of routine."""
+    session = welcomed(make_session(), 0.0)
+    session.send_report(REPORT, 10.0)
+    session.messages_to_send(10.0)
+    session.report_at_once(10.1)
+    assert session.report_due(10.1)
+    session.send_report(REPORT, 10.1)
+    session.messages_to_send(10.1)
+    session.report_at_once(10.2)
+    assert not session.report_due(11.0)
+    assert session.report_due(11.1)
+
+
 def welcomed(session: ControlSession, now: float, interval_s: float = 10.0) -> ControlSession:
     session.opened(now)
     session.messages_to_send(now)
