@@ -62,24 +62,7 @@ def run(options: argparse.Namespace) -> int:
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     sizes = tuple(options.size or SIZES)
     wanted = targets(sizes)
-    figures: dict[str, float] = {}
-    details: dict[str, object] = {}
-    pressure = CpuPressure()
-    for size in sizes:
-        with tempfile.TemporaryDirectory(prefix="plr-bench-") as temporary:
-            folder = (options.keep_logs or Path(temporary)) / f"control-{size}"
-            folder.mkdir(parents=True)
-            fleet = Fleet(size, folder, options.steady_s, console.print)
-            (folder / "bare").mkdir()
-            anchor = Fleet(size, folder / "bare", options.steady_s, console.print)
-            asyncio.run(_both(fleet, anchor))
-        measured = fleet.figures | anchor.figures
-        figures.update({f"{key}_{size}": value for key, value in measured.items()})
-        details[str(size)] = fleet.details | anchor.details
-        found = {**figures, "verdicts": {target.key: target.met(figures) for target in wanted}}
-        found |= {"details": details, "machine": {**machine(), "cpu_pressure": pressure.share()}}
-        options.out.mkdir(parents=True, exist_ok=True)
-        (options.out / "control.json").write_text(json.dumps(found, indent=1) + "\n")
+    figures = asyncio.run(_measure(sizes, options, console))
     show_verdicts(console, figures, wanted)
     console.print(f"figures: {options.out / 'control.json'}")
     return 1 if any(target.met(figures) is False for target in wanted) else 0
@@ -209,10 +192,29 @@ class Fleet:
             await asyncio.sleep(LOOK_EVERY_S)
 
 
-async def _both(fleet: Fleet, anchor: Fleet) -> None:
-    """In one event loop: gRPC's threads do not survive theirs."""
-    await fleet.measure()
-    await anchor.measure_bare()
+async def _measure(sizes: tuple[int, ...], options: argparse.Namespace, console: Console) -> dict[str, float]:
+    """One size after the other, in one event loop: gRPC's threads do not survive theirs. Writes control.json."""
+    wanted = targets(sizes)
+    figures: dict[str, float] = {}
+    details: dict[str, object] = {}
+    pressure = CpuPressure()
+    for size in sizes:
+        with tempfile.TemporaryDirectory(prefix="plr-bench-") as temporary:
+            folder = (options.keep_logs or Path(temporary)) / f"control-{size}"
+            folder.mkdir(parents=True)
+            fleet = Fleet(size, folder, options.steady_s, console.print)
+            (folder / "bare").mkdir()
+            anchor = Fleet(size, folder / "bare", options.steady_s, console.print)
+            await fleet.measure()
+            await anchor.measure_bare()
+        measured = fleet.figures | anchor.figures
+        figures.update({f"{key}_{size}": value for key, value in measured.items()})
+        details[str(size)] = fleet.details | anchor.details
+        found = {**figures, "verdicts": {target.key: target.met(figures) for target in wanted}}
+        found |= {"details": details, "machine": {**machine(), "cpu_pressure": pressure.share()}}
+        options.out.mkdir(parents=True, exist_ok=True)
+        (options.out / "control.json").write_text(json.dumps(found, indent=1) + "\n")
+    return figures
 
 
 def _free_port() -> int:
