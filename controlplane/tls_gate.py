@@ -53,7 +53,7 @@ MAX_HANDSHAKES_PER_SOURCE = 256
 """Of these, from one address (IPv6: one /64), which may be a NAT with a fleet behind it. A further one ends the oldest
 of the same address."""
 
-TURN_TIMEOUT_S = 15.0
+TURN_TIMEOUT_S = 40.0
 """Longest wait for the turn to begin a handshake: as long as a sidecar of a large fleet waits."""
 
 MAX_ON_THE_WAY = 64

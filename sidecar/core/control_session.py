@@ -55,6 +55,10 @@ RETRY_LEAST_S = 1.0
 WELCOME_TIMEOUT_S = 5.0
 """A stream without Welcome for this long is given up: connection set-up over a bad cellular link takes 1 to 2 s."""
 
+PATIENCE_TIMES = 3.0
+"""So many times as long as the attempts of its fleet may be apart a sidecar waits beside that. From 1,500 sidecars on
+they are closer together than would let all in."""
+
 STABLE_AFTER_S = 5.0
 """A stream this old ended for a new reason: the backoff starts anew."""
 
@@ -252,7 +256,7 @@ class ControlSession:
         if welcome.reconnect_max_s:
             reconnect_max_s = min(max(welcome.reconnect_max_s, RETRY_FIRST_S), RETRY_MAX_S)
             self._backoff.set_max(reconnect_max_s)
-            self._patience_s = WELCOME_TIMEOUT_S + reconnect_max_s
+            self._patience_s = WELCOME_TIMEOUT_S + PATIENCE_TIMES * reconnect_max_s
         self._heartbeat_interval_s = max(welcome.lease_s / HEARTBEATS_PER_LEASE, MIN_INTERVAL_S)
         self._report_interval_s = max(welcome.report_interval_s, MIN_INTERVAL_S)
         self._heartbeat_at = now + self._heartbeat_interval_s

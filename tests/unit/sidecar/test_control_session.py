@@ -38,6 +38,7 @@ from protos.model import (
 )
 from sidecar.core.control_session import (
     MIN_INTERVAL_S,
+    PATIENCE_TIMES,
     RETRY_FIRST_S,
     RETRY_MAX_S,
     STABLE_AFTER_S,
@@ -561,7 +562,7 @@ def test_a_fleet_that_is_told_so_comes_back_within_the_time_told_and_waits_for_i
         delays.append(session.retry_at - attempt)
         session.opened(100.0)
     assert max(delays) <= 2.0 < sum(sorted(delays)[-2:])
-    assert session.next_timer() == 100.0 + WELCOME_TIMEOUT_S + 2.0
+    assert session.next_timer() == 100.0 + WELCOME_TIMEOUT_S + PATIENCE_TIMES * 2.0
 
 
 @pytest.mark.audit("ops-18")
