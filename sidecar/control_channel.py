@@ -23,6 +23,9 @@ _CHANNEL_OPTIONS: tuple[tuple[str, int | str], ...] = (
     ("grpc.keepalive_timeout_ms", KEEPALIVE_TIMEOUT_MS),
     ("grpc.http2.max_pings_without_data", 0),
     # The session decides when to try again: no retries and no remembered backoff below it.
+    # A connection may take so long: where a large fleet comes back, the handshake waits for its turn. gRPC's 20 s are
+    # fewer than `ControlSession` waits, which is who gives up.
+    ("grpc.min_reconnect_backoff_ms", 60_000),
     ("grpc.enable_retries", 0),
     ("grpc.use_local_subchannel_pool", 1),
     # Behaviour comes from the configuration, not from the environment.

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
 
 OPTIONS: tuple[tuple[str, int | str], ...] = (
+    ("grpc.min_reconnect_backoff_ms", 60_000),
     ("grpc.enable_retries", 0),
     ("grpc.use_local_subchannel_pool", 1),
     ("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),
