@@ -61,7 +61,11 @@ class PipeEnd(asyncio.Protocol):
         """Whether something has arrived that is not even read from the socket yet."""
         if self.lost or self._transport is None:
             return False
-        waiting = fcntl.ioctl(self._transport.get_extra_info("socket").fileno(), termios.FIONREAD, bytes(4))
+        sock = self._transport.get_extra_info("socket")
+        if sock is None or sock.fileno() < 0:
+            # TLS has lost its connection, and tells us in the next turn of the loop.
+            return False
+        waiting = fcntl.ioctl(sock.fileno(), termios.FIONREAD, bytes(4))
         return bool(struct.unpack("i", waiting)[0])
 
     # ── asyncio.Protocol ──

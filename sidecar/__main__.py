@@ -20,11 +20,11 @@ from protos import commit, extras, program
 with extras.required("plr-sidecar", "sidecar"):
     from protos.certificate_term import term_problem
     from protos.errors import ConfigError, StartError
+    from protos.logging_setup import Logging
     from protos.printable import escaped
     from protos.tls_files import load_tls_files
     from protos.version_option import ShowVersion
     from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
-    from sidecar.logging_setup import Logging
     from sidecar.ros import environment
     from sidecar.stop_request import StopRequest
 
@@ -159,7 +159,7 @@ def _run(config: SidecarConfig) -> int:
     # gRPC's own lines on stderr have another format, and what they tell is in our log.
     os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
     stop = StopRequest()
-    with Logging(config.log_level.value, sys.stderr):
+    with Logging("sidecar", config.log_level.value, sys.stderr, left_out="sidecar"):
         failure = _stop_on_signals_and_crashes(stop)
         try:
             problem = _certificate_problem(config)

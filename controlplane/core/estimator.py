@@ -330,11 +330,12 @@ class Estimator:
         return tables.network.paths if tables is not None else {}
 
     def path_views(self, robot: NodeName) -> Iterator[PathView]:
-        """Each path of a robot as reported last, with its round trips as remembered."""
+        """Each path of a robot as reported last, with its round trips as remembered, but those that lead nowhere."""
         tables = self._robots.get(robot)
         if tables is not None:
-            for (interface, server), state in tables.network.paths.items():
-                yield PathView(interface, server, state.up, state.rtt.median_once())
+            for key, state in tables.network.paths.items():
+                if tables.network.leads_there(key):
+                    yield PathView(*key, state.up, state.rtt.median_once())
 
     def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
         """Whether the path was up when last reported; None if it never was reported."""

@@ -99,6 +99,8 @@ class PathState:
     rtt: FadedHistogram
     datagrams: FadedCount
     last: PathReport
+    answered: bool = False
+    """Whether it ever was up."""
 
     def loss(self) -> float:
         """Share of what was sent that got lost, as datagrams or as probes, whichever is worse."""
@@ -116,6 +118,8 @@ class RobotNetwork:
     def __init__(self, half_life_s: float) -> None:
         self._half_life_s = half_life_s
         self.paths: OrderedDict[PathKey, PathState] = OrderedDict()
+        self._answered_over: set[InterfaceName] = set()
+        """Interfaces over which any server ever answered."""
         self._cells: OrderedDict[CellKey, FadedHistogram] = OrderedDict()
         self._clocks: dict[int, HeardClock] = {}
         """Of the cells of each size class."""
@@ -150,11 +154,22 @@ class RobotNetwork:
         self._keep(self.paths, key, state, MAX_PATHS)
         changed = known is None or known.up != path.up
         state.up = path.up
+        if path.up and not state.answered:
+            state.answered = True
+            if len(self._answered_over) < MAX_PATHS:
+                self._answered_over.add(path.interface)
         state.last = path
         state.rtt.add(path.rtt, now)
         # What was sent before the last report may be found lost only now: no more is lost than is sent.
         state.datagrams.add(path.datagrams_sent, min(path.datagrams_lost, path.datagrams_sent), now)
         return changed
+
+    def leads_there(self, key: PathKey) -> bool:
+        """Whether the path was up once, or nothing ever was over its interface.
+
+        What an interface never reached while it reached others, as another site's server, is no sign of a failure.
+        """
+        return self.paths[key].answered or key[0] not in self._answered_over
 
     def merge_requests(self, report: LatencyReport, now: float) -> None:
         """Add what requests took."""

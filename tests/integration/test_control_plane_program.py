@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import re
 import signal
 import socket
@@ -33,6 +35,32 @@ def test_a_signal_ends_it_cleanly(tmp_path: Path, number: signal.Signals) -> Non
         assert "stopping" in details
         assert plane.lines[-1].endswith("stopped")
         assert not [line for line in plane.lines if "Traceback" in line]
+
+
+@pytest.mark.audit("ops-6")
+def test_a_journal_that_stalls_holds_up_nobody(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    size = fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, 4096)
+    os.write(writing, b"x" * size)
+    config = {"insecure": True, "listen": "127.0.0.1:0", "metrics_listen": "127.0.0.1:0", "stun_listen": []}
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        config["listen"] = f"127.0.0.1:{free.getsockname()[1]}"
+    (tmp_path / "controlplane.yaml").write_text(yaml.safe_dump(config))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "controlplane", "--config", str(tmp_path / "controlplane.yaml")], stderr=writing
+    )
+    try:
+        with grpc.insecure_channel(str(config["listen"])) as channel:
+            grpc.channel_ready_future(channel).result(PATIENCE_S)
+        for number in range(3):
+            with cloud(str(config["listen"]), f"cloud-{number}") as stream:
+                stream.expect(Welcome)
+    finally:
+        # It cannot end in order: Python itself waits for what is still to be written, until somebody reads or kills.
+        process.kill()
+        process.wait(PATIENCE_S)
+        os.close(reading)
+        os.close(writing)
 
 
 def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,6 +72,7 @@ BEYOND_CONTRACT: dict[str, set[str]] = {
     "plr_revocation_list_age_seconds": {"ca"},
     "plr_revocation_list_max_age_seconds": set(),
     "plr_revocation_lists_too_old": set(),
+    "plr_fleet_series_left_out": set(),
     "plr_leases_postponed_total": set(),
     "plr_loop_cpu_seconds_total": set(),
     "plr_robot_interface_info": {"robot", "interface", "carrier"},

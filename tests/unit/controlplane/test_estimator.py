@@ -213,6 +213,25 @@ def test_going_up_or_down_is_news(estimator: Estimator) -> None:
     assert estimator.path_up(ROBOT, WLAN, A) is None
 
 
+@pytest.mark.audit("ops-12")
+def test_what_an_interface_never_reached_tells_nothing_of_it_once_it_reached_others(estimator: Estimator) -> None:
+    """The carrier of a site leads to the site's own server alone; one that leads nowhere at all is dark."""
+
+    def seen() -> dict[tuple[str, str], bool]:
+        return {(view.interface, view.server): view.up for view in estimator.path_views(NodeName("robot"))}
+
+    estimator.merge(
+        NodeName("robot"),
+        Report(paths=(path("wlan0", "edge"), path("wlan0", "far", up=False), path("wwan0", "far", up=False))),
+        0.0,
+    )
+    assert seen() == {("wlan0", "edge"): True, ("wwan0", "far"): False}
+    estimator.merge(NodeName("robot"), Report(paths=(path("wlan0", "edge", up=False),)), 1.0)
+    assert seen() == {("wlan0", "edge"): False, ("wwan0", "far"): False}
+    estimator.merge(NodeName("robot"), Report(paths=(path("wlan0", "far"),)), 2.0)
+    assert seen()["wlan0", "far"]
+
+
 def test_observed_misses(estimator: Estimator) -> None:
     assert estimator.observed_miss_ratio(ROBOT, PLAN, 0.0) is None
     estimator.merge(ROBOT, Report(outcomes=(OutcomeReport(PLAN, ok=90, deadline_missed=8, failed=2),)), 0.0)

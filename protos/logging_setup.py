@@ -1,4 +1,4 @@
-"""Logging of the program: one line for each event, with time, level and component, written by a thread of its own.
+"""Logging of both programs: one line for each event, with time, level and component, written by a thread of its own.
 
 A journal or terminal that stalls must not stall the thread that logs: lines wait in a bounded queue, and what does not
 fit is counted and said afterwards.
@@ -22,8 +22,6 @@ MAX_WAITING_LINES = 10_000
 
 STOP_TIMEOUT_S = 1.0
 """What a stalled stream may cost at the end of the program; waiting lines are lost then."""
-
-_PACKAGES = ("sidecar", "protos")
 
 
 class _BoundedQueueHandler(QueueHandler):
@@ -78,21 +76,27 @@ class _PatientListener(QueueListener):
 
 
 class Logging:
-    """The program's logging while used as a context: ours from `level`, libraries' from WARNING."""
+    """A program's logging while used as a context: that of `package` and ours from `level`, libraries' from WARNING.
 
-    def __init__(self, level: str, stream: TextIO, *, max_waiting: int = MAX_WAITING_LINES) -> None:
+    Components are named without `left_out` before them.
+    """
+
+    def __init__(
+        self, package: str, level: str, stream: TextIO, *, left_out: str = "", max_waiting: int = MAX_WAITING_LINES
+    ) -> None:
         output = logging.StreamHandler(stream)
-        output.setFormatter(line_formatter(stream, "sidecar"))
+        output.setFormatter(line_formatter(stream, left_out))
         waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(max_waiting)
         self._handler = _BoundedQueueHandler(waiting)
         self._listener = _PatientListener(waiting, output)
+        self._packages = (package, "protos")
         self._level = level.upper()
 
     def __enter__(self) -> None:
         root = logging.getLogger()
         root.setLevel(logging.WARNING)
         root.addHandler(self._handler)
-        for package in _PACKAGES:
+        for package in self._packages:
             logging.getLogger(package).setLevel(self._level)
         self._listener.start()
 
