@@ -12,6 +12,9 @@ TOO_FAST = "too_fast"
 MAX_MESSAGE_BYTES = 4 << 20
 """Longest message either way: 4096 peers with their credentials, or a report on as many paths, stay below."""
 
+MAX_FIRST_BYTES = 64 << 10
+"""Longest first message of a stream, before anything is known of who speaks: a registration takes 4 KiB at most."""
+
 MAX_STREAMS_PER_NAME = 3
 """The one in use, the one that replaces it, and one that has just been replaced."""
 

@@ -7,13 +7,25 @@ import time
 from typing import TYPE_CHECKING, NoReturn
 
 import grpc
-from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from controlplane.core.control_events import CloseReason
 from controlplane.core.registry import Refusal
-from controlplane.limits import MAX_STREAMS_PER_NAME, TOO_FAST, TOO_MANY_STREAMS, ReportPace, StreamCount, StreamRate
+from controlplane.limits import (
+    MAX_FIRST_BYTES,
+    MAX_STREAMS_PER_NAME,
+    TOO_FAST,
+    TOO_MANY_STREAMS,
+    ReportPace,
+    StreamCount,
+    StreamRate,
+)
 from controlplane.stream_encoder import StreamEncoder
-from protos.convert import parse_in_parts, parse_sidecar_message
+from protos.convert import (
+    parse_in_parts,
+    parse_sidecar_message,
+    read_sidecar_message,
+    sidecar_message_from_proto,
+)
 from protos.convert.reports import report_entries
 from protos.errors import DecodeError, UnknownKindError
 from protos.model import Heartbeat, Registration, Report
@@ -135,10 +147,10 @@ class ControlPlaneService:
                 data = await self._receive(context)
         except TimeoutError:
             raise _StreamEndError(grpc.StatusCode.DEADLINE_EXCEEDED, "no registration came") from None
-        _check_protocol_version(data)
-        registration = _parse(data)
-        if not isinstance(registration, Registration):
-            raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
+        found = _first_message(data)
+        if isinstance(found, _StreamEndError):
+            raise found
+        registration = found
         async with self._turn:
             # Few in each turn of the loop: the messages of those who are registered already come in between.
             await asyncio.sleep(0)
@@ -165,6 +177,7 @@ class ControlPlaneService:
 
     async def _read(self, stream: StreamId, context: Context) -> NoReturn:
         told = False
+        malformed: _StreamEndError | None = None
         rate = StreamRate(report_interval_s=self._report_interval_s, now=time.monotonic())
         pace = ReportPace()
         while True:
@@ -185,7 +198,10 @@ class ControlPlaneService:
                     async for _ in self._loop.turns.each(parts, lambda part: self._loop.receive(stream, part)):
                         pass
             except DecodeError as error:
-                raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, str(error)) from error
+                malformed = _malformed(error)
+            if malformed is not None:
+                # Out here: an error holds all that was parsed where it was raised, and so would this one.
+                raise malformed
             entries = sum(report_entries(part) for part in parts if isinstance(part, Report))
             wait_s = pace.wait_s(entries, time.monotonic())
             if wait_s:
@@ -214,22 +230,33 @@ class ControlPlaneService:
                     raise _StreamEndError(None, "the connection broke") from error
 
 
-def _parse(data: bytes) -> SidecarMessage:
+def _first_message(data: bytes) -> Registration | _StreamEndError:
+    """What a stream begins with, or why it may not.
+
+    Returned, not raised from where it is found: an error holds all that was parsed there for as long as it lives.
+    """
+    if len(data) > MAX_FIRST_BYTES:
+        return _not_a_registration()
     try:
-        return parse_sidecar_message(data)
+        message = read_sidecar_message(data)
+        kind = message.WhichOneof("kind")
+        if kind == "register":
+            # Before all else: what another version says may have another meaning.
+            oldest = message.register.protocol_version
+            problem = refusal(Spoken(oldest, message.register.newest_protocol_version or oldest))
+            if problem is not None:
+                return _StreamEndError(grpc.StatusCode.FAILED_PRECONDITION, problem)
+        elif kind is not None:
+            return _not_a_registration()
+        registration = sidecar_message_from_proto(message)
     except DecodeError as error:
-        raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, str(error)) from error
+        return _malformed(error)
+    return registration if isinstance(registration, Registration) else _not_a_registration()
 
 
-def _check_protocol_version(data: bytes) -> None:
-    """Before all else: what another version says may have another meaning."""
-    try:
-        message = control_pb2.SidecarMessage.FromString(data)
-    except ProtobufDecodeError:
-        return
-    if not message.HasField("register"):
-        return
-    oldest = message.register.protocol_version
-    problem = refusal(Spoken(oldest, message.register.newest_protocol_version or oldest))
-    if problem is not None:
-        raise _StreamEndError(grpc.StatusCode.FAILED_PRECONDITION, problem)
+def _not_a_registration() -> _StreamEndError:
+    return _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
+
+
+def _malformed(error: DecodeError) -> _StreamEndError:
+    return _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, str(error))

@@ -21,6 +21,7 @@ from protos.convert.control import (
     parse_control_message,
     parse_in_parts,
     parse_sidecar_message,
+    read_sidecar_message,
     sidecar_message_from_proto,
     sidecar_message_to_proto,
 )
@@ -84,6 +85,7 @@ __all__ = [
     "parse_sidecar_message",
     "peer_from_proto",
     "peer_to_proto",
+    "read_sidecar_message",
     "report_from_proto",
     "report_to_proto",
     "sidecar_message_from_proto",

@@ -19,6 +19,7 @@ from protos.convert.fields import (
     version,
 )
 from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
+from protos.convert.message_cost import check_cost
 from protos.convert.reports import report_from_proto, report_parts, report_to_proto
 from protos.convert.types import (
     announced_from_proto,
@@ -90,19 +91,21 @@ _REASON_NUMBERS = {reason: number for number, reason in _REASONS.items()}
 
 def parse_sidecar_message(data: bytes) -> SidecarMessage:
     """Parse and check the bytes of one message of a sidecar."""
-    return sidecar_message_from_proto(_sidecar_message(data))
+    return sidecar_message_from_proto(read_sidecar_message(data))
 
 
 def parse_in_parts(data: bytes) -> Iterator[SidecarMessage]:
     """The same, with a report in parts that each take a moment."""
-    message = _sidecar_message(data)
+    message = read_sidecar_message(data)
     if message.WhichOneof("kind") == "report":
         yield from report_parts(message.report)
     else:
         yield sidecar_message_from_proto(message)
 
 
-def _sidecar_message(data: bytes) -> control_pb2.SidecarMessage:
+def read_sidecar_message(data: bytes) -> control_pb2.SidecarMessage:
+    """Parse the bytes of one message of a sidecar, and check no more than that it is not too costly."""
+    check_cost(data)
     try:
         return control_pb2.SidecarMessage.FromString(data)
     except ProtobufDecodeError as error:

@@ -21,7 +21,7 @@ from protos.convert.fields import (
     unique,
 )
 from protos.errors import DecodeError
-from protos.histogram import LAYOUT, Histogram
+from protos.histogram import BUCKETS, LAYOUT, Histogram
 from protos.model import (
     ALL_CALLS,
     MAX_CANDIDATES_OF_INTERFACE,
@@ -339,6 +339,9 @@ def peer_to_proto(peer: Peer) -> types_pb2.Peer:
 def histogram_from_proto(message: types_pb2.Histogram) -> Histogram:
     """Check a histogram; a message never filled in is an empty one."""
     layout, lost = message.layout, message.lost
+    for field, values in (("index", message.index), ("count", message.count)):
+        if len(values) > BUCKETS:
+            raise DecodeError(f"histogram {field} has {len(values)} elements, more than {BUCKETS}")
     # Slices of repeated fields are lists, made in C.
     index, count = message.index[:], message.count[:]
     if layout == 0 and not lost and not index and not count:

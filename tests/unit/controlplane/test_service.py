@@ -6,11 +6,15 @@ import asyncio
 from typing import TYPE_CHECKING, Any, cast
 
 import grpc
+import pytest
 
+from controlplane import service as module
+from controlplane.limits import MAX_FIRST_BYTES
 from controlplane.mailbox import Mailbox
 from controlplane.service import ControlPlaneService
 from protos.convert import sidecar_message_to_proto
-from protos.model import PeerSet, Version
+from protos.model import Heartbeat, PeerSet, Report, Version
+from protos.plr.v1 import control_pb2
 from tests.unit.controlplane.samples import registration
 
 if TYPE_CHECKING:
@@ -29,15 +33,25 @@ class Loop:
         mailbox.put(PeerSet(Version(1), nonce=1))
         return 7, mailbox
 
+    def stream_ended(self, *_: object) -> None:
+        pass
+
     def disconnected(self, stream: object) -> None:
         self.gone.append(stream)
 
 
-class Broken:
-    """A call that registers and says no more, and whose connection is gone when it is answered."""
+class Ended(Exception):
+    """The call was ended with this status."""
 
-    def __init__(self) -> None:
-        self._first: list[bytes] = [sidecar_message_to_proto(registration("robot")).SerializeToString()]
+
+class Broken:
+    """A call that says one thing, a registration, and whose connection is gone when it is answered."""
+
+    def __init__(self, first: bytes | None = None) -> None:
+        self._first: list[bytes] = [first or sidecar_message_to_proto(registration("robot")).SerializeToString()]
+
+    async def abort(self, code: grpc.StatusCode, details: str) -> None:
+        raise Ended(code, details)
 
     def peer(self) -> str:
         return "test"
@@ -62,3 +76,29 @@ def test_a_connection_that_breaks_under_a_message_ends_its_stream_without_a_faul
 
     asyncio.run(serve())
     assert loop.gone == [7]
+
+
+@pytest.mark.audit("ops-16")
+def test_who_is_not_registered_is_given_no_time_and_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the first message is made of: it is short, or is never looked into, and only a registration is checked."""
+
+    def unread(_: object) -> object:
+        raise AssertionError("looked into")
+
+    monkeypatch.setattr(module, "sidecar_message_from_proto", unread)
+    report = control_pb2.Report(joints=[control_pb2.JointReport()] * MAX_FIRST_BYTES)
+    short = [sidecar_message_to_proto(said).SerializeToString() for said in (Heartbeat(), Report())]
+    for first in (control_pb2.SidecarMessage(report=report).SerializeToString(), *short):
+        with monkeypatch.context() as patch:
+            if len(first) > MAX_FIRST_BYTES:
+                patch.setattr(module, "read_sidecar_message", unread)
+            with pytest.raises(Ended) as ended:
+                asyncio.run(
+                    ControlPlaneService(cast("ControlLoop", Loop()), 0.5, None).connect(
+                        None, cast("Context", Broken(first))
+                    )
+                )
+        assert ended.value.args == (
+            grpc.StatusCode.INVALID_ARGUMENT,
+            "the first message has to be a registration",
+        )
