@@ -494,6 +494,10 @@ class Report:
     """Servers that said goodbye to this robot and are listed yet, or were until its last report."""
     continues: bool = False
     """Whether this is a further part of a report, which says nothing of penalties."""
+    more: bool = False
+    """Whether further parts of the report follow."""
+    servers_before: frozenset[NodeName] = frozenset()
+    """Servers of the paths in the parts before this one."""
 
 
 SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain | RevocationSet

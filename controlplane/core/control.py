@@ -242,9 +242,11 @@ class ControlCore:
         if sidecar is None or sidecar.role is not Role.ROBOT:
             self.counters.reports_ignored += 1
             return
-        self._note_goodbyes(report.goodbyes)
+        self._note_goodbyes(name, report.goodbyes)
         # Before the rest: after a restart a robot reports on servers that are not back yet.
-        reaches_again = self._publisher.waits_for(name, (path.server for path in report.paths))
+        reaches_again = not report.more and self._publisher.waits_for(
+            name, report.servers_before.union(path.server for path in report.paths)
+        )
         report, left_out = believable(report, name, self.registry, self.permits)
         self.counters.reports += not report.continues
         self.counters.report_entries_forbidden += left_out
@@ -264,9 +266,12 @@ class ControlCore:
         if reaches_again:
             self._publish_soon(now)
 
-    def _note_goodbyes(self, servers: Iterable[NodeName]) -> None:
-        """What a robot knows of those that went while the control plane was away."""
+    def _note_goodbyes(self, robot: NodeName, servers: Iterable[NodeName]) -> None:
+        """What a robot knows of those that went while the control plane was away, and that it may call."""
         for name in servers:
+            if not self.permits.may_know(robot, name):
+                self.counters.report_entries_forbidden += 1
+                continue
             self._returning.said_goodbye(name)
             gone = self.departed.get(name)
             if gone is not None and gone.role is Role.CLOUD and gone.text == returning.TEXT:

@@ -82,6 +82,12 @@ class Permits:
         """Whether a robot may call anything on a cloud."""
         return self._policy is None or bool(self.of(self.group(robot), cloud))
 
+    def may_know(self, robot: NodeName, cloud: NodeName) -> bool:
+        """Whether a robot may call anything on a cloud of which no more is known than its name."""
+        if self._policy is None:
+            return True
+        return any(self._policy.calls[index].leads_to(cloud) for index in self.group(robot))
+
     def may_offer(self, cloud: NodeName, service: ServiceName) -> bool:
         """Whether a cloud may offer a service."""
         if self._policy is None:

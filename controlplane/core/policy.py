@@ -45,7 +45,11 @@ class CallRule:
 
     def lets_call(self, service: ServiceName, cloud: NodeName) -> bool:
         """Whether the rule lets the robots it is about call the service on the cloud."""
-        return matches(cloud, self.clouds) and matches(service, self.services)
+        return self.leads_to(cloud) and matches(service, self.services)
+
+    def leads_to(self, cloud: NodeName) -> bool:
+        """Whether the rule lets the robots it is about call anything there."""
+        return matches(cloud, self.clouds)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from protos.fleet_events import Why
+from protos.model import Role
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -52,7 +53,8 @@ class Returning:
 
     def said_goodbye(self, name: NodeName) -> None:
         """A robot says so of a server."""
-        if name in self._awaited:
+        awaited = self._awaited.get(name)
+        if awaited is not None and awaited.role is Role.CLOUD:
             self._stopped.add(name)
 
     def missing(self, now: float) -> list[Departure]:

@@ -39,6 +39,8 @@ from protos.size_class import SIZE_CLASSES
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from protos.model import NodeName
+
 PART_ENTRIES = 32
 """Some 2 ms, with what is made of them."""
 
@@ -71,17 +73,22 @@ def report_parts(message: control_pb2.Report) -> Iterator[Report]:
     )
     for field, limit in lists:
         check_length(getattr(message, field), limit, field)
-    yield report_from_proto(control_pb2.Report(penalties=message.penalties, goodbyes=message.goodbyes))
+    part = report_from_proto(control_pb2.Report(penalties=message.penalties, goodbyes=message.goodbyes))
+    servers: frozenset[NodeName] = frozenset()
     for field, _ in lists:
         entries = getattr(message, field)
         for begin in range(0, len(entries), PART_ENTRIES):
+            yield replace(part, more=True)
+            servers |= {path.server for path in part.paths}
             part = report_from_proto(control_pb2.Report(**{field: entries[begin : begin + PART_ENTRIES]}))
-            yield replace(part, continues=True)
+            part = replace(part, continues=True, servers_before=servers)
+    yield part
 
 
 def report_entries(report: Report) -> int:
-    """How many entries take time to merge."""
-    return len(report.latencies) + len(report.paths) + len(report.joints) + len(report.interface_joints)
+    """How many entries take time to read or to merge."""
+    lists = (report.latencies, report.paths, report.outcomes, report.joints, report.interface_joints, report.penalties)
+    return sum(map(len, lists)) + len(report.goodbyes)
 
 
 def report_to_proto(report: Report) -> control_pb2.Report:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
+
 from controlplane.core.control_events import Settings
-from protos.model import CandidateSet, NodeName, Role, ServiceSet
+from protos.convert import parse_in_parts, sidecar_message_to_proto
+from protos.convert.reports import PART_ENTRIES
+from protos.model import CandidateSet, NodeName, Report, Role, ServiceSet
 from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import interfaces, registration, use
+from tests.unit.controlplane.samples import interfaces, path, registration, use
 
 ROBOT = NodeName("robot")
 
@@ -38,6 +42,30 @@ def test_after_a_restart_a_robot_keeps_its_peers_until_those_are_back() -> None:
     world.run(0.2)
     assert robot.peer_names == {"a", "b"}
     assert sorted(robot.pairs().values()) == ["a", "b"]
+
+
+@pytest.mark.audit("ops-16")
+def test_a_robot_whose_report_comes_in_parts_waits_for_all_servers_of_it() -> None:
+    world = restarted()
+    robot = come_back(world)
+    servers = [f"s{number:02d}" for number in range(PART_ENTRIES)]
+    for name in servers[1:]:
+        world.cloud(name)
+    nics = ("wlan0", "wwan0")
+    # The first server is in the first part of the paths alone.
+    paths = tuple(path(nic, name) for name in servers for nic in nics)
+    parts = list(parse_in_parts(sidecar_message_to_proto(Report(paths=paths)).SerializeToString()))
+    assert len(parts) > 2
+    for _ in range(2):
+        for part in parts:
+            world.say(robot, part)
+            world.run(0.5)
+            assert robot.peer_sets == []
+    world.cloud(servers[0])
+    for part in parts:
+        world.say(robot, part)
+    world.run(0.5)
+    assert robot.peer_names == set(servers)
 
 
 def test_after_the_warm_up_a_robot_is_told_who_did_not_come_back() -> None:

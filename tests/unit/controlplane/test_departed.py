@@ -176,6 +176,21 @@ def test_a_server_that_was_stopped_while_the_control_plane_was_away_is_no_dead_o
     assert world.departed == ["soon", "late", "dead", "late"]
 
 
+@pytest.mark.audit("ops-16")
+def test_a_robot_says_who_was_stopped_of_servers_alone_and_of_those_that_it_may_call() -> None:
+    policy = Policy((CallRule(("robot",), ("*",), ("mine",)),), (OfferRule(("*",), ("*",)),))
+    world = World(Settings(warm_up_s=5.0, policy=policy))
+    servers = [replace(departure(name), role=Role.CLOUD) for name in ("mine", "others", "late")]
+    world.core.remember([], [*servers, departure("arm")], world.now)
+    robot = world.robot()
+    world.say(robot, Report(goodbyes=tuple(NodeName(name) for name in ("mine", "others", "arm"))))
+    world.run(5.0 + world.settings.lease_s + 1.0)
+    world.say(robot, Report(goodbyes=(NodeName("late"),)))
+    assert {name for name, reason in why(world).items() if reason is Why.DRAINED} == {"mine"}
+    assert set(why(world)) == {"mine", "others", "late", "arm"}
+    assert world.core.counters.report_entries_forbidden == 3
+
+
 def test_no_robot_says_of_others_that_they_were_stopped(world: World) -> None:
     """Of those that the control plane itself has seen go it knows better."""
     robot = world.robot()

@@ -80,7 +80,7 @@ def test_a_connection_that_breaks_under_a_message_ends_its_stream_without_a_faul
 
 @pytest.mark.audit("ops-16")
 def test_who_is_not_registered_is_given_no_time_and_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the first message is made of: it is short, or is never looked into, and only a registration is checked."""
+    """A first message is short, or is never looked into, and only a registration is checked."""
 
     def unread(_: object) -> object:
         raise AssertionError("looked into")

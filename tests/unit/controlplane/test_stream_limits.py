@@ -15,7 +15,20 @@ from controlplane.limits import (
     StreamCount,
     StreamRate,
 )
-from protos.model import MAX_JOINTS, MAX_LATENCIES, MAX_PATHS
+from protos.convert.fields import MAX_OUTCOMES
+from protos.convert.reports import report_entries
+from protos.model import (
+    MAX_GOODBYES,
+    MAX_JOINTS,
+    MAX_LATENCIES,
+    MAX_PATHS,
+    MAX_PENALTIES,
+    NodeName,
+    OutcomeReport,
+    PenaltyReport,
+    Report,
+)
+from tests.unit.controlplane.samples import PLAN
 
 
 def test_a_sidecar_that_does_what_it_is_told_is_never_too_fast() -> None:
@@ -55,9 +68,18 @@ def test_reports_of_a_large_robot_are_read_at_once_and_of_more_at_a_bearable_pac
     pace = ReportPace()
     large = 8 * 16 * (4 + 1)
     assert not any(pace.wait_s(large, second / 2) for second in range(100)), "8 interfaces, 16 servers, 4 services"
-    assert not pace.wait_s(MAX_LATENCIES + MAX_PATHS + 2 * MAX_JOINTS, 60.0), "the largest there is"
+    largest = MAX_LATENCIES + MAX_PATHS + MAX_OUTCOMES + 2 * MAX_JOINTS + MAX_PENALTIES + MAX_GOODBYES
+    assert not pace.wait_s(largest, 60.0), "the largest there is"
     now, entries = 100.0, 0
     while now < 200.0:
         now += pace.wait_s(1600, now) + 0.01
         entries += 1600
     assert entries <= ENTRIES_BURST + 100.0 * ENTRIES_PER_S + 1600
+
+
+@pytest.mark.audit("ops-16")
+def test_whatever_a_report_is_made_of_counts() -> None:
+    server = NodeName("a")
+    outcome = OutcomeReport(PLAN, 1, 0, 0)
+    assert report_entries(Report(outcomes=(outcome,) * 3)) == 3
+    assert report_entries(Report(penalties=(PenaltyReport(server, 5.0, 3),), goodbyes=(server, server))) == 3
