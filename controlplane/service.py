@@ -57,6 +57,7 @@ _REFUSAL_CODES = {
     Refusal.NAME_TAKEN: grpc.StatusCode.ALREADY_EXISTS,
     Refusal.SESSION_TAKEN: grpc.StatusCode.ALREADY_EXISTS,
     Refusal.FULL: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    Refusal.TOO_OFTEN: grpc.StatusCode.RESOURCE_EXHAUSTED,
     Refusal.NAME_MISMATCH: grpc.StatusCode.PERMISSION_DENIED,
     Refusal.WRONG_ROLE: grpc.StatusCode.PERMISSION_DENIED,
     Refusal.BAD_CREDENTIAL: grpc.StatusCode.PERMISSION_DENIED,

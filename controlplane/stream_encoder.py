@@ -25,6 +25,9 @@ PART_BYTES = 256 << 10
 MAX_KEPT = 16_384
 """Encodings kept: a fleet's peers, before and after each has changed. Beyond that all are forgotten."""
 
+MAX_KEPT_BYTES = 64 << 20
+"""The same: those of 4096 servers take some 4 MiB, one with as many offers as can be half a MiB."""
+
 _LENGTH_DELIMITED = 2
 
 
@@ -52,6 +55,7 @@ class StreamEncoder:
     def __init__(self) -> None:
         self._encoded: dict[int, tuple[Peer, bytes]] = {}
         """By the identity of the peer, which is held so that no other takes its place."""
+        self._kept_bytes = 0
 
     def encode(self, message: ControlMessage, *, incremental: bool) -> Iterator[bytes]:
         """The messages that say this, each made when it is asked for; only `incremental` sidecars take several."""
@@ -83,9 +87,12 @@ class StreamEncoder:
         for peer, token in peers.with_tokens():
             known = self._encoded.get(id(peer))
             if known is None:
-                if len(self._encoded) >= MAX_KEPT:
+                known = peer, peer_to_proto(peer.with_token(b"")).SerializeToString()
+                if len(self._encoded) >= MAX_KEPT or self._kept_bytes + len(known[1]) > MAX_KEPT_BYTES:
                     self._encoded.clear()
-                known = self._encoded[id(peer)] = peer, peer_to_proto(peer.with_token(b"")).SerializeToString()
+                    self._kept_bytes = 0
+                self._encoded[id(peer)] = known
+                self._kept_bytes += len(known[1])
             yield known[1] + _TOKEN + token
 
 

@@ -62,6 +62,7 @@ CAPPED = {
     "reached._robots_of": MAX_PAIRS,
     "history._histories[].changes": MAX_HISTORIES * MAX_CHANGES,
     "restlessness._shares": MAX_MEMBERS,
+    "registry._shares._shares": MAX_MEMBERS,
     "registry._removals": MAX_REMEMBERED_REMOVALS,
     "_publisher._gone": MAX_GONE_SNAPSHOTS,
     "estimator._compute._servers": MAX_PROCESSING,

@@ -12,6 +12,7 @@ from collections import Counter, OrderedDict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
+from controlplane.core.registration_share import RegistrationShare
 from protos.model import (
     NO_REVOCATIONS,
     NodeName,
@@ -57,6 +58,7 @@ class Refusal(enum.Enum):
     NAME_TAKEN = "another sidecar holds this name, and its lease has not ended"
     SESSION_TAKEN = "another sidecar has this session number: draw a new one"
     FULL = f"{MAX_SIDECARS} sidecars are registered, which is the limit"
+    TOO_OFTEN = "it registers too often: see why it starts or loses its connection all the time"
     NAME_MISMATCH = "the certificate is another name's: set name to the certificate's, or leave it out"
     WRONG_ROLE = "the certificate is for another role: set role to the certificate's, or leave it out"
     BAD_CREDENTIAL = "the credential is not this run's, or not signed with this certificate"
@@ -182,6 +184,7 @@ class Registry:
         self._leases: dict[NodeName, _Lease] = {}
         self._sidecars: dict[NodeName, Sidecar] = {}
         self._sessions: dict[SessionId, NodeName] = {}
+        self._shares = RegistrationShare()
         self._offers: Counter[ServiceName] = Counter()
         """By how many each is offered."""
         self._removals: OrderedDict[NodeName, tuple[RemovalReason, float]] = OrderedDict()
@@ -214,6 +217,8 @@ class Registry:
         if known is None:
             if len(self._sidecars) >= MAX_SIDECARS:
                 return self._refuse(Refusal.FULL)
+            if not self._shares.take(name, now, new_run=True):
+                return self._refuse(Refusal.TOO_OFTEN)
             self._removals.pop(name, None)
             self._sidecars[name] = Sidecar(registration, stream)
             self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
@@ -228,6 +233,8 @@ class Registry:
         same_run = registration.session == before.session
         if registration.incarnation == before.incarnation and not same_run:
             return self._refuse(Refusal.NAME_TAKEN)
+        if not self._shares.take(name, now, new_run=not same_run):
+            return self._refuse(Refusal.TOO_OFTEN)
         # What it said last holds until it says it anew, a moment from now: its peers see no gap.
         carried = known.carried if same_run else frozenset()
         self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False, carried=carried)

@@ -180,7 +180,7 @@ def test_setters_say_whether_anything_changed(registry: Registry) -> None:
 
 
 def test_coming_and_going_leaves_nothing_behind(registry: Registry) -> None:
-    for round_ in range(50):
+    for round_ in range(25):
         registry.register(registration("robot", incarnation=round_), stream(round_), 0.001 * round_)
         registry.set_draining(ROBOT)
         registry.disconnect(ROBOT, stream(round_))

@@ -10,7 +10,18 @@ from controlplane import stream_encoder
 from controlplane.core.told_peers import ToldPeers
 from controlplane.stream_encoder import StreamEncoder
 from protos.convert import parse_control_message
-from protos.model import NodeName, Peer, PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
+from protos.model import (
+    NodeName,
+    Peer,
+    PeerSet,
+    RemovalReason,
+    RemovedPeer,
+    Role,
+    ServiceName,
+    ServiceOffer,
+    SessionId,
+    Version,
+)
 from tests.unit.protos.message_strategies import control_messages, peers
 
 ENCODER = StreamEncoder()
@@ -56,3 +67,17 @@ def test_what_is_kept_is_bounded_and_never_another_peers(monkeypatch: pytest.Mon
         assert isinstance(parsed, PeerSet)
         assert tuple(parsed.peers) == tuple(told)
     assert len(encoder._encoded) <= 10
+
+
+@pytest.mark.audit("ops-16")
+def test_what_is_kept_is_bounded_by_its_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream_encoder, "MAX_KEPT_BYTES", 10_000)
+    encoder = StreamEncoder()
+    offers = tuple(ServiceOffer(ServiceName(f"/s{number}"), "std_srvs/srv/Trigger") for number in range(100))
+    most = 0
+    for number in range(20):
+        peer = Peer(NodeName("cloud"), Role.CLOUD, SessionId(number + 1), bytes(16), 1, offers=offers)
+        list(encoder.encode(PeerSet(Version(1), 1, ToldPeers((peer,), NodeName("me"), Role.ROBOT)), incremental=True))
+        most = max(most, sum(len(data) for _, data in encoder._encoded.values()))
+        assert encoder._kept_bytes <= 10_000
+    assert 5_000 < most <= 10_000
