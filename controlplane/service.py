@@ -72,6 +72,9 @@ _CLOSE_CODES = {
 }
 
 
+_NOT_A_REGISTRATION = (grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
+
+
 class _StreamEndError(Exception):
     """The stream ends with this status; None: the sidecar ended it."""
 
@@ -133,24 +136,24 @@ class ControlPlaneService:
                 tasks.create_task(self._write(mailbox, context, incremental=incremental))
                 tasks.create_task(self._read(stream, context))
         except BaseExceptionGroup as group:
-            ends, others = group.split(_StreamEndError)
-            if others is not None or ends is None:
+            end = _only_end(group)
+            if end is None:
                 raise
-            raise ends.exceptions[0] from None
+        else:
+            raise AssertionError("neither task ends but by an exception")
         finally:
             self._loop.disconnected(stream)
-        raise AssertionError("neither task ends but by an exception")
+        raise _StreamEndError(*end)
 
     async def _register(self, context: Context, caller: Caller | None) -> tuple[StreamId, Mailbox, bool]:
         """Returns the stream, what to write to it, and whether it takes changes."""
         try:
             async with asyncio.timeout(REGISTER_TIMEOUT_S):
-                data = await self._receive(context)
+                found = _first_message(await self._receive(context))
         except TimeoutError:
             raise _StreamEndError(grpc.StatusCode.DEADLINE_EXCEEDED, "no registration came") from None
-        found = _first_message(data)
-        if isinstance(found, _StreamEndError):
-            raise found
+        if not isinstance(found, Registration):
+            raise _StreamEndError(*found)
         registration = found
         async with self._turn:
             # Few in each turn of the loop: the messages of those who are registered already come in between.
@@ -178,7 +181,7 @@ class ControlPlaneService:
 
     async def _read(self, stream: StreamId, context: Context) -> NoReturn:
         told = False
-        malformed: _StreamEndError | None = None
+        malformed: str | None = None
         rate = StreamRate(report_interval_s=self._report_interval_s, now=time.monotonic())
         pace = ReportPace()
         while True:
@@ -199,10 +202,10 @@ class ControlPlaneService:
                     async for _ in self._loop.turns.each(parts, lambda part: self._loop.receive(stream, part)):
                         pass
             except DecodeError as error:
-                malformed = _malformed(error)
+                malformed = str(error)
             if malformed is not None:
                 # Out here: an error holds all that was parsed where it was raised, and so would this one.
-                raise malformed
+                raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, malformed)
             entries = sum(report_entries(part) for part in parts if isinstance(part, Report))
             wait_s = pace.wait_s(entries, time.monotonic())
             if wait_s:
@@ -231,13 +234,26 @@ class ControlPlaneService:
                     raise _StreamEndError(None, "the connection broke") from error
 
 
-def _first_message(data: bytes) -> Registration | _StreamEndError:
-    """What a stream begins with, or why it may not.
+_End = tuple[grpc.StatusCode | None, str]
+"""The status of a stream, and details. Passed on, not raised where it is found: an error holds all that was parsed
+there for as long as it lives."""
 
-    Returned, not raised from where it is found: an error holds all that was parsed there for as long as it lives.
-    """
+
+def _only_end(group: BaseExceptionGroup) -> _End | None:
+    """Why a stream ends, if nothing else is in the group."""
+    ends, others = group.split(_StreamEndError)
+    if others is not None or ends is None:
+        return None
+    first = ends.exceptions[0]
+    while isinstance(first, BaseExceptionGroup):
+        first = first.exceptions[0]
+    return first.code, first.details
+
+
+def _first_message(data: bytes) -> Registration | _End:
+    """What a stream begins with, or why it may not."""
     if len(data) > MAX_FIRST_BYTES:
-        return _not_a_registration()
+        return _NOT_A_REGISTRATION
     try:
         message = read_sidecar_message(data)
         kind = message.WhichOneof("kind")
@@ -246,18 +262,10 @@ def _first_message(data: bytes) -> Registration | _StreamEndError:
             oldest = message.register.protocol_version
             problem = refusal(Spoken(oldest, message.register.newest_protocol_version or oldest))
             if problem is not None:
-                return _StreamEndError(grpc.StatusCode.FAILED_PRECONDITION, problem)
+                return grpc.StatusCode.FAILED_PRECONDITION, problem
         elif kind is not None:
-            return _not_a_registration()
+            return _NOT_A_REGISTRATION
         registration = sidecar_message_from_proto(message)
     except DecodeError as error:
-        return _malformed(error)
-    return registration if isinstance(registration, Registration) else _not_a_registration()
-
-
-def _not_a_registration() -> _StreamEndError:
-    return _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
-
-
-def _malformed(error: DecodeError) -> _StreamEndError:
-    return _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, str(error))
+        return grpc.StatusCode.INVALID_ARGUMENT, str(error)
+    return registration if isinstance(registration, Registration) else _NOT_A_REGISTRATION

@@ -233,7 +233,7 @@ class Registry:
         same_run = registration.session == before.session
         if registration.incarnation == before.incarnation and not same_run:
             return self._refuse(Refusal.NAME_TAKEN)
-        if not self._shares.take(name, now, new_run=not same_run):
+        if not self._shares.take(name, now, new_run=_tells_anything(registration, before)):
             return self._refuse(Refusal.TOO_OFTEN)
         # What it said last holds until it says it anew, a moment from now: its peers see no gap.
         carried = known.carried if same_run else frozenset()
@@ -419,3 +419,9 @@ class Registry:
             return lease.heard_at
         removed = self._removals.get(name)
         return now if removed is None else removed[1]
+
+
+def _tells_anything(registration: Registration, before: Registration) -> bool:
+    """Whether all others are to be told of what a sidecar registers with; not of what it holds itself."""
+    held = replace(before, peers_version=registration.peers_version, mapping_version=registration.mapping_version)
+    return registration != held

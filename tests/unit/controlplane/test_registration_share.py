@@ -33,13 +33,15 @@ def admitted(made: Callable[[int], Registration]) -> int:
 
 
 def test_a_member_that_starts_all_the_time_is_let_in_as_often_as_its_share() -> None:
-    count = admitted(lambda second: registration("cloud", Role.CLOUD, incarnation=second, token=b"t" * 16))
-    assert STARTS_BURST <= count <= STARTS_BURST + STARTS_PER_S * SECONDS + 1
+    of_new_sessions = admitted(lambda second: registration("cloud", Role.CLOUD, incarnation=second))
+    of_one_session = admitted(lambda second: registration("cloud", Role.CLOUD, incarnation=second, session=7))
+    for count in (of_new_sessions, of_one_session):
+        assert STARTS_BURST <= count <= STARTS_BURST + STARTS_PER_S * SECONDS + 1
 
 
 def test_a_run_that_only_connects_again_is_let_in_once_a_second() -> None:
     assert STARTS_PER_S / RETURN_COST >= 1.0
-    assert admitted(lambda _: registration("robot")) == SECONDS
+    assert admitted(lambda second: registration("robot", held=second)) == SECONDS
 
 
 def test_the_share_of_one_is_not_anothers_and_a_stranger_takes_none_of_it() -> None:
