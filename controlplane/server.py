@@ -54,8 +54,6 @@ GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
     ("grpc.keepalive_time_ms", 20_000),
     ("grpc.keepalive_timeout_ms", 10_000),
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-    # None but the identity: a few kilobytes must not become a message of the largest size. No sidecar compresses.
-    ("grpc.compression_enabled_algorithms_bitset", 1),
     ("grpc.max_concurrent_streams", MAX_STREAMS_PER_CONNECTION),
     # A connection without a call is not worth its place for longer than somebody reads the answer to the one before.
     ("grpc.max_connection_idle_ms", 60_000),

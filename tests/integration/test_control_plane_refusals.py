@@ -113,15 +113,3 @@ def test_a_stream_that_ends_before_it_registers_is_no_error(plane: ControlPlaneP
     with Stream(plane.address) as stream:
         stream.half_close()
         assert stream.end()[0] is grpc.StatusCode.OK
-
-
-@pytest.mark.audit("ops-16")
-def test_nothing_is_unpacked(plane: ControlPlaneProcess) -> None:
-    """A kilobyte of gzip can be a megabyte."""
-    data = sidecar_message_to_proto(registration("robot")).SerializeToString()
-    with grpc.insecure_channel(plane.address) as channel:
-        connect: grpc.StreamStreamMultiCallable[bytes, bytes] = channel.stream_stream("/plr.v1.ControlPlane/Connect")
-        call = connect(iter([data]), timeout=PATIENCE_S, compression=grpc.Compression.Gzip)
-        with pytest.raises(grpc.RpcError):
-            list(call)
-        assert call.code() is grpc.StatusCode.UNIMPLEMENTED
