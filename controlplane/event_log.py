@@ -17,6 +17,7 @@ import logging
 import os
 import threading
 import time
+from bisect import bisect_left
 from collections import deque
 from typing import IO, TYPE_CHECKING
 
@@ -27,7 +28,7 @@ from protos.fleet_events import EventKind, EventLogState, FleetEvent
 from protos.names import clean_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
     from protos.fleet_events import EventQuery, Why
@@ -215,26 +216,24 @@ class EventLog:
             at = self._wall()
             os.utime(self._lock.fileno(), (at, at))
 
-    def _read(self, path: Path) -> Iterator[FleetEvent]:
+    def _read(self, path: Path) -> list[FleetEvent]:
         with path.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(0, size - 2 * MAX_FILE_BYTES))
             data = file.read(2 * MAX_FILE_BYTES)
         # What is appended must not join a line that was cut off.
         self._write_all = not data.endswith(b"\n")
-        last = 0
+        read = []
         for line in data.split(b"\n"):
             if not line:
                 continue
             try:
-                event = decode(line)
-                if event.number <= last:
-                    raise DecodeError("out of order")
+                read.append(decode(line))
             except DecodeError:
                 self._damaged += 1
-                continue
-            last = event.number
-            yield event
+        events = _in_order(read)
+        self._damaged += len(read) - len(events)
+        return events
 
     # ── the writer's thread ──
 
@@ -313,3 +312,29 @@ def _write_through(file: IO[bytes], data: bytes) -> None:
     while view:
         view = view[file.write(view) :]
     os.fdatasync(file.fileno())
+
+
+def _in_order(events: list[FleetEvent]) -> list[FleetEvent]:
+    """Return as many of these as can be in ascending order of their numbers: one wrong number costs one event.
+
+    By patience sorting (longest increasing subsequence).
+    """
+    ends: list[int] = []
+    """The least number that such a sequence of each length ends with."""
+    at: list[int] = []
+    """Where in `events` that one is."""
+    before: list[int | None] = []
+    for index, event in enumerate(events):
+        length = bisect_left(ends, event.number)
+        before.append(at[length - 1] if length else None)
+        if ends[length : length + 1] == [event.number]:
+            # Of two with one number the first stays.
+            continue
+        ends[length : length + 1] = [event.number]
+        at[length : length + 1] = [index]
+    found = []
+    next_one = at[-1] if at else None
+    while next_one is not None:
+        found.append(events[next_one])
+        next_one = before[next_one]
+    return found[::-1]

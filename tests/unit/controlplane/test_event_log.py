@@ -119,6 +119,24 @@ def test_a_full_disk_costs_nothing_but_time(tmp_path: Path, monkeypatch: pytest.
     again.close()
 
 
+@pytest.mark.audit("ops-16")
+@pytest.mark.parametrize("wrong", [1, 1 << 60])
+@pytest.mark.parametrize("place", range(4))
+def test_a_wrong_number_costs_one_event(tmp_path: Path, wrong: int, place: int) -> None:
+    written = write(tmp_path)
+    lines = (tmp_path / FILE).read_bytes().splitlines(keepends=True)
+    lines[place] = lines[place].replace(str(written[place].number).encode(), str(wrong).encode())
+    (tmp_path / FILE).write_bytes(b"".join(lines))
+    log = EventLog(tmp_path)
+    # One that is still in order cannot be told from a right one, and may stand in place of one.
+    assert log.state.damaged <= 1
+    kept = [event.number for event in log.events()]
+    assert len(kept) + log.state.damaged == len(written)
+    assert kept == sorted(kept)
+    assert {event.number for event in written[max(place, 1) + 1 :]} <= set(kept)
+    log.close()
+
+
 def test_the_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(event_log, "MAX_FILE_BYTES", 20_000)
     monkeypatch.setattr("controlplane.core.event_memory.MAX_EVENTS", 50)
