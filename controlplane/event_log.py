@@ -23,9 +23,11 @@ from typing import IO, TYPE_CHECKING
 
 from controlplane.core.event_memory import EventMemory
 from controlplane.event_lines import decode, encode
+from protos import own_folder
 from protos.errors import DecodeError
 from protos.fleet_events import EventKind, EventLogState, FleetEvent
 from protos.names import clean_text
+from protos.own_folder import OwnFolder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,7 +68,8 @@ class EventLog:
         clock: Callable[[], float] = time.monotonic,
         retry_s: float = RETRY_S,
     ) -> None:
-        self._folder = folder
+        self._folder: OwnFolder | None = None
+        self._path = folder
         self._wall = wall
         self._clock = clock
         self._retry_s = retry_s
@@ -92,12 +95,12 @@ class EventLog:
 
     def announce(self) -> None:
         """Log what is wrong with it. Not at once: a program that does not start has other things to say."""
-        if self._folder is None:
+        if self._path is None:
             log.info("events are kept in memory only, and a restart forgets who is gone: state_dir is not set")
         elif self._problem:
             log.error("events are kept in memory only: %s", self._problem)
         if self._damaged:
-            log.warning("%s: %d damaged lines of the log of events skipped", self._folder, self._damaged)
+            log.warning("%s: %d damaged lines of the log of events skipped", self._path, self._damaged)
 
     # ── for the loop ──
 
@@ -174,35 +177,39 @@ class EventLog:
             self._closing = True
             self._condition.notify()
         self._writer.join(CLOSE_TIMEOUT_S)
-        self._unlock()
+        if not self._writer.is_alive():
+            self._unlock()
 
     def _unlock(self) -> None:
         if self._lock is not None:
             self._lock.close()
+        if self._folder is not None:
+            self._folder.close()
 
     # ── the file ──
 
-    def _open(self, folder: Path) -> bool:
+    def _open(self, path: Path) -> bool:
         try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._lock = (folder / LOCK_FILE).open("ab")
+            self._folder = OwnFolder(path)
+            self._lock = self._open_to_append(LOCK_FILE)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            self._problem = f"state_dir: another control plane uses {folder}; give each a folder of its own"
+            self._problem = f"state_dir: another control plane uses {path}; give each a folder of its own"
         except OSError as error:
-            self._problem = f"state_dir: {folder}: {error.strerror or error}"
+            self._problem = f"state_dir: {path}: {error.strerror or error}"
         if self._problem:
             self._unlock()
             return False
         assert self._lock is not None
+        assert self._folder is not None
         touched_at = os.fstat(self._lock.fileno()).st_mtime
         try:
-            for event in self._read(folder / FILE):
+            for event in self._read(self._folder):
                 self._memory.add(event)
         except FileNotFoundError:
             pass
         except OSError as error:
-            log.error("%s cannot be read: %s; events begin anew", folder / FILE, error.strerror or error)
+            log.error("%s cannot be read: %s; events begin anew", path / FILE, error.strerror or error)
         self._write_all |= self._damaged > 0
         last = self._memory.last(1)
         if last:
@@ -216,8 +223,12 @@ class EventLog:
             at = self._wall()
             os.utime(self._lock.fileno(), (at, at))
 
-    def _read(self, path: Path) -> list[FleetEvent]:
-        with path.open("rb") as file:
+    def _open_to_append(self, name: str) -> IO[bytes]:
+        assert self._folder is not None
+        return open(self._folder.open(name, os.O_WRONLY | os.O_CREAT | os.O_APPEND), "ab", buffering=0)
+
+    def _read(self, folder: OwnFolder) -> list[FleetEvent]:
+        with folder.open_to_read(FILE) as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(0, size - 2 * MAX_FILE_BYTES))
             data = file.read(2 * MAX_FILE_BYTES)
@@ -285,33 +296,18 @@ class EventLog:
     def _put(self, events: list[FleetEvent], whole: bool) -> None:
         assert self._folder is not None
         data = "".join(f"{encode(event)}\n" for event in events).encode()
-        path = self._folder / FILE
         if whole:
             self._close_file()
-            aside = path.with_suffix(".new")
-            try:
-                with aside.open("wb", buffering=0) as file:
-                    _write_through(file, data)
-                aside.replace(path)
-            except OSError:
-                aside.unlink(missing_ok=True)
-                raise
+            self._folder.write(FILE, data)
             return
         if self._file is not None and not os.fstat(self._file.fileno()).st_nlink:
             raise FileNotFoundError(errno.ENOENT, "somebody has removed it")
         if self._file is None:
-            self._file = path.open("ab", buffering=0)
-        _write_through(self._file, data)
+            self._file = self._open_to_append(FILE)
+        own_folder.write_through(self._file, data)
         if self._file.tell() > MAX_FILE_BYTES:
             with self._condition:
                 self._write_all = True
-
-
-def _write_through(file: IO[bytes], data: bytes) -> None:
-    view = memoryview(data)
-    while view:
-        view = view[file.write(view) :]
-    os.fdatasync(file.fileno())
 
 
 def _in_order(events: list[FleetEvent]) -> list[FleetEvent]:

@@ -12,18 +12,26 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
 
-def open_regular(path: Path) -> BinaryIO:
-    """Open a file to read it; raises OSError, also if it is none, or nothing can have such a name."""
+def open_regular(path: Path, *, folder: int | None = None) -> BinaryIO:
+    """Open a file to read it; raises OSError, also if it is none, or nothing can have such a name.
+
+    `folder`: the descriptor of the one that a relative path begins in.
+    """
     try:
         # A FIFO would be waited for until somebody writes to it.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
     except ValueError as error:
         raise OSError(errno.EINVAL, "there is a NUL in its name") from error
+    refuse_irregular(descriptor)
+    return open(descriptor, "rb")
+
+
+def refuse_irregular(descriptor: int) -> None:
+    """Close what is no regular file, and raise OSError."""
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
         raise OSError(errno.EISDIR, os.strerror(errno.EISDIR)) if stat.S_ISDIR(mode) else _no_file()
-    return open(descriptor, "rb")
 
 
 def _no_file() -> OSError:

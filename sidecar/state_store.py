@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from protos.errors import DecodeError
 from protos.model import TOKEN_BYTES
-from protos.regular_file import open_regular
+from protos.own_folder import OwnFolder
 from sidecar.state_file import (
     MAX_FILE_BYTES,
     ControlAddresses,
@@ -81,11 +81,10 @@ class StateStore:
     """
 
     def __init__(self, folder: Path, owner: NodeName) -> None:
-        self._folder = folder
         self._owner = owner
         self.failures: Counter[str] = Counter()
         """Files not read or not written."""
-        self._lock = _lock(folder)
+        self._folder, self._lock = _lock(folder)
         self.identity = self._next_identity()
         self._current = self._read(LAST_GOOD_FILE, lambda data: decode_last_good(data, owner)) or LastGood(owner)
         self.last_good = self._current
@@ -141,9 +140,10 @@ class StateStore:
             self._condition.notify()
         self._writer.join(CLOSE_TIMEOUT_S)
         if self._writer.is_alive():
-            log.warning("%s: the last state is still being written", self._folder)
+            log.warning("%s: the last state is still being written", self._folder.path)
         else:
             os.close(self._lock)
+            self._folder.close()
 
     def _next_identity(self) -> Identity:
         known = self._read(IDENTITY_FILE, decode_identity)
@@ -166,9 +166,9 @@ class StateStore:
                 self._condition.wait_for(lambda: self._closing, MIN_WRITE_INTERVAL_S)
 
     def _read(self, name: str, decode: Callable[[bytes], T]) -> T | None:
-        path = self._folder / name
+        path = self._folder.path / name
         try:
-            with open_regular(path) as file:
+            with self._folder.open_to_read(name) as file:
                 data = file.read(MAX_FILE_BYTES + 1)
             if len(data) > MAX_FILE_BYTES:
                 raise DecodeError(f"more than {MAX_FILE_BYTES} bytes")
@@ -177,61 +177,51 @@ class StateStore:
             return None
         except (OSError, DecodeError) as error:
             self.failures[f"{name.replace('-', '_')}_refused"] += 1
-            aside = path.with_name(name + SET_ASIDE_SUFFIX)
-            log.error("%s refused (%s), set aside as %s", path, error, aside.name)
-            self._set_aside(path, aside)
+            log.error("%s refused (%s), set aside as %s", path, error, name + SET_ASIDE_SUFFIX)
+            self._set_aside(name)
             return None
 
-    def _set_aside(self, path: Path, aside: Path) -> None:
+    def _set_aside(self, name: str) -> None:
         try:
-            path.replace(aside)
+            self._folder.rename(name, name + SET_ASIDE_SUFFIX)
         except OSError as error:
-            log.error("%s cannot be set aside: %s", path, error)
+            log.error("%s cannot be set aside: %s", self._folder.path / name, error)
 
     def _write(self, name: str, data: bytes) -> None:
-        path = self._folder / name
-        temporary = path.with_name(name + ".new")
         try:
-            # In a folder that somebody else made it may be his link to a file that he may not write.
-            temporary.unlink(missing_ok=True)
-            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-            with open(descriptor, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(descriptor)
-            temporary.replace(path)
-            _sync_folder(self._folder)
+            self._folder.write(name, data)
         except OSError as error:
             self.failures["write_failed"] += 1
-            log.error("%s not written: %s; a restart will not know it", path, error)
+            log.error("%s not written: %s; a restart will not know it", self._folder.path / name, error)
 
 
-def _lock(folder: Path) -> int:
-    """Create the folder, and keep a second sidecar out of it for as long as the returned descriptor is open."""
+def _lock(path: Path) -> tuple[OwnFolder, int]:
+    """Open the folder, and keep a second sidecar out of it for as long as the returned descriptor is open."""
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        descriptor = _open_lock(folder / LOCK_FILE)
+        folder = OwnFolder(path)
     except OSError as error:
-        raise StateDirError(f"expected a folder that can be written: {error.strerror or error}") from error
+        raise _unusable(error) from error
+    try:
+        descriptor = _open_lock(folder)
+    except OSError as error:
+        folder.close()
+        raise _unusable(error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         os.close(descriptor)
+        folder.close()
         raise StateDirError("expected a folder of its own: another sidecar is using it") from error
-    return descriptor
+    return folder, descriptor
 
 
-def _open_lock(path: Path) -> int:
+def _unusable(error: OSError) -> StateDirError:
+    return StateDirError(f"expected a folder that can be written: {error.strerror or error}")
+
+
+def _open_lock(folder: OwnFolder) -> int:
     try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        return folder.open(LOCK_FILE, os.O_RDWR | os.O_CREAT)
     except OSError:
         # A card that has gone read-only still holds the last mapping: the lock of an earlier run will do.
-        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        return folder.open(LOCK_FILE, os.O_RDONLY)

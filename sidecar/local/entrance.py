@@ -15,6 +15,7 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from protos.own_folder import refuse_strange
 from sidecar.local.shares import Rate
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class SocketLock:
 
     def take(self) -> None:
         """Raise OSError if another sidecar has it, or its folder is one where others could exchange what is in it."""
-        _refuse_strange(self._path.parent)
+        refuse_strange(self._path.parent, self._path.parent.stat())
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         descriptor = os.open(self._path, flags, 0o600)
         try:
@@ -160,14 +161,6 @@ def _open_to_group(path: Path, group: int | None) -> tuple[int, int]:
         return status.st_dev, status.st_ino
     finally:
         os.close(descriptor)
-
-
-def _refuse_strange(folder: Path) -> None:
-    status = folder.stat()
-    if status.st_uid not in (0, os.geteuid()):
-        raise OSError(errno.EPERM, f"{folder} belongs to user {status.st_uid}: chown it, or name a folder of its own")
-    if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
-        raise OSError(errno.EPERM, f"everybody may change {folder}: chmod o-w, or name a folder of its own")
 
 
 def _taken() -> OSError:

@@ -15,6 +15,7 @@ from controlplane import event_log
 from controlplane.event_lines import decode, encode
 from controlplane.event_log import FILE, EventLog
 from controlplane.remembered import departures
+from protos import own_folder
 from protos.errors import DecodeError
 from protos.fleet_events import EventKind, EventQuery, FleetEvent, Why
 from protos.model import NodeName, Role
@@ -91,7 +92,7 @@ def test_a_line_without_its_end_does_not_swallow_the_next(tmp_path: Path) -> Non
 
 def test_a_full_disk_costs_nothing_but_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = threading.Event()
-    real = event_log._write_through
+    real = own_folder.write_through
 
     def write_through(file: IO[bytes], data: bytes) -> None:
         if full.is_set():
@@ -99,7 +100,7 @@ def test_a_full_disk_costs_nothing_but_time(tmp_path: Path, monkeypatch: pytest.
             raise OSError(errno.ENOSPC, "No space left on device")
         real(file, data)
 
-    monkeypatch.setattr(event_log, "_write_through", write_through)
+    monkeypatch.setattr(own_folder, "write_through", write_through)
     log = EventLog(tmp_path, retry_s=0.05)
     log.record(EventKind.STARTED)
     wait_for(lambda: (tmp_path / FILE).exists())
@@ -109,7 +110,7 @@ def test_a_full_disk_costs_nothing_but_time(tmp_path: Path, monkeypatch: pytest.
     wait_for(lambda: log.state.write_failures > 1)
     assert not log.state.on_disk
     assert "No space left" in log.state.problem
-    assert not (tmp_path / "events.new").exists()
+    assert not (tmp_path / f"{FILE}.new").exists()
     full.clear()
     wait_for(lambda: log.state.on_disk)
     log.close()
