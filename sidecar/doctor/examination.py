@@ -243,7 +243,13 @@ def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | Non
         told = state.get("services") or {}
         yield from node_checks.types(told.get("carried") or {}, told.get("missing_types") or {})
         return
-    used = host.unit_environment(where.config)
+    unit = host.unit_environment(where.config)
+    if unit.refused:
+        remedy = (
+            f"let it and its folder belong to root or the configuration's owner, who alone may write: {where.config}"
+        )
+        yield warn("ros", unit.refused, remedy)
+    used = unit.variables
     yield from node_checks.ros(used, shell, environment.problem(used, thorough=True))
     if config is not None:
         wanted = _types_last_offered(config)

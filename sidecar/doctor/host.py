@@ -3,17 +3,38 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
+import re
+import stat
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from protos.regular_file import open_regular
+
+if TYPE_CHECKING:
+    from collections.abc import Container
 
 STA_UNSYNC = 0x0040
 CLOCK_KEPT_S = 16.0
 """The kernel's bound of its error grows to this where nobody keeps the clock (ntp_adjtime(3): NTP_PHASE_LIMIT)."""
+ENVIRONMENT_FILE = "sidecar.env"
 MAX_ENVIRONMENT_BYTES = 1 << 16
+MAX_NAMES_CHARACTERS = 200
 CONF = Path("/proc/sys/net/ipv4/conf")
+
+_TELLS_OF_ROS = frozenset(
+    {
+        "ROS_DOMAIN_ID",
+        "RMW_IMPLEMENTATION",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "ROS_LOCALHOST_ONLY",
+        "ROS_STATIC_PEERS",
+    }
+)
+"""Variables that name no file: PATH, PYTHONPATH, LD_PRELOAD, AMENT_PREFIX_PATH and many more run code."""
+_PLAIN_VALUE = re.compile(r"[A-Za-z0-9_.:;, -]*")
 
 
 class _Timex(ctypes.Structure):
@@ -65,19 +86,61 @@ def _number(path: Path) -> int | None:
         return None
 
 
-def unit_environment(config: Path) -> dict[str, str]:
-    """Return the environment in which the unit of a configuration in /etc starts, as far as its files tell.
+@dataclass(frozen=True, slots=True)
+class UnitEnvironment:
+    """The environment in which the unit of a configuration in /etc starts, as far as its files tell."""
 
-    What stands in `sidecar.env` beside the configuration wins over this shell's.
+    variables: dict[str, str]
+    refused: str = ""
+    """What of `sidecar.env` is not used, and why; empty: nothing."""
+
+
+def unit_environment(config: Path) -> UnitEnvironment:
+    """Read `sidecar.env` beside the configuration, which wins over this shell's environment.
+
+    A program is run with it, so it is used only if nobody can have written it but root, this user, or the owner of the
+    configuration. The last one's tells of ROS and no more, since it must not run code of his as this user.
     """
     environment = dict(os.environ)
+    path = config.with_name(ENVIRONMENT_FILE)
     try:
-        with open_regular(config.with_name("sidecar.env")) as file:
-            lines = file.read(MAX_ENVIRONMENT_BYTES).decode().splitlines()
-    except (OSError, ValueError):
-        return environment
-    for line in lines:
-        key, separator, value = line.strip().partition("=")
-        if separator and not key.startswith(("#", ";")):
-            environment[key.strip()] = value.strip().strip("\"'")
-    return environment
+        owner, text = _read_trusted(path, {0, os.geteuid(), config.stat().st_uid})
+    except FileNotFoundError:
+        return UnitEnvironment(environment)
+    except (OSError, ValueError) as error:
+        return UnitEnvironment(environment, f"{path} is not used: {getattr(error, 'strerror', None) or error}")
+    foreign = owner not in (0, os.geteuid())
+    refused = set()
+    for line in text.splitlines():
+        key, separator, value = (part.strip() for part in line.strip().partition("="))
+        if not separator or key.startswith(("#", ";")):
+            continue
+        value = value.strip("\"'")
+        if foreign and not (key in _TELLS_OF_ROS and _PLAIN_VALUE.fullmatch(value)):
+            refused.add(key)
+        else:
+            environment[key] = value
+    if not refused:
+        return UnitEnvironment(environment)
+    names = " ".join(sorted(refused))[:MAX_NAMES_CHARACTERS]
+    return UnitEnvironment(environment, f"{path} belongs to user {owner}, of it are not used: {names}")
+
+
+def _read_trusted(path: Path, owners: Container[int]) -> tuple[int, str]:
+    """Return owner and text of a file that only `owners` can have written; raises OSError or ValueError."""
+    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with open_regular(Path(path.name), folder=folder) as file:
+            _refuse_untrusted("its folder", os.fstat(folder), owners)
+            status = os.fstat(file.fileno())
+            _refuse_untrusted("it", status, owners)
+            return status.st_uid, file.read(MAX_ENVIRONMENT_BYTES).decode()
+    finally:
+        os.close(folder)
+
+
+def _refuse_untrusted(what: str, status: os.stat_result, owners: Container[int]) -> None:
+    if status.st_uid not in owners:
+        raise OSError(errno.EPERM, f"{what} belongs to user {status.st_uid}, who is not the configuration's owner")
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise OSError(errno.EPERM, f"others may write {what}: chmod go-w")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from typing import TYPE_CHECKING
 
@@ -161,5 +162,38 @@ def test_the_reverse_path_filter(tmp_path: Path) -> None:
 
 def test_the_environment_of_the_unit_is_read(tmp_path: Path) -> None:
     (tmp_path / "sidecar.env").write_text("# a comment\nROS_DOMAIN_ID=42\nRMW_IMPLEMENTATION='rmw_x'\nnonsense\n")
+    (tmp_path / "sidecar.yaml").touch()
     environment = unit_environment(tmp_path / "sidecar.yaml")
-    assert (environment["ROS_DOMAIN_ID"], environment["RMW_IMPLEMENTATION"]) == ("42", "rmw_x")
+    assert not environment.refused
+    assert environment.variables["ROS_DOMAIN_ID"] == "42"
+    assert environment.variables["RMW_IMPLEMENTATION"] == "rmw_x"
+
+
+def test_the_environment_of_the_unit_is_not_read_where_others_may_write(tmp_path: Path) -> None:
+    config, file = tmp_path / "sidecar.yaml", tmp_path / "sidecar.env"
+    config.touch()
+    assert not unit_environment(config).refused  # there is none
+    file.write_text("PYTHONPATH=/evil\n")
+    for path, mode in ((tmp_path, 0o1777), (file, 0o666), (file, 0o664)):
+        before = path.stat().st_mode & 0o777
+        path.chmod(mode)
+        found = unit_environment(config)
+        assert "others may write" in found.refused
+        assert found.variables.get("PYTHONPATH") != "/evil"
+        path.chmod(before)
+    assert unit_environment(config).variables["PYTHONPATH"] == "/evil"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="giving a file away takes root")
+def test_the_environment_of_another_user_runs_none_of_his_code(tmp_path: Path) -> None:
+    config, file = tmp_path / "sidecar.yaml", tmp_path / "sidecar.env"
+    config.touch()
+    file.write_text("LD_PRELOAD=/evil\nPATH=/evil\nROS_DOMAIN_ID=42\nRMW_IMPLEMENTATION=../../evil\n")
+    os.chown(file, 65534, 65534)
+    found = unit_environment(config)
+    assert "belongs to user 65534, who is not the configuration's owner" in found.refused
+    assert found.variables == dict(os.environ)
+    os.chown(config, 65534, 65534)
+    found = unit_environment(config)
+    assert found.refused.endswith("of it are not used: LD_PRELOAD PATH RMW_IMPLEMENTATION")
+    assert found.variables == os.environ | {"ROS_DOMAIN_ID": "42"}
