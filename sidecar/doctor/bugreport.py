@@ -19,12 +19,11 @@ import json
 import os
 import platform
 import shutil
+import socket
 import subprocess
 import sys
 import tarfile
 import time
-import urllib.request
-from http.client import HTTPException
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,6 +32,7 @@ import yaml
 
 from protos.config_file import parse_yaml, read_text
 from protos.errors import ConfigError
+from protos.host_port import split_host_port
 from protos.printable import escaped
 from sidecar.config import SidecarConfig
 from sidecar.doctor.command import as_json, as_text
@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 
 EXIT_OK = 0
 EXIT_FAILURE = 1
-_NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""The metrics are this host's own."""
 MAX_PART_BYTES = 8 << 20
 """Of each file; a longer one loses its middle."""
 COMMAND_S = 15.0
@@ -194,10 +192,28 @@ def _metrics(seen: Examination) -> str:
     if listen is None:
         return "no metrics are served\n"
     try:
-        with _NO_PROXY.open(f"http://{listen}/metrics", timeout=METRICS_S) as answer:
-            data, until = b"", time.monotonic() + METRICS_S
-            while len(data) < MAX_PART_BYTES and time.monotonic() < until and (some := answer.read1(1 << 16)):
-                data += some
-            return data.decode(errors="replace")
-    except (OSError, ValueError, HTTPException) as error:
+        head, _, page = _answer(*split_host_port(listen), time.monotonic() + METRICS_S).partition(b"\r\n\r\n")
+    except OSError as error:
         return f"http://{listen}/metrics: {error}\n"
+    status = head.partition(b"\r\n")[0]
+    return (page if b" 200 " in status else status).decode(errors="replace")
+
+
+def _answer(host: str, port: int, until: float) -> bytes:
+    """Return what is answered; raises OSError, also when there is no end of it at `until` (monotonic seconds).
+
+    An HTTP library's time limit is for each read alone, and any user may have taken the port of a sidecar that is down,
+    to answer a byte at a time.
+    """
+    data = bytearray()
+    with socket.create_connection((host, port), METRICS_S) as sock:
+        sock.sendall(f"GET /metrics HTTP/1.0\r\nHost: {host}\r\n\r\n".encode())
+        while len(data) < MAX_PART_BYTES and (left := until - time.monotonic()) > 0:
+            sock.settimeout(left)
+            some = sock.recv(1 << 16)
+            if not some:
+                return bytes(data)
+            data += some
+    if len(data) < MAX_PART_BYTES:
+        raise TimeoutError("no whole answer in time: it may be somebody else's, who has taken the port")
+    return bytes(data)
