@@ -126,7 +126,7 @@ class Metrics:
         self.registry.register(FleetCollector(ask))
 
     def start(self, host: str, port: int) -> tuple[str, int]:
-        """Serve them over HTTP; returns where. Raises OSError if the address cannot be had."""
+        """Serve them over HTTP; returns where."""
         return host, MetricsServer(host, port, self.registry).port
 
     def update(

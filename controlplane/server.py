@@ -208,12 +208,7 @@ def _start_metrics(config: ControlPlaneConfig, metrics: Metrics) -> str | None:
     if config.metrics_listen is None:
         return None
     host, port = split_host_port(config.metrics_listen)
-    try:
-        return _join(*metrics.start(host, port))
-    except OSError as error:
-        raise StartError(
-            f"metrics_listen: cannot listen on {config.metrics_listen}: {error.strerror or error}"
-        ) from error
+    return _join(*metrics.start(host, port))
 
 
 def _add_port(config: ControlPlaneConfig, server: grpc.aio.Server) -> str:

@@ -6,6 +6,7 @@ nothing takes the program's last file descriptors, without which a sidecar opens
 
 from __future__ import annotations
 
+import logging
 import socket
 import threading
 from socketserver import ThreadingMixIn
@@ -17,10 +18,14 @@ from prometheus_client import make_wsgi_app
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
 
+log = logging.getLogger(__name__)
+
 MAX_CONNECTIONS = 16
 """Scrapes at once; a further one is closed unheard."""
 TIMEOUT_S = 5.0
 """For each read and write: a scraper over a slow network takes less."""
+RETRY_S = 10.0
+"""From one attempt to have a port that is taken to the next."""
 _STOP_TIMEOUT_S = 1.0
 
 
@@ -59,29 +64,71 @@ class _Server(ThreadingMixIn, WSGIServer):
 
 
 class MetricsServer:
-    """Serves a registry on `host` (an address) from a thread of its own; raises OSError when it cannot listen."""
+    """Serves a registry on `host` (an address) from a thread of its own.
 
-    def __init__(self, host: str, port: int, registry: CollectorRegistry) -> None:
-        self._server = _Server(host, port)
-        self._server.set_app(make_wsgi_app(registry))
+    If the port is taken it warns once and tries every `retry_s`: any user of a host can take a port before a program
+    starts, and must not keep a robot without its sidecar by that.
+    """
+
+    def __init__(self, host: str, port: int, registry: CollectorRegistry, retry_s: float = RETRY_S) -> None:
+        self._host = host
+        self._port = port
+        self._app = make_wsgi_app(registry)
+        self._retry_s = retry_s
+        self._server: _Server | None = None
+        self._has_failed = False
+        self._changing = threading.Lock()
+        """Its thread may open while another one closes."""
         self._closing = threading.Event()
+        self._open()
         self._thread = threading.Thread(target=self._serve, name="plr-metrics", daemon=True)
         self._thread.start()
 
     @property
     def port(self) -> int:
-        """The port listened on, also where 0 was asked for."""
-        return self._server.server_port
+        """The port listened on, also where 0 was asked for; the one asked for while it is taken."""
+        server = self._server
+        return self._port if server is None else server.server_port
+
+    @property
+    def is_listening(self) -> bool:
+        """Whether the port was free."""
+        return self._server is not None
+
+    def _open(self) -> None:
+        with self._changing:
+            if self._closing.is_set():
+                return
+            try:
+                server = _Server(self._host, self._port)
+            except OSError as error:
+                if not self._has_failed:
+                    log.warning(
+                        "metrics_listen: cannot listen on %s port %d: %s; no metrics until it can (tried every %.0f s)",
+                        self._host, self._port, error.strerror or error, self._retry_s,
+                    )  # fmt: skip
+                self._has_failed = True
+                return
+            server.set_app(self._app)
+            self._server = server
+        if self._has_failed:
+            log.info("metrics_listen: listens on %s port %d now", self._host, self._port)
 
     def _serve(self) -> None:
         # Not serve_forever: that looks twice a second whether it should end, and keeps whoever ends it waiting.
         while not self._closing.is_set():
-            self._server.handle_request()
+            if self._server is not None:
+                self._server.handle_request()
+            elif not self._closing.wait(self._retry_s):
+                self._open()
 
     def close(self) -> None:
         """Stop serving."""
-        self._closing.set()
-        # Wakes the thread: on Linux, a socket that listens no more is readable.
-        self._server.socket.shutdown(socket.SHUT_RDWR)
+        with self._changing:
+            self._closing.set()
+        if self._server is not None:
+            # Wakes the thread: on Linux, a socket that listens no more is readable.
+            self._server.socket.shutdown(socket.SHUT_RDWR)
         self._thread.join(_STOP_TIMEOUT_S)
-        self._server.server_close()
+        if self._server is not None:
+            self._server.server_close()

@@ -51,12 +51,12 @@ _DESCRIPTION = "Carries the ROS 2 service calls of a robot to cloud servers over
 _EPILOG = """\
 examples:
   plr-sidecar --config /etc/plr/sidecar.yaml                  run until SIGTERM or Ctrl-C
-  plr-sidecar --config /etc/plr/sidecar.yaml --check-config   say whether it would start
+  plr-sidecar --config /etc/plr/sidecar.yaml --check-config   say whether the configuration is right
   plr-sidecar --print-schema > sidecar.schema.json            describe the configuration to an editor
 
 exit codes:
   0  stopped as asked, or the configuration is right
-  1  failed while running, or cannot have a port or its state_dir now; the log says why
+  1  failed while running, or cannot have its state_dir now, which --check-config does not try; the log says why
   2  wrong usage or configuration; one line on stderr names the file, the key and what was expected
 """
 

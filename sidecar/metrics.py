@@ -113,7 +113,7 @@ class SidecarCollector(Collector):
 
 
 def serve_metrics(listen: str, sources: MetricSources) -> MetricsServer:
-    """Serve /metrics on `listen` (address:port); raises OSError when that cannot be had."""
+    """Serve /metrics on `listen` (address:port), as soon as that can be had."""
     registry = CollectorRegistry()
     registry.register(SidecarCollector(sources))
     ProcessCollector(registry=registry)

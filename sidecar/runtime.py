@@ -173,7 +173,7 @@ class Sidecar:
         """Start every part; what the disk remembers is in force before the control plane is asked.
 
         Raises:
-            OSError: a socket or the metrics' port is refused.
+            OSError: a socket is refused.
         """
         interpreter.share()
         self._open_metrics()
@@ -288,11 +288,7 @@ class Sidecar:
             revocations=lambda: None if self._revocations is None else self._revocations.state,
             local_refused=lambda: {} if self._local is None else self._local.refused,
         )
-        try:
-            self._metrics = serve_metrics(listen, sources)
-        except OSError as error:
-            problem = f"expected an address and port to listen on, got '{listen}': {error.strerror or error}"
-            raise StartError("the configuration", "metrics_listen", problem) from error
+        self._metrics = serve_metrics(listen, sources)
 
     def _restore(self, held: Apply, error: str | None) -> None:
         if error:
@@ -421,7 +417,7 @@ def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
     """Run a sidecar until `stopping` is set; returns the exit code.
 
     Raises:
-        StartError: an address or the state folder cannot be had now.
+        StartError: the state folder cannot be had now.
     """
     if config.insecure:
         log.warning("insecure: true: the control plane and every peer are believed to be who they say")

@@ -162,7 +162,7 @@ def test_without_certificates_and_without_the_word_insecure_it_does_not_start(tm
 @pytest.mark.audit("ops-7")
 @pytest.mark.parametrize(
     ("key", "kind"),
-    [("listen", socket.SOCK_STREAM), ("stun_listen", socket.SOCK_DGRAM), ("metrics_listen", socket.SOCK_STREAM)],
+    [("listen", socket.SOCK_STREAM), ("stun_listen", socket.SOCK_DGRAM)],
 )
 def test_an_address_in_use_ends_with_1_and_names_the_key(tmp_path: Path, key: str, kind: socket.SocketKind) -> None:
     with socket.socket(socket.AF_INET, kind) as taken:

@@ -294,13 +294,19 @@ def test_a_mapping_on_disk_is_in_force_as_soon_as_it_fits_and_stays_on_the_disk(
 
 @pytest.mark.ros
 def test_what_cannot_be_had_now_is_exit_1_and_says_which_key(program: Program) -> None:
-    host, port = str(program.config["metrics_listen"]).split(":")
-    with socket.create_server((host, int(port))):
-        program.start()
-        assert program.end() == 1
-    assert f"plr-sidecar: {program.path}: metrics_listen: " in program.log
     store = StateStore(Path(program.config["state_dir"]), NodeName("robot-1"))
     program.start()
     assert program.end() == 1
     store.close()
     assert f"plr-sidecar: {program.path}: state_dir: expected a folder of its own" in program.log
+
+
+@pytest.mark.ros
+@pytest.mark.audit("ops-7")
+def test_who_has_the_port_of_the_metrics_does_not_keep_a_robot_without_its_sidecar(program: Program) -> None:
+    host, port = str(program.config["metrics_listen"]).split(":")
+    with socket.create_server((host, int(port))):
+        program.start()
+        program.wait_for_log("metrics_listen: cannot listen on")
+        program.process.send_signal(signal.SIGTERM)
+        assert program.end() == 0

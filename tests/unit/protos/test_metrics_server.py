@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 import urllib.request
 from typing import TYPE_CHECKING
 
@@ -60,9 +61,30 @@ def test_connections_that_say_nothing_are_few_and_end(server: MetricsServer) -> 
     assert "plr_answer 42.0" in scrape(server)
 
 
-def test_a_port_in_use_is_an_error(server: MetricsServer) -> None:
-    with pytest.raises(OSError, match="in use"):
-        MetricsServer("127.0.0.1", server.port, CollectorRegistry())
+@pytest.mark.audit("ops-7")
+def test_a_port_in_use_is_warned_of_once_and_taken_when_it_is_free(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    taken = socket.create_server(("127.0.0.1", 0))
+    one = MetricsServer("127.0.0.1", taken.getsockname()[1], CollectorRegistry(), retry_s=0.01)
+    time.sleep(0.1)
+    assert not one.is_listening
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "metrics_listen: cannot listen on 127.0.0.1" in caplog.text
+    taken.close()
+    end = time.monotonic() + 30.0
+    while not one.is_listening:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    scrape(one)
+    assert caplog.records[-1].levelname == "INFO"
+    one.close()
+
+
+def test_one_that_never_had_its_port_ends(server: MetricsServer) -> None:
+    one = MetricsServer("127.0.0.1", server.port, CollectorRegistry())
+    one.close()
+    assert not one.is_listening
+    assert not one._thread.is_alive()
 
 
 def test_nonsense_breaks_nothing(server: MetricsServer) -> None:
