@@ -12,17 +12,19 @@ from cryptography.x509.oid import NameOID
 
 from controlplane.ca import listing
 from controlplane.ca.authority import Authority, AuthorityError
-from controlplane.ca.files import write_tls_files
+from controlplane.ca.files import refuse_planted, write_tls_files
 from controlplane.ca.folder import AuthorityFolder, Protection
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE, PassphraseSource
 from protos.errors import ConfigError
 from protos.identity import IdentityRole
+from protos.regular_file import open_regular
 from protos.tls_files import (
     CA_FILE,
     CERTIFICATE_FILE,
     CRL_FILE,
     KEY_FILE,
     KEY_FORBIDDEN,
+    MAX_FILE_BYTES,
     load_private_key,
     read_guarded,
 )
@@ -167,15 +169,20 @@ def save(folder: AuthorityFolder, authority: Authority) -> None:
 
 
 def refuse_taken(out: Path, name: str, *, own: bool) -> None:
-    """Raise AuthorityError if the folder holds the key or the certificate of a node with another name.
+    """Raise AuthorityError if the folder holds the key or the certificate of a node with another name, or OSError as
+    `refuse_planted` does.
 
     `own`: it is the CA's folder for this name, where a key without certificate is left of a command cut short.
     """
+    if out.exists():
+        refuse_planted(out)
     path = out / CERTIFICATE_FILE
     if not path.exists() and (own or not (out / KEY_FILE).exists()):
         return
     try:
-        certificate = x509.load_pem_x509_certificate(path.read_bytes())
+        # In a folder of the node's own user, who may put anything there.
+        with open_regular(path) as file:
+            certificate = x509.load_pem_x509_certificate(file.read(MAX_FILE_BYTES))
         owners = [each.value for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
     except (OSError, ValueError):
         owners = []

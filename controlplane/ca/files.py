@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import stat
 import tempfile
 from typing import TYPE_CHECKING
 
@@ -64,5 +66,18 @@ def write_certificate(
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder that is missing, readable for its owner alone; raises OSError."""
+    """Make a folder that is missing, readable for its owner alone; raises OSError, as `refuse_planted` does."""
     folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+    refuse_planted(folder)
+
+
+def refuse_planted(folder: Path) -> None:
+    """Raise OSError if a folder for a key was made by another user where everybody may make some, as in /tmp.
+
+    Elsewhere it may well be another user's, such as a service's.
+    """
+    owner = folder.stat().st_uid
+    if owner not in (0, os.geteuid()) and folder.absolute().parent.stat().st_mode & stat.S_IWOTH:
+        raise OSError(
+            errno.EPERM, f"it belongs to user {owner}, where everybody may make folders: name another", str(folder)
+        )

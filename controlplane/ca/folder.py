@@ -27,6 +27,7 @@ from controlplane.ca.files import PRIVATE_FILE, PRIVATE_FOLDER, PUBLIC_FILE, wri
 from controlplane.ca.index import decode_index, encode_index
 from controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
 from protos.errors import ConfigError
+from protos.regular_file import open_regular
 from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ class AuthorityFolder:
         self.refuse_existing()
         self._refuse_other_things()
         self.path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+        self._refuse_others()
         self.path.chmod(PRIVATE_FOLDER)
         with self._lock():
             self.refuse_existing()
@@ -97,6 +99,11 @@ class AuthorityFolder:
             each.name not in own and not _TEMPORARY.fullmatch(each.name) for each in self.path.iterdir()
         ):
             raise ConfigError(str(self.path), "", "holds other things; a CA needs a --dir of its own")
+
+    def _refuse_others(self) -> None:
+        """Raise ConfigError if another user made the folder, or something in it: he would get at the keys."""
+        for path in (self.path, *self.path.iterdir()):
+            _refuse_strange(path, path.stat() if path == self.path else path.lstat())
 
     def protections(self) -> list[Protection]:
         """Return how each of the CAs' keys is kept; raises ConfigError."""
@@ -152,7 +159,8 @@ class AuthorityFolder:
     def _lists(self) -> tuple[x509.CertificateRevocationList, ...]:
         """Return the revocation lists that stand here: of a command cut short, nodes may have them already."""
         try:
-            pem = (self.path / CRL_FILE).read_bytes()
+            with open_regular(self.path / CRL_FILE) as file:
+                pem = file.read()
             return tuple(x509.load_pem_x509_crl(one) for one in _PEM_LIST.findall(pem))
         except (OSError, ValueError):
             return ()
@@ -206,7 +214,10 @@ class AuthorityFolder:
             data = (self.path / name).read_bytes()
             for path in (self.path / NODES).glob(f"*/{name}"):
                 try:
-                    if path.read_bytes() != data:
+                    # A service's folder is its own: it may hold anything under this name.
+                    with open_regular(path) as file:
+                        is_same = file.read(len(data) + 1) == data
+                    if not is_same:
                         write_atomically(path, data, PUBLIC_FILE)
                 except OSError as error:
                     problems.append(f"{path}: not brought up to date: {error.strerror or error}")
@@ -241,8 +252,9 @@ class AuthorityFolder:
     def _check(self) -> None:
         if not (self.path / INDEX_FILE).is_file():
             raise ConfigError(str(self.path), "", "expected the folder of a CA; see: plr ca init --help")
-        mode = self.path.stat().st_mode
-        if mode & NOT_THE_OWNER:
+        status = self.path.stat()
+        _refuse_strange(self.path, status)
+        if status.st_mode & NOT_THE_OWNER:
             raise ConfigError(str(self.path), "", f"others may enter it; do: chmod 700 {self.path}")
 
     @contextlib.contextmanager
@@ -257,6 +269,12 @@ class AuthorityFolder:
             yield
         finally:
             os.close(descriptor)
+
+
+def _refuse_strange(path: Path, status: os.stat_result) -> None:
+    if status.st_uid not in (0, os.geteuid()):
+        problem = f"belongs to user {status.st_uid}; give another --dir, or run plr as that user"
+        raise ConfigError(str(path), "", problem)
 
 
 def _key_pem(key: ec.EllipticCurvePrivateKey, passphrase: bytes | None) -> bytes:

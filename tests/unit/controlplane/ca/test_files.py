@@ -74,3 +74,16 @@ def test_root_renews_what_a_service_reads(tmp_path: Path) -> None:
     os.chown(folder, 60002, 60003)
     write_tls_files(folder, ca.issue("robot-1", IdentityRole.ROBOT), ca.ca_pem, ca.crl_pem())
     assert {(path.stat().st_uid, path.stat().st_gid) for path in folder.iterdir()} == {(60002, 60003)}
+
+
+@pytest.mark.audit("ops-14")
+@pytest.mark.skipif(os.geteuid() != 0, reason="giving files away takes root")
+def test_no_key_goes_to_a_folder_that_anybody_may_have_made(tmp_path: Path) -> None:
+    ca = Authority.create()
+    tmp_path.chmod(0o1777)
+    folder = tmp_path / "tls"
+    folder.mkdir()
+    os.chown(folder, 60002, 60003)
+    with pytest.raises(OSError, match="it belongs to user 60002"):
+        write_tls_files(folder, ca.issue("robot-1", IdentityRole.ROBOT), ca.ca_pem, ca.crl_pem())
+    assert list(folder.iterdir()) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import stat
 import threading
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.ca import Authority, AuthorityError, folder
+from controlplane.ca.actions import refuse_taken
 from controlplane.ca.files import write_atomically
 from controlplane.ca.folder import AuthorityFolder, Protection
 from protos.errors import ConfigError
@@ -267,3 +269,29 @@ def test_an_index_that_is_none_is_refused(kept: AuthorityFolder, index: bytes) -
         kept.records()
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.audit("ops-14")
+@pytest.mark.skipif(os.geteuid() != 0, reason="giving files away takes root")
+@pytest.mark.parametrize("planted", ["", "nodes"])
+def test_no_ca_is_made_in_what_somebody_else_made_first(tmp_path: Path, planted: str) -> None:
+    folder = tmp_path / "plr-ca"
+    (folder / "nodes").mkdir(parents=True)
+    os.chown(folder / planted, 60002, 60003)
+    with pytest.raises(ConfigError, match="belongs to user 60002"):
+        AuthorityFolder(folder).create(Authority.create())
+    assert [path.name for path in folder.iterdir()] == ["nodes"]
+
+
+@pytest.mark.audit("ops-14")
+def test_a_fifo_in_a_nodes_folder_holds_up_nobody(tmp_path: Path) -> None:
+    folder = AuthorityFolder(tmp_path / "plr-ca")
+    folder.create(Authority.create())
+    folder.node_folder("robot-1").mkdir(parents=True)
+    for name in ("ca.pem", "cert.pem"):
+        os.mkfifo(folder.node_folder("robot-1") / name)
+    with folder.locked() as authority:
+        (problem,) = folder.save(authority)
+        assert "it is no regular file" in problem
+        with pytest.raises(AuthorityError, match="holds another node's files"):
+            refuse_taken(folder.node_folder("robot-1"), "robot-1", own=True)
