@@ -134,7 +134,10 @@ def _read_trusted(path: Path, owners: Container[int]) -> tuple[int, str]:
             _refuse_untrusted("its folder", os.fstat(folder), owners)
             status = os.fstat(file.fileno())
             _refuse_untrusted("it", status, owners)
-            return status.st_uid, file.read(MAX_ENVIRONMENT_BYTES).decode()
+            data = file.read(MAX_ENVIRONMENT_BYTES)
+            if b"\0" in data:
+                raise OSError(errno.EINVAL, "there is a NUL in it, as a power cut leaves them: write it again")
+            return status.st_uid, data.decode()
     finally:
         os.close(folder)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -25,6 +26,7 @@ TRY_TIMEOUT_S = 60.0
 
 _TRY = "import rclpy; rclpy.init(args=['--ros-args', '--disable-external-lib-logs']); rclpy.shutdown()"
 _MAX_SAID_CHARACTERS = 300
+_NUMBER = re.compile(r"[0-9]{1,9}")
 
 
 def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = False) -> str | None:
@@ -33,8 +35,8 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
     `thorough`: try rclpy in any case, which takes about a second.
     """
     domain = environment.get("ROS_DOMAIN_ID", "")
-    if domain and not (domain.isascii() and domain.isdigit() and int(domain) <= MAX_DOMAIN_ID):
-        return f"ROS_DOMAIN_ID: expected a number from 0 to {MAX_DOMAIN_ID}, got {domain!r}"
+    if domain and not (_NUMBER.fullmatch(domain) and int(domain) <= MAX_DOMAIN_ID):
+        return f"ROS_DOMAIN_ID: expected a number from 0 to {MAX_DOMAIN_ID}, got {domain[:_MAX_SAID_CHARACTERS]!r}"
     if importlib.util.find_spec("rclpy") is None:
         return (
             f"ROS 2's rclpy is not there for {sys.executable}: with ROS from apt, source /opt/ros/jazzy/setup.bash "

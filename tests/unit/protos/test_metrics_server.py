@@ -16,7 +16,7 @@ from protos import metrics_server
 from protos.metrics_server import MAX_CONNECTIONS, MetricsServer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 @pytest.fixture
@@ -33,6 +33,13 @@ def scrape(server: MetricsServer) -> str:
     with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=10.0) as answer:
         text: str = answer.read().decode()
     return text
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def handlers() -> int:
@@ -71,10 +78,7 @@ def test_a_port_in_use_is_warned_of_once_and_taken_when_it_is_free(caplog: pytes
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "metrics_listen: cannot listen on 127.0.0.1" in caplog.text
     taken.close()
-    end = time.monotonic() + 30.0
-    while not one.is_listening:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    wait_for(lambda: one.is_listening)
     scrape(one)
     assert caplog.records[-1].levelname == "INFO"
     one.close()

@@ -182,6 +182,8 @@ def test_the_environment_of_the_unit_is_not_read_where_others_may_write(tmp_path
         assert found.variables.get("PYTHONPATH") != "/evil"
         path.chmod(before)
     assert unit_environment(config).variables["PYTHONPATH"] == "/evil"
+    file.write_bytes(b"ROS_DOMAIN_ID=1\0\0")
+    assert "there is a NUL in it" in unit_environment(config).refused
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="giving a file away takes root")
