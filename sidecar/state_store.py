@@ -1,7 +1,8 @@
 """What a restart needs, kept on disk: who the sidecar is, and what the control plane said last.
 
 Files are replaced whole (written aside, synced, renamed), so that a power cut leaves the old one or the new one. What
-cannot be read is set aside and counted, what cannot be written is logged: neither keeps the sidecar from running.
+cannot be read is set aside and counted, what cannot be written is logged and tried again: neither keeps the sidecar
+from running.
 """
 
 from __future__ import annotations
@@ -67,6 +68,9 @@ CLOSE_TIMEOUT_S = 2.0
 MIN_WRITE_INTERVAL_S = 1.0
 """Between two writes of what the control plane said: mappings may change several times a second, flash wears out."""
 
+RETRY_S = 10.0
+"""From a failed writing to the next attempt: a disk that is full is so for a while."""
+
 T = TypeVar("T")
 
 
@@ -85,6 +89,10 @@ class StateStore:
         self.failures: Counter[str] = Counter()
         """Files not read or not written."""
         self._folder, self._lock = _lock(folder)
+        self._dirty: dict[str, bytes | LastGood] = {}
+        """What to write, by file."""
+        self._failing: set[str] = set()
+        """Files whose last writing failed, and was logged."""
         self.identity = self._next_identity()
         self._current = self._read(LAST_GOOD_FILE, lambda data: decode_last_good(data, owner)) or LastGood(owner)
         self.last_good = self._current
@@ -95,8 +103,6 @@ class StateStore:
         self.clock_floor = self._read(CLOCK_FILE, decode_clock_floor) or 0.0
         """See `ClockFloor`; seconds since 1970, as found on disk when opened."""
         self._condition = threading.Condition()
-        self._dirty: dict[str, bytes | LastGood] = {}
-        """What to write, by file."""
         self._closing = False
         self._writer = threading.Thread(target=self._write_when_changed, name="plr-state", daemon=True)
         self._writer.start()
@@ -150,7 +156,9 @@ class StateStore:
         # Milliseconds since 1970 let the number grow even where the last one could not be read or written.
         incarnation = max(known.incarnation + 1 if known else 1, int(time.time() * 1000.0))
         identity = Identity(known.token if known else secrets.token_bytes(TOKEN_BYTES), incarnation)
-        self._write(IDENTITY_FILE, encode_identity(identity))
+        data = encode_identity(identity)
+        if not self._write(IDENTITY_FILE, data):
+            self._dirty[IDENTITY_FILE] = data
         return identity
 
     def _write_when_changed(self) -> None:
@@ -159,11 +167,19 @@ class StateStore:
                 self._condition.wait_for(lambda: self._dirty or self._closing)
                 if not self._dirty:
                     return
+                closing = self._closing
                 dirty, self._dirty = self._dirty, {}
-            for name, content in dirty.items():
-                self._write(name, encode_last_good(content) if isinstance(content, LastGood) else content)
+            failed = {
+                name: content
+                for name, content in dirty.items()
+                if not self._write(name, encode_last_good(content) if isinstance(content, LastGood) else content)
+            }
             with self._condition:
-                self._condition.wait_for(lambda: self._closing, MIN_WRITE_INTERVAL_S)
+                if closing and failed:
+                    return
+                # What came meanwhile is newer.
+                self._dirty = failed | self._dirty
+                self._condition.wait_for(lambda: self._closing, RETRY_S if failed else MIN_WRITE_INTERVAL_S)
 
     def _read(self, name: str, decode: Callable[[bytes], T]) -> T | None:
         path = self._folder.path / name
@@ -187,12 +203,20 @@ class StateStore:
         except OSError as error:
             log.error("%s cannot be set aside: %s", self._folder.path / name, error)
 
-    def _write(self, name: str, data: bytes) -> None:
+    def _write(self, name: str, data: bytes) -> bool:
         try:
             self._folder.write(name, data)
         except OSError as error:
             self.failures["write_failed"] += 1
-            log.error("%s not written: %s; a restart will not know it", self._folder.path / name, error)
+            if name not in self._failing:
+                self._failing.add(name)
+                path = self._folder.path / name
+                log.error("%s not written: %s; tried again, and a restart before will not know it", path, error)
+            return False
+        if name in self._failing:
+            self._failing.remove(name)
+            log.info("%s is on the disk again", self._folder.path / name)
+        return True
 
 
 def _lock(path: Path) -> tuple[OwnFolder, int]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import stat
@@ -7,10 +8,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import pytest
 
+from protos import own_folder
 from protos.errors import DecodeError
 from protos.model import (
     Assignment,
@@ -30,6 +32,7 @@ from protos.model import (
     Version,
     Welcome,
 )
+from sidecar import state_store
 from sidecar.state_file import (
     ControlAddresses,
     Identity,
@@ -283,8 +286,40 @@ def test_a_failing_write_is_counted_and_logged(tmp_path: Path, caplog: pytest.Lo
     (tmp_path / f"{LAST_GOOD_FILE}.new").mkdir()
     store.remember(PEERS)
     store.close()
-    assert dict(store.failures) == {"write_failed": 1}
-    assert "a restart will not know it" in caplog.text
+    assert set(store.failures) == {"write_failed"}
+    assert "tried again, and a restart before will not know it" in caplog.text
+
+
+@pytest.mark.audit("ops-10")
+def test_what_did_not_fit_on_a_full_disk_is_written_when_there_is_room(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_store, "RETRY_S", 0.01)
+    full = True
+    real = own_folder.write_through
+
+    def write_through(file: IO[bytes], data: bytes) -> None:
+        if full:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(file, data)
+
+    monkeypatch.setattr(own_folder, "write_through", write_through)
+    store = StateStore(tmp_path, NodeName("robot-1"))
+    store.remember_revocations(b"an older list")
+    store.remember_clock_floor(1e9)
+    end = time.monotonic() + 30.0
+    while store.failures["write_failed"] < 12:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    store.remember_revocations(b"a list")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lock"]
+    full = False
+    token = store.identity.token
+    store.close()
+    assert len([record for record in caplog.records if record.levelname == "ERROR"]) == 3
+    again = StateStore(tmp_path, NodeName("robot-1"))
+    assert (again.revocations, again.clock_floor, again.identity.token) == (b"a list", 1e9, token)
+    again.close()
 
 
 WRITE_FOR_EVER = """
