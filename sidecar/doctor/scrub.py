@@ -14,10 +14,13 @@ from typing import Any
 LEFT_OUT = "(left out)"
 MAX_LINE = 2000
 """Characters: no line that helps is longer."""
+MAX_VALUE_LINES = 100
+"""Of a secret in brackets or quotes."""
 
 _PEM = re.compile(r"-----BEGIN ([A-Z0-9 ]*)-----.*?(?:-----END \1-----|\Z)", re.DOTALL)
 _NAME = re.compile(
     r"(?i)pass(?:phrase|word|wd|code)|secret|token|credential|authorization|cookie|bearer|api[-_ ]?key"
+    r"|private[-_ ]?key|(?-i:(?<=[a-z])Keys?)(?=\"?'?\s*[=:])"
     r"|(?<![a-z])(?:pwd|psk)(?![a-z])|-pass(?![a-z])|(?<![a-z])(?:pass|keys?)(?=\"?'?\s*[=:])"
 )
 """What is called so is a secret, and may consist of several words; [a-z] is either case here."""
@@ -26,6 +29,8 @@ _OPENS = re.compile(r"[=:>|\[{(\\]")
 _SAYS_SOMETHING = re.compile(r"[^\W_]")
 _REFUSED_VALUE = re.compile(r"\b(got) ['\"\[{].*")
 """In the error of a configuration: the value may be a secret that stands at the wrong key."""
+_USER_AND_SPACE = re.compile(r"://[^\s/@:]+:[^\s/@]*\s+@")
+_DASHES = re.compile(r"(?:- +)*")
 _NON_SPACE = re.compile(r"\S+")
 _HEX_PAIRS = re.compile(r"(?:[0-9A-Fa-f]{2}:){15,}[0-9A-Fa-f]{2}")
 """A fingerprint or a key: longer than any address."""
@@ -46,46 +51,77 @@ def scrubbed(text: str) -> str:
     text = _PEM.sub(lambda found: f"({found[1].strip() or 'PEM'} left out)", text)
     lines = []
     named_at = -1
-    """Where the name of a secret begins whose value comes in lines below it; -1: of none."""
+    """Where the name of a secret begins whose value comes, or goes on, in lines below it; -1: of none."""
     is_first = False
-    for line in text.split("\n"):
+    unclosed = _Unclosed()
+    for whole in text.split("\n"):
+        line = whole if len(whole) <= MAX_LINE else f"{whole[:MAX_LINE]}..."
         content = line.lstrip()
         if not content:
             lines.append("")
             continue
         indent = len(line) - len(content)
         if named_at >= 0:
-            # The first line is the value, wherever it stands; further ones where they stand in it or in a list.
-            if is_first or indent > named_at or (indent == named_at and content.startswith("-")):
+            # The first line is the value, wherever it stands, as are those within a bracket, a quotation, or behind a
+            # backslash; further ones where they stand in it or in a list.
+            within = unclosed.goes_on()
+            if is_first or within or indent > named_at or (indent == named_at and content.startswith("-")):
                 is_first = False
+                unclosed.take(content)
                 lines.append(f"{line[: min(indent, MAX_LINE)]}{LEFT_OUT}")
                 continue
             named_at = -1
-        shown, is_open = _line(line)
+        shown, value = _line(line)
         lines.append(shown)
-        if is_open:
-            named_at, is_first = indent, True
+        if value is not None:
+            # In a list the value's lines stand further in than the dash.
+            dashes = _DASHES.match(content)
+            named_at = indent + (0 if dashes is None else dashes.end())
+            unclosed = _Unclosed()
+            # The name's own quotation ends where it does.
+            unclosed.take(value.removeprefix('"'))
+            is_first = _SAYS_SOMETHING.search(value) is None
     return "\n".join(lines)
 
 
-def _line(line: str) -> tuple[str, bool]:
-    """Return a line without secrets, and whether it ends with the name of one whose value comes in the next."""
-    if len(line) > MAX_LINE:
-        line = f"{line[:MAX_LINE]}..."
-    is_open = False
+class _Unclosed:
+    """Whether a value goes on in the next line, by its brackets, double quotes and backslashes."""
+
+    def __init__(self) -> None:
+        self._depth = 0
+        self._is_quoted = False
+        self._goes_on = False
+        self._lines = 0
+
+    def take(self, text: str) -> None:
+        """A line of the value."""
+        self._lines += 1
+        self._is_quoted ^= text.count('"') % 2 == 1
+        self._depth += sum(map(text.count, "[({")) - sum(map(text.count, "])}"))
+        self._goes_on = text.endswith("\\")
+
+    def goes_on(self) -> bool:
+        """A bracket that nobody closes is no reason to leave out the rest of a report."""
+        return self._lines <= MAX_VALUE_LINES and (self._goes_on or self._is_quoted or self._depth > 0)
+
+
+def _line(line: str) -> tuple[str, str | None]:
+    """Return a line without secrets, and the value of one that it names, or its beginning; None: it names none."""
+    value = None
     named = _NAME.search(line)
     if named is not None:
         goes_on = _NAME_GOES_ON.match(line, named.end())
         end = named.end() if goes_on is None else goes_on.end()
         if _SAYS_SOMETHING.search(line, end) is None:
-            is_open = _OPENS.search(line, end) is not None
+            value = line[end:] if _OPENS.search(line, end) is not None else None
         else:
+            value = line[end:]
             line = f"{line[:end]} {LEFT_OUT}"
     line = _REFUSED_VALUE.sub(rf"\1 {LEFT_OUT}", line)
     if "://" in line and "@" in line:
-        line = _NON_SPACE.sub(_without_user, line)
+        line = _NON_SPACE.sub(_without_user, _USER_AND_SPACE.sub(f"://{LEFT_OUT}@", line))
     line = _HEX_PAIRS.sub(LEFT_OUT, line)
-    return _RUN.sub(_only_words, line), is_open
+    return _RUN.sub(_only_words, line), value
 
 
 def _without_user(word: re.Match[str]) -> str:

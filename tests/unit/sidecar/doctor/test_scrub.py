@@ -52,6 +52,16 @@ HEX = "00112233445566778899aabbccddeeff"
         ("MY_SECRET=\n  hunter2", "hunter2"),
         ("secrets:\n- name: x\n  value: hunter2\n- hunter2\nafter: 1", "hunter2"),
         ("passwords:\n  alice:\n\n    hunter2\n  bob: hunter2", "hunter2"),
+        ("password: correct\n  hunter2\n  staple", "hunter2"),
+        ('passphrase: "first half\n  hunter2"', "hunter2"),
+        ('passphrase: "first half\nhunter2"', "hunter2"),
+        ('"token": ["abc",\n"hunter2"]', "hunter2"),
+        ('  "token": [\n  "abc",\n  "hunter2"\n  ]', "hunter2"),
+        ("password = one \\\nhunter2", "hunter2"),
+        ("- password: one\n   hunter2", "hunter2"),
+        ("PrivateKey = hunter2", "hunter2"),
+        ("a private key hunter2", "hunter2"),
+        ("https://u:hunter2 @h", "hunter2"),
         ("udp_port: expected a whole number, got 'hunter2'", "hunter2"),
     ],
 )
@@ -87,6 +97,19 @@ def test_what_comes_after_a_secret_s_lines_stays() -> None:
     )
 
 
+def test_what_follows_a_value_that_goes_on_stays() -> None:
+    text = '- password: a\n  name: robot-1\n"token": ["a",\n"b"]\nrole: robot\npassword (x'
+    assert scrubbed(text + "\ny" * 300).splitlines()[:6] == [
+        "- password (left out)",
+        "  name: robot-1",
+        '"token (left out)',
+        "(left out)",
+        "role: robot",
+        "password (left out)",
+    ]
+    assert scrubbed(text + "\ny" * 300).endswith("y\ny")
+
+
 def test_random_keys_are_left_out() -> None:
     """Of 16 bytes one in a thousand looks like words; of 32 none in 20,000 did."""
     drawn = random.Random(7)
@@ -100,7 +123,7 @@ def test_random_keys_are_left_out() -> None:
 @pytest.mark.parametrize(
     "unit",
     ["a.", "a=b ", "://", "a://@", "-----BEGIN A-----", "-----BEGIN A", "ab:", "aA", "Aa-", " ", "=", "password:\n",
-     "a_key ", '"\\', "got '", "\n"],
+     "password [\n", "://a:b ", "Key", "- ", "a_key ", '"\\', "got '", "\n"],
 )  # fmt: skip
 def test_time_grows_with_the_length_alone(unit: str) -> None:
     """A line four times as long, and four times as many lines, take no sixteen times as long."""
