@@ -64,6 +64,10 @@ class OwnFolder:
         if owner not in (0, os.geteuid()):
             os.close(descriptor)
             raise OSError(errno.EPERM, f"{name} belongs to user {owner}: chown or remove it")
+        if flags & os.O_CREAT and owner == os.geteuid():
+            # One of an earlier version may be for everybody to read, and so to lock.
+            with contextlib.suppress(OSError):
+                os.fchmod(descriptor, 0o600)
         return descriptor
 
     def open_to_read(self, name: str) -> BinaryIO:

@@ -21,6 +21,7 @@ EXIT_NO_READER = 128 + signal.SIGPIPE
 """As the shell tells of a program that SIGPIPE ended, ..."""
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 """... or Ctrl-C."""
+_STDERR = 2
 _NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
@@ -68,7 +69,13 @@ def ended_by_ctrl_c() -> Iterator[None]:
 
 
 def _have_streams() -> None:
-    """A shell may start us without them (>&-)."""
+    """A shell may start us without them (>&-).
+
+    What C libraries print to descriptor 2 would go to the first file or socket that gets the number.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= _STDERR:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
     for stream in ("stdout", "stderr"):
         if getattr(sys, stream) is None:
             setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))

@@ -98,3 +98,14 @@ def test_a_folder_moved_away_is_still_the_one_written_to(tmp_path: Path) -> None
     folder.write("file", b"content")
     folder.close()
     assert (tmp_path / "moved" / "file").read_bytes() == b"content"
+
+
+def test_files_are_for_this_user_alone_also_those_of_an_earlier_version(tmp_path: Path) -> None:
+    (tmp_path / "lock").touch(0o644)
+    log = EventLog(tmp_path)
+    log.record(EventKind.STARTED)
+    log.close()
+    assert {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {
+        "lock": 0o600,
+        "events.jsonl": 0o600,
+    }

@@ -74,6 +74,14 @@ def test_ctrl_c_ends_without_a_trace(how: str, code: int) -> None:
     assert program.returncode == code
 
 
+def test_no_file_of_ours_gets_the_number_of_a_standard_stream() -> None:
+    code = "import os; from protos.program import ends_quietly; ends_quietly('plr')(lambda: 0)(); os._exit(os.dup(0))"
+    with subprocess.Popen(
+        ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-c", code], cwd=ROOT
+    ) as program:
+        assert program.wait(60) > 2
+
+
 def test_another_error_and_the_end_of_argparse_pass() -> None:
     @ends_quietly("plr")
     def main(error: BaseException) -> int:
