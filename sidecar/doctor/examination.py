@@ -106,10 +106,12 @@ def connect(where: Where, config: SidecarConfig | None) -> LocalClient:
             return LocalClient(path, _owners(where.config))
         except LocalError as error:
             said.append(error)
-    for kind in (LocalBusyError, LocalRefusedError):
-        for one in said:
-            if isinstance(one, kind):
-                raise one
+    for one in said:
+        if isinstance(one, LocalBusyError):
+            raise one
+    # Not the first of two: a member of the group may not look into the state folder, wherever the sidecar is.
+    if said and isinstance(said[-1], LocalRefusedError):
+        raise said[-1]
     raise LocalError(" and ".join(map(str, said)) or "local_socket is null in the configuration")
 
 

@@ -10,9 +10,11 @@ import pytest
 import yaml
 
 from protos.errors import ConfigError
-from sidecar.doctor.examination import RUNTIME_SOCKET, Where, _judged, _wrong, sockets
+from sidecar.doctor import examination
+from sidecar.doctor.examination import RUNTIME_SOCKET, Where, _judged, _wrong, connect, sockets
 from sidecar.doctor.finding import Level
 from sidecar.doctor.running_checks import paths
+from sidecar.local.client import LocalError, LocalRefusedError
 from tests.unit.sidecar.configs import ROBOT, parse
 
 if TYPE_CHECKING:
@@ -47,6 +49,24 @@ def test_under_systemd_it_is_in_the_runtime_folder() -> None:
     assert config.local_socket_path("/run/plr") == RUNTIME_SOCKET
     assert config.local_socket_path(None) == Path("/var/lib/plr/sidecar.sock")
     assert parse(ROBOT, local_socket=None).local_socket_path("/run/plr") is None
+
+
+def test_a_member_who_may_not_look_into_the_state_folder_hears_that_nothing_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Client:
+        def __init__(self, path: Path, _owners: frozenset[int]) -> None:
+            raise (LocalRefusedError if path in refused else LocalError)(f"{path}: no")
+
+    monkeypatch.setattr(examination, "LocalClient", Client)
+    config = parse(ROBOT, state_dir=str(tmp_path))
+    refused = {tmp_path / "sidecar.sock"}
+    with pytest.raises(LocalError, match=rf"{tmp_path}.* and {RUNTIME_SOCKET}") as caught:
+        connect(Where(), config)
+    assert type(caught.value) is LocalError
+    refused.add(RUNTIME_SOCKET)
+    with pytest.raises(LocalRefusedError):
+        connect(Where(), config)
 
 
 @pytest.mark.parametrize("wrong", ["sidecar.sock", "", "/" + "x" * 101])
