@@ -28,6 +28,7 @@ with extras.required("plr-controlplane", "controlplane"):
     from controlplane.config import load_config, refuse_exposed
     from protos.certificate_term import term_problem
     from protos.errors import ConfigError
+    from protos.log_lines import line_formatter
     from protos.logging_setup import Logging
     from protos.printable import escaped
     from protos.version_option import ShowVersion, describe
@@ -81,13 +82,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         _warn_of_what_is_legal(config)
         sys.stdout.write(f"{escaped(str(arguments.config))}: ok\n")
         return EXIT_OK
-    # gRPC writes a traceback when a client goes while its call is being ended, which anybody can make happen.
     logging.getLogger("grpc._cython.cygrpc").addFilter(_is_not_a_lost_stream)
-    with Logging("controlplane", config.log_level, sys.stderr):
+    # Not on the loop's thread: a terminal that is stopped would stop the whole fleet's control plane.
+    logs = Logging("controlplane", config.log_level, sys.stderr, line_formatter(sys.stderr))
+    with logs:
         if problem is not None:
-            # It starts all the same: a clock is set soon after a boot, and a certificate is read again when replaced.
+            # It starts all the same: a clock is set soon after a boot, and a certificate is read anew when it is
+            # replaced.
             log.log(logging.WARNING if problem.in_force else logging.ERROR, "%s", problem.text)
-        return _serve(arguments.config, config, files)
+        code = _serve(arguments.config, config, files)
+    logs.end_if_stalled(code)
+    return code
 
 
 def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
@@ -143,6 +148,7 @@ def _take_descriptors() -> None:
 
 
 def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
+    """gRPC writes a traceback when a client goes while its call is being ended, which anybody can make happen."""
     return not record.getMessage().startswith("ExecuteBatchError raised in core")
 
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import queue
 from logging.handlers import QueueHandler, QueueListener
 from typing import TYPE_CHECKING
-
-from protos.log_lines import line_formatter
 
 if TYPE_CHECKING:
     from typing import TextIO
@@ -65,6 +64,8 @@ class _PatientListener(QueueListener):
     def __init__(self, waiting: queue.Queue[logging.LogRecord | None], output: logging.Handler) -> None:
         super().__init__(waiting, output)
         self._waiting = waiting
+        self.is_stalled = False
+        """Whether its stream still took nothing when it was stopped."""
 
     def stop(self) -> None:
         if self._thread is None:
@@ -72,20 +73,24 @@ class _PatientListener(QueueListener):
         with contextlib.suppress(queue.Full):
             self._waiting.put(None, timeout=STOP_TIMEOUT_S)
         self._thread.join(STOP_TIMEOUT_S)
+        self.is_stalled = self._thread.is_alive()
         self._thread = None
 
 
 class Logging:
-    """A program's logging while used as a context: that of `package` and ours from `level`, libraries' from WARNING.
-
-    Components are named without `left_out` before them.
-    """
+    """The program's logging while used as a context: `package` and protos from `level`, libraries from WARNING."""
 
     def __init__(
-        self, package: str, level: str, stream: TextIO, *, left_out: str = "", max_waiting: int = MAX_WAITING_LINES
+        self,
+        package: str,
+        level: str,
+        stream: TextIO,
+        formatter: logging.Formatter,
+        *,
+        max_waiting: int = MAX_WAITING_LINES,
     ) -> None:
         output = logging.StreamHandler(stream)
-        output.setFormatter(line_formatter(stream, left_out))
+        output.setFormatter(formatter)
         waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(max_waiting)
         self._handler = _BoundedQueueHandler(waiting)
         self._listener = _PatientListener(waiting, output)
@@ -104,3 +109,9 @@ class Logging:
         logging.getLogger().removeHandler(self._handler)
         self._handler.tell_what_was_dropped()
         self._listener.stop()
+
+    def end_if_stalled(self, code: int) -> None:
+        """Exit with this code, after the context, if its stream takes nothing more: the thread that hangs in writing
+        holds locks that the interpreter takes at its end."""
+        if self._listener.is_stalled:
+            os._exit(code)

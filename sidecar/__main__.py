@@ -20,6 +20,7 @@ from protos import commit, extras, program
 with extras.required("plr-sidecar", "sidecar"):
     from protos.certificate_term import term_problem
     from protos.errors import ConfigError, StartError
+    from protos.log_lines import line_formatter
     from protos.logging_setup import Logging
     from protos.printable import escaped
     from protos.tls_files import load_tls_files
@@ -159,7 +160,8 @@ def _run(config: SidecarConfig) -> int:
     # gRPC's own lines on stderr have another format, and what they tell is in our log.
     os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
     stop = StopRequest()
-    with Logging("sidecar", config.log_level.value, sys.stderr, left_out="sidecar"):
+    logs = Logging("sidecar", config.log_level.value, sys.stderr, line_formatter(sys.stderr, "sidecar"))
+    with logs:
         failure = _stop_on_signals_and_crashes(stop)
         try:
             problem = _certificate_problem(config)
@@ -176,8 +178,11 @@ def _run(config: SidecarConfig) -> int:
             raise
         except Exception:
             log.critical("failed", exc_info=True)
-            return EXIT_FAILURE
-    return EXIT_FAILURE if failure.is_set() else code
+            code = EXIT_FAILURE
+    if failure.is_set():
+        code = EXIT_FAILURE
+    logs.end_if_stalled(code)
+    return code
 
 
 def _stop_on_signals_and_crashes(stop: StopRequest) -> threading.Event:

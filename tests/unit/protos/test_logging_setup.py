@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos import logging_setup
+from protos.log_lines import line_formatter
 from protos.logging_setup import Logging
 
 if TYPE_CHECKING:
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
 
 OURS = logging.getLogger("sidecar.net.sockets")
 LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z [A-Z]+ \S+: .*")
+
+
+def logging_to(stream: io.StringIO, level: str, max_waiting: int = logging_setup.MAX_WAITING_LINES) -> Logging:
+    return Logging("sidecar", level, stream, line_formatter(stream, "sidecar"), max_waiting=max_waiting)
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +34,7 @@ def _levels() -> Iterator[None]:
 
 def test_one_line_with_time_level_and_component() -> None:
     stream = io.StringIO()
-    with Logging("sidecar", "info", stream, left_out="sidecar"):
+    with logging_to(stream, "info"):
         OURS.info("hello %s", "there")
         OURS.warning("two\nlines")
         OURS.debug("too quiet")
@@ -41,7 +46,7 @@ def test_one_line_with_time_level_and_component() -> None:
 
 def test_libraries_are_heard_from_warning_on() -> None:
     stream = io.StringIO()
-    with Logging("sidecar", "debug", stream, left_out="sidecar"):
+    with logging_to(stream, "debug"):
         logging.getLogger("asyncio").info("chatter")
         logging.getLogger("asyncio").warning("trouble")
         OURS.debug("detail")
@@ -50,7 +55,7 @@ def test_libraries_are_heard_from_warning_on() -> None:
 
 def test_a_traceback_follows_its_line_indented() -> None:
     stream = io.StringIO()
-    with Logging("sidecar", "info", stream, left_out="sidecar"):
+    with logging_to(stream, "info"):
         try:
             raise ValueError("broken")
         except ValueError:
@@ -64,7 +69,7 @@ def test_a_traceback_follows_its_line_indented() -> None:
 def test_arguments_are_written_as_they_were() -> None:
     stream = io.StringIO()
     values = [1]
-    with Logging("sidecar", "info", stream, left_out="sidecar"):
+    with logging_to(stream, "info"):
         OURS.info("values %s", values)
         values.append(2)
     assert "values [1]" in stream.getvalue()
@@ -85,7 +90,7 @@ class StalledStream(io.StringIO):
 def test_a_stalled_stream_does_not_stall_who_logs_and_the_loss_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logging_setup, "STOP_TIMEOUT_S", 30.0)
     stream = StalledStream()
-    with Logging("sidecar", "info", stream, left_out="sidecar", max_waiting=5):
+    with logging_to(stream, "info", max_waiting=5):
         for number in range(50):
             OURS.info("line %d", number)
         stream.go.set()
@@ -99,7 +104,7 @@ def test_a_stalled_stream_does_not_stall_who_logs_and_the_loss_is_told(monkeypat
 def test_a_stream_stalled_for_good_does_not_keep_the_program_from_ending(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logging_setup, "STOP_TIMEOUT_S", 0.05)
     stream = StalledStream()
-    with Logging("sidecar", "info", stream, left_out="sidecar", max_waiting=2):
+    with logging_to(stream, "info", max_waiting=2):
         for number in range(9):
             OURS.info("line %d", number)
     assert stream.getvalue() == ""
