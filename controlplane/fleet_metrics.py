@@ -256,7 +256,8 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     def up() -> Iterator[tuple[Labels, float]]:
         for robot, room in rooms:
             for path in robot.paths[: room.paths]:
-                yield (robot.name, path.interface, path.server), float(path.up)
+                if path.leads_there:
+                    yield (robot.name, path.interface, path.server), float(path.up)
 
     def interfaces() -> Iterator[tuple[Labels, float]]:
         for robot, room in rooms:

@@ -330,12 +330,11 @@ class Estimator:
         return tables.network.paths if tables is not None else {}
 
     def path_views(self, robot: NodeName) -> Iterator[PathView]:
-        """Each path of a robot as reported last, with its round trips as remembered, but those that lead nowhere."""
+        """Each path of a robot as reported last, with its round trips as remembered."""
         tables = self._robots.get(robot)
         if tables is not None:
             for key, state in tables.network.paths.items():
-                if tables.network.leads_there(key):
-                    yield PathView(*key, state.up, state.rtt.median_once())
+                yield PathView(*key, state.up, state.rtt.median_once(), tables.network.leads_there(key))
 
     def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
         """Whether the path was up when last reported; None if it never was reported."""

@@ -38,6 +38,8 @@ class PathView:
     up: bool
     round_trip_s: float
     """The median, within 2 %; NaN where none is known."""
+    leads_there: bool = True
+    """Whether it ever was up, or nothing ever was over its interface: else its being down tells nothing."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from bench.attacker.control_client import CONNECT
 from bench.attacker.junk import mangled, noise
 from protos.convert import sidecar_message_to_proto
 from protos.identity import CONTROL_PLANE_DNS, IdentityRole
-from protos.model import CandidateSet, Drain, Heartbeat, Report, Role, ServiceSet
+from protos.model import CandidateSet, Drain, Heartbeat, NodeName, Report, Role, ServiceSet
 from tests.attacks.registrations import registration
 from tests.integration.control_plane_process import Secured, cloud, open_channel, robot
 from tests.integration.secured_control_plane import SecuredControlPlane
@@ -29,10 +29,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from controlplane.ca import Issued
+
 MB = 1e6
 DATAGRAMS_A_MESSAGE = 100
 """`--fuzz-datagrams` counts datagrams; a stream's message costs a hundred times as much."""
 MESSAGES_A_STREAM = 20
+STREAMS_A_MEMBER = 20
+"""Each has its share of registrations, and one beyond it is refused: another one goes on."""
 LINES = 21
 GROWTH_BYTES = 24 * MB
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
@@ -58,7 +62,8 @@ class Fleet:
         self.plane = SecuredControlPlane(folder)
         self.authority = self.plane.authority
         self.folder = folder / "fuzzer"
-        self.fuzzer = self.authority.write_tls_dir(self.folder, "fuzzer", IdentityRole.ROBOT)
+        self.authority.write_tls_dir(self.folder, "fuzzer", IdentityRole.ROBOT)
+        self._members = 0
         self.host, port = self.plane.address.rsplit(":", 1)
         self.port = int(port)
         self._process = psutil.Process(self.plane._process.pid)
@@ -70,16 +75,23 @@ class Fleet:
         with cloud(self.plane.address, "cloud-a", a), robot(self.plane.address, "robot-1", r) as user:
             user.mapping("cloud-a", "cloud-a")
 
-    def channel(self) -> grpc.Channel:
-        return open_channel(self.plane.address, Secured(self.fuzzer, self.authority.ca_pem))
+    def another(self) -> tuple[NodeName, Issued]:
+        """A member that has not registered yet."""
+        self._members += 1
+        name = NodeName(f"member-{self._members}")
+        return name, self.authority.issue(name, IdentityRole.ROBOT)
+
+    def channel(self, member: Issued) -> grpc.Channel:
+        return open_channel(self.plane.address, Secured(member, self.authority.ca_pem))
 
     def resident(self) -> int:
         return int(self._process.memory_info().rss)
 
     def assert_fine(self) -> None:
         """It lets a member in, and has nothing to complain of."""
-        with self.channel() as channel:
-            code, answers = talk(channel, [registration(self.fuzzer, "fuzzer", Role.ROBOT)], wait_for=1)
+        name, member = self.another()
+        with self.channel(member) as channel:
+            code, answers = talk(channel, [registration(member, name, Role.ROBOT)], wait_for=1)
         assert answers, code
         assert [line for line in self.plane.lines if "Traceback" in line or " ERROR " in line] == []
 
@@ -141,14 +153,16 @@ def test_a_member_that_sends_anything(fleet: Fleet, fuzz_datagrams: int) -> None
     before = 0
     began = time.monotonic()
     count = max(3 * LINES, fuzz_datagrams // DATAGRAMS_A_MESSAGE // MESSAGES_A_STREAM)
-    with fleet.channel() as channel:
-        for number in range(count):
-            register = registration(fleet.fuzzer, "fuzzer", Role.ROBOT)
-            first = mutated(register, rng) if number % 4 == 0 else register
-            code, _ = talk(channel, [first, *(mutated(sane(rng, register), rng) for _ in range(MESSAGES_A_STREAM))])
-            codes.add(code)
-            if number == count // 2:
-                before = fleet.resident()
+    for begin in range(0, count, STREAMS_A_MEMBER):
+        name, member = fleet.another()
+        with fleet.channel(member) as channel:
+            for number in range(begin, min(begin + STREAMS_A_MEMBER, count)):
+                register = registration(member, name, Role.ROBOT)
+                first = mutated(register, rng) if number % 4 == 0 else register
+                code, _ = talk(channel, [first, *(mutated(sane(rng, register), rng) for _ in range(MESSAGES_A_STREAM))])
+                codes.add(code)
+                if number == count // 2:
+                    before = fleet.resident()
     assert codes <= REFUSALS
     assert grpc.StatusCode.INVALID_ARGUMENT in codes
     told = [line for line in fleet.plane.lines if " ended: " in line]

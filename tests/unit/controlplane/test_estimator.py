@@ -218,7 +218,8 @@ def test_what_an_interface_never_reached_tells_nothing_of_it_once_it_reached_oth
     """The carrier of a site leads to the site's own server alone; one that leads nowhere at all is dark."""
 
     def seen() -> dict[tuple[str, str], bool]:
-        return {(view.interface, view.server): view.up for view in estimator.path_views(NodeName("robot"))}
+        views = estimator.path_views(NodeName("robot"))
+        return {(view.interface, view.server): view.up for view in views if view.leads_there}
 
     estimator.merge(
         NodeName("robot"),

@@ -275,6 +275,7 @@ def test_paths_to_a_server_that_is_gone_have_no_series() -> None:
     server = world.cloud("a")
     world.cloud("b")
     robot = world.robot()
+    world.say(robot, Report(paths=(path("wlan0", "a"), path("wlan0", "b"))))
     world.say(robot, Report(paths=(path("wlan0", "a", up=False), path("wlan0", "b"))))
     world.run(SETTLED_S)
 
