@@ -399,7 +399,7 @@ class ControlLoop:
                     share = used.share(time.thread_time(), now)
                     self._core.follow_load(now, share)
                     self._prepare_if_quiet(share)
-                    self._update_metrics()
+                    self.update_metrics()
                     self._garbage.look_if_worth(len(self._core.registry))
                     metrics_at = now + METRICS_INTERVAL_S
                 self._dispatch_quietly()
@@ -458,7 +458,8 @@ class ControlLoop:
         plan = self._matcher.solve(picture.problem, limit_s, self._core.plan)
         return self._core.settle(picture, plan, self._loop.time())
 
-    def _update_metrics(self) -> None:
+    def update_metrics(self) -> None:
+        """Leave the values of this moment for whoever scrapes."""
         superseded = self._superseded + sum(mailbox.superseded for mailbox in self._mailboxes.values())
         self._metrics.update(self._core, self.stun_servers, superseded, self.events.state, self.reports_slowed)
 

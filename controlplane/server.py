@@ -116,6 +116,7 @@ async def serve(
             gate.on_member_refused = lambda name, text: events.record(EventKind.REFUSED, name, text)
         servers, health_service = _make_servers(config, loop, metrics, gate)
         stun = await _start_stun(config, loop, cleanup)
+        loop.update_metrics()
         metrics.watch_fleet(loop.ask_fleet)
         metrics_address = _start_metrics(config, metrics)
         if gate is None:
