@@ -182,7 +182,7 @@ class ControlCore:
             self._forget_paths(name)
         self._publisher.begin_stream(registration)
         self._welcome(name, stream)
-        self._came_or_went(name, now)
+        self._came_or_went(name, registration.role, now)
         self.follow_load(now)
         return stream
 
@@ -211,7 +211,7 @@ class ControlCore:
                 sidecar = self.registry.get(name)
                 if sidecar is not None and self.registry.set_draining(name):
                     self._publisher.changed(name, sidecar.role)
-                    self._came_or_went(name, now)
+                    self._came_or_went(name, sidecar.role, now)
             case RevocationSet():
                 self.registry.set_revocations(name, message)
             case Heartbeat():
@@ -233,7 +233,7 @@ class ControlCore:
         sidecar = self.registry.get(name)
         if changed and sidecar is not None:
             self._publisher.changed(name, sidecar.role)
-            self._members_changed(now)
+            self._members_changed(now, sidecar.role)
             if isinstance(told, ServiceSet):
                 self._note_refused_offers(name)
 
@@ -366,7 +366,7 @@ class ControlCore:
             return
         if self.registry.disconnect(name, stream) is not None:
             self._forget(sidecar, RemovalReason.LEFT, now)
-            self._came_or_went(name, now)
+            self._came_or_went(name, sidecar.role, now)
         elif sidecar.stream == stream:
             self._events.append(StreamLostNotice(name, sidecar.role))
 
@@ -433,7 +433,7 @@ class ControlCore:
         for sidecar in self.registry.expire(now, unread):
             self._close(sidecar.stream, CloseReason.LEASE_EXPIRED, now)
             self._forget(sidecar, RemovalReason.LEASE_EXPIRED, now)
-            self._members_changed(now)
+            self._members_changed(now, sidecar.role)
         for gone in self._returning.missing(now):
             self.departed.note(gone)
             self._events.append(DepartureNotice(gone.name, gone))
@@ -484,15 +484,16 @@ class ControlCore:
         self.estimator.forget_paths(name)
         self._drawing.robot_changed(name)
 
-    def _members_changed(self, now: float) -> None:
+    def _members_changed(self, now: float, role: Role = Role.CLOUD) -> None:
+        """Those of this role did, or what is as much as that."""
         self._drawing.members_changed()
-        self._debounce.note(Change.MEMBERS, now)
+        self._debounce.note(Change.ROBOTS if role is Role.ROBOT else Change.MEMBERS, now)
         self._publish_soon(now)
 
-    def _came_or_went(self, name: NodeName, now: float) -> None:
+    def _came_or_went(self, name: NodeName, role: Role, now: float) -> None:
         """By its own will: beyond its share that is told a little later, and not solved for at once."""
         if self.restlessness.take(name, now):
-            self._members_changed(now)
+            self._members_changed(now, role)
             return
         self._drawing.members_changed()
         self._debounce.note(Change.REPORT, now)

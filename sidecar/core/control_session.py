@@ -55,6 +55,10 @@ RETRY_LEAST_S = 1.0
 WELCOME_TIMEOUT_S = 5.0
 """A stream without Welcome for this long is given up: connection set-up over a bad cellular link takes 1 to 2 s."""
 
+WELCOME_TIMEOUT_MAX_S = 35.0
+"""Each one given up makes the next wait twice as long, up to this: a fleet that starts all at once takes longer than
+the first timeout, and who gives up and begins anew has had its turn for nothing."""
+
 PATIENCE_TIMES = 3.0
 """So many times as long as the attempts of its fleet may be apart a sidecar waits beside that. From 1,500 sidecars on
 they are closer together than would let all in."""
@@ -146,8 +150,9 @@ class ControlSession:
         self.stats = ControlStats()
         self._retry_at = 0.0
         self._patience_s = WELCOME_TIMEOUT_S
-        """The same and more, as a fleet that comes back all at once waits for its turns: who gives up and begins anew
-        has had its turn for nothing."""
+        """For how long a stream may be without Welcome, ..."""
+        self._first_patience_s = WELCOME_TIMEOUT_S
+        """... and the first one after the last Welcome or change of the network."""
         self._opened_at = 0.0
         self._refused = False
         self._heartbeat_interval_s = 0.0
@@ -219,6 +224,8 @@ class ControlSession:
             self._backoff.exhaust()
         if self._report is not None:
             self.stats.reports_dropped += 1
+        if self.welcome_overdue(now):
+            self._patience_s = min(2.0 * self._patience_s, WELCOME_TIMEOUT_MAX_S)
         self._clear_outgoing()
         self.state = ControlState.OFFLINE
         self._refused = refused
@@ -233,6 +240,7 @@ class ControlSession:
         """
         if self.state is ControlState.OFFLINE and not self._refused:
             self._backoff.reset()
+            self._patience_s = self._first_patience_s
             soon = max(now, self._opened_at + RETRY_LEAST_S) + self._backoff.next_delay_s()
             self._retry_at = min(self._retry_at, soon)
 
@@ -256,7 +264,8 @@ class ControlSession:
         if welcome.reconnect_max_s:
             reconnect_max_s = min(max(welcome.reconnect_max_s, RETRY_FIRST_S), RETRY_MAX_S)
             self._backoff.set_max(reconnect_max_s)
-            self._patience_s = WELCOME_TIMEOUT_S + PATIENCE_TIMES * reconnect_max_s
+            self._first_patience_s = WELCOME_TIMEOUT_S + PATIENCE_TIMES * reconnect_max_s
+        self._patience_s = self._first_patience_s
         self._heartbeat_interval_s = max(welcome.lease_s / HEARTBEATS_PER_LEASE, MIN_INTERVAL_S)
         self._report_interval_s = max(welcome.report_interval_s, MIN_INTERVAL_S)
         self._heartbeat_at = now + self._heartbeat_interval_s

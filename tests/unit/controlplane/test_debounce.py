@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.debounce import ROUTINE_INTERVAL_S, ROUTINE_TIMES, URGENT_DELAY_S, Change, Debounce
+from controlplane.core.debounce import (
+    ROBOTS_TIMES,
+    ROBOTS_WAIT_S,
+    ROUTINE_INTERVAL_S,
+    ROUTINE_TIMES,
+    URGENT_DELAY_S,
+    Change,
+    Debounce,
+)
 
 
 def solve_at(debounce: Debounce, now: float, duration: float = 0.0) -> None:
@@ -61,3 +69,33 @@ def test_what_happens_while_solving_is_solved_for_afterwards() -> None:
     assert not debounce.start(5.0)
     debounce.finished(5.0)
     assert debounce.start(5.0)
+
+
+@pytest.mark.audit("ops-16")
+@pytest.mark.parametrize("took_s", [0.0, 0.02, 0.25, 3.0])
+def test_robots_that_come_leave_time_for_the_rest(took_s: float) -> None:
+    debounce, now, solved, wait = Debounce(), 0.0, 0, 0.0
+    while solved < 20:
+        debounce.note(Change.ROBOTS, now)
+        due = debounce.next_time()
+        assert due is not None
+        wait = due - now
+        now = due
+        assert debounce.start(now) is Change.ROBOTS
+        now += took_s
+        debounce.finished(now)
+        solved += 1
+    assert wait == pytest.approx(max(URGENT_DELAY_S, min(ROBOTS_TIMES * took_s, ROBOTS_WAIT_S)))
+
+
+@pytest.mark.audit("ops-20")
+@pytest.mark.parametrize("change", [Change.PATH, Change.MISSES, Change.MEMBERS])
+def test_what_is_urgent_waits_for_no_robots(change: Change) -> None:
+    debounce = Debounce()
+    debounce.note(Change.ROBOTS, 0.0)
+    solve_at(debounce, URGENT_DELAY_S, duration=0.5)
+    debounce.note(Change.ROBOTS, 0.6)
+    debounce.note(change, 0.7)
+    assert debounce.next_time() == pytest.approx(0.7 + URGENT_DELAY_S)
+    solve_at(debounce, 0.7 + URGENT_DELAY_S)
+    assert debounce.next_time() is None

@@ -42,6 +42,7 @@ from sidecar.core.control_session import (
     RETRY_FIRST_S,
     RETRY_MAX_S,
     STABLE_AFTER_S,
+    WELCOME_TIMEOUT_MAX_S,
     WELCOME_TIMEOUT_S,
     Apply,
     ControlSession,
@@ -563,6 +564,36 @@ def test_a_fleet_that_is_told_so_comes_back_within_the_time_told_and_waits_for_i
         session.opened(100.0)
     assert max(delays) <= 2.0 < sum(sorted(delays)[-2:])
     assert session.next_timer() == 100.0 + WELCOME_TIMEOUT_S + PATIENCE_TIMES * 2.0
+
+
+@pytest.mark.audit("ops-16")
+def test_each_stream_without_welcome_is_waited_for_twice_as_long() -> None:
+    session = make_session()
+    waits, now = [], 0.0
+    for _ in range(5):
+        session.opened(now)
+        waits.append(session.next_timer() - now)
+        now = session.next_timer()
+        session.closed(now)
+    assert waits == [WELCOME_TIMEOUT_S, 2 * WELCOME_TIMEOUT_S, 4 * WELCOME_TIMEOUT_S, *[WELCOME_TIMEOUT_MAX_S] * 2]
+    session.network_changed(now)
+    session.opened(now)
+    assert session.next_timer() == now + WELCOME_TIMEOUT_S
+    session.closed(now + WELCOME_TIMEOUT_S)
+    session.opened(now)
+    session.receive(WELCOME, now)
+    session.closed(now)
+    session.opened(now)
+    assert session.next_timer() == now + WELCOME_TIMEOUT_S
+
+
+def test_a_stream_that_ends_early_makes_nobody_patient() -> None:
+    session = make_session()
+    for attempt in range(3):
+        session.opened(float(attempt))
+        session.closed(attempt + 0.5)
+    session.opened(10.0)
+    assert session.next_timer() == 10.0 + WELCOME_TIMEOUT_S
 
 
 @pytest.mark.audit("ops-18")
