@@ -492,6 +492,8 @@ class Report:
     """All that are in force."""
     goodbyes: tuple[NodeName, ...] = ()
     """Servers that said goodbye to this robot and are listed yet, or were until its last report."""
+    changes_only: bool = False
+    """Whether it tells of no other paths than those that went up or down, and of nothing else that was measured."""
     continues: bool = False
     """Whether this is a further part of a report, which says nothing of penalties."""
     more: bool = False

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
     from sidecar.core.control_session import ControlSession, ControlStats
+    from sidecar.core.report_scope import ReportScope
     from sidecar.net.control_dialer import ControlDialer, ControlLine
 
     _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
@@ -156,9 +157,9 @@ class ControlClient:
         """Tell the control plane which revocation lists we use now."""
         self._post(lambda: self._session.set_revocations(held))
 
-    def report_at_once(self) -> None:
-        """Something happened that the control plane should hear of before the next report is due."""
-        self._post(lambda: self._session.report_at_once(time.monotonic()))
+    def report_at_once(self, scope: ReportScope) -> None:
+        """Something happened that the control plane should hear of before the next report is due, and no more."""
+        self._post(lambda: self._session.report_at_once(time.monotonic(), scope))
 
     def try_again(self) -> None:
         """Interfaces or peers are others now: a mapping that was refused for want of them may fit."""
@@ -349,8 +350,9 @@ class ControlClient:
             stopping = self._stopping
             now = time.monotonic()
             self._session.handle_timer(now)
-            if self._session.report_due(now):
-                self._session.send_report(self._take_report(), now)
+            scope = self._session.report_due(now)
+            if scope is not None:
+                self._session.send_report(self._take_report(scope), now)
             try:
                 for message in self._session.messages_to_send(now):
                     await call.write(sidecar_message_to_proto(message))
@@ -422,9 +424,9 @@ class ControlClient:
             self._refusals.taken(apply.resource)
             log.info("%s version %d fits now", apply.resource.value, apply.content.version)
 
-    def _take_report(self) -> Report:
+    def _take_report(self, scope: ReportScope) -> Report:
         try:
-            return self._hooks.take_report()
+            return self._hooks.take_report(scope)
         except Exception:
             log.exception("taking a report failed")
             return Report()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from protos.model import MappingSet, PeerSet, Report, Welcome
     from protos.tls_files import TlsFiles
+    from sidecar.core.report_scope import ReportScope
 
 
 class ControlHooks(Protocol):
@@ -21,7 +22,7 @@ class ControlHooks(Protocol):
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         """Put the mapping in force; returns why not, or None."""
 
-    def take_report(self) -> Report:
+    def take_report(self, scope: ReportScope) -> Report:
         """Return what was measured since the last call."""
 
     def connection_changed(self, connected: bool, reason: str) -> None:

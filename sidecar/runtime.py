@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from sidecar.config import SidecarConfig
     from sidecar.core.path_id import PathState
     from sidecar.core.pinging import Pong
+    from sidecar.core.report_scope import ReportScope
     from sidecar.core.stun_events import StunEvent
     from sidecar.stop_request import StopRequest
 
@@ -112,7 +113,7 @@ class Sidecar:
                 self._on_reach_changed,
                 self._on_paths_changed,
                 self._on_revocations,
-                lambda: self._control.report_at_once(),
+                lambda scope: self._control.report_at_once(scope),
                 self._on_pong,
             ),
         )
@@ -369,9 +370,9 @@ class Sidecar:
                 log.info("mapping %d: %s goes %s: %s", mapping.version, service.service, pairs, service.reason)
         self._logged_mappings = {service.service: service.assignments for service in mapping.services}
 
-    def take_report(self) -> Report:
+    def take_report(self, scope: ReportScope) -> Report:
         """Return what was measured since the last call."""
-        return self._data_plane.take_report()
+        return self._data_plane.take_report(scope)
 
     def look_at_revocations(self) -> None:
         """A second has passed: judge the revocation lists that peers sent, and how old those in use are."""

@@ -20,6 +20,7 @@ from protos.model import MappingSet, PeerSet, Role
 from protos.plr.v1 import control_pb2_grpc
 from sidecar.control_channel import REFUSALS
 from sidecar.core.control_session import Apply, ControlState
+from sidecar.core.report_scope import ReportScope
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -87,7 +88,7 @@ class Crowd:
         for member in self.members.values():
             if member.role is Role.ROBOT:
                 member.dead = dead
-                member.session.report_at_once(now)
+                member.session.report_at_once(now, ReportScope.CHANGES)
                 self._wake[member.name].set()
         return now
 
@@ -141,7 +142,10 @@ class Crowd:
             wake.clear()
             now = time.monotonic()
             session.handle_timer(now)
-            if session.report_due(now):
+            scope = session.report_due(now)
+            if scope is ReportScope.CHANGES:
+                session.send_report(member.path_changes(), now)
+            elif scope is ReportScope.ALL:
                 session.send_report(member.report(now - reported_at), now)
                 reported_at = now
             try:

@@ -122,6 +122,11 @@ class Member:
                     )
         return Report(tuple(latencies), tuple(paths), (OutcomeReport(SERVICE, ok=requests),))
 
+    def path_changes(self) -> Report:
+        """What a robot tells at once when a server is dead."""
+        paths = [PathReport(interface, self.dead, False, Histogram()) for interface in self._interfaces if self.dead]
+        return Report(paths=tuple(paths), changes_only=True)
+
     def takes(self, assignments: tuple[Assignment, ...], now: float) -> None:
         """A mapping is in force."""
         self.mapped = frozenset(one.server for one in assignments)

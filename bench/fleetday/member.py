@@ -30,13 +30,14 @@ from protos.model import (
     Welcome,
 )
 from sidecar.core.control_session import Apply, ControlSession, ControlState
+from sidecar.core.report_scope import ReportScope
 
 if TYPE_CHECKING:
     import random
 
     from bench.fleetday.plane import Plane
     from bench.fleetday.timeline import Timeline
-    from protos.model import Address, ControlMessage, NodeName
+    from protos.model import Address, ControlMessage, InterfaceName, NodeName
 
 NOTICES_S = (10.0, 40.0)
 """Keepalives find a connection that died without a word within this time."""
@@ -117,6 +118,8 @@ class Member:
         self.lost_at: dict[InterfaceName, float] = {}
         """Interfaces that went away, and when."""
         self._paths_due = False
+        self._told_up: dict[tuple[InterfaceName, NodeName], bool] = {}
+        """Whether each path was up when it was told last."""
         self._measure_at = 0.0
         self._wake_at = float("inf")
         self.complaints: list[str] = []
@@ -238,7 +241,7 @@ class Member:
         """A path went up or down, which is reported at once."""
         if self.role is Role.ROBOT and self.session is not None:
             self._paths_due = True
-            self.session.report_at_once(self._timeline.now)
+            self.session.report_at_once(self._timeline.now, ReportScope.CHANGES)
             self._schedule()
 
     # ── its stream ──
@@ -268,8 +271,10 @@ class Member:
             self._give_up()
         else:
             session.handle_timer(now)
-            if session.report_due(now):
-                session.send_report(self._measure(now), now)
+            scope = session.report_due(now)
+            if scope is not None:
+                changes_only = scope is ReportScope.CHANGES
+                session.send_report(self._path_changes() if changes_only else self._measure(now), now)
             self._say()
         self._schedule()
 
@@ -384,6 +389,17 @@ class Member:
         """Whether datagrams arrive."""
         return interface not in self.dark and (interface, server) not in self.dark
 
+    def _path_changes(self) -> Report:
+        """Paths that are not as they were told last."""
+        states = self._path_states()
+        changed = [(pair, up) for pair, up in states.items() if self._told_up.get(pair) != up]
+        self._told_up = states
+        return Report(paths=tuple(PathReport(*pair, up, _EMPTY) for pair, up in changed), changes_only=True)
+
+    def _path_states(self) -> dict[tuple[InterfaceName, NodeName], bool]:
+        pairs = ((interface, server) for server in self.held.peers.table for interface in self.interfaces)
+        return {pair: self.is_up(*pair) for pair in pairs}
+
     def _measure(self, now: float) -> Report:
         if self.role is Role.CLOUD:
             return NOTHING
@@ -391,16 +407,11 @@ class Member:
         if not measures and not self._paths_due:
             return NOTHING
         self._paths_due = False
+        self._told_up = self._path_states()
         rng, made = self._rng, self._measurements
         paths = tuple(
-            PathReport(
-                interface,
-                server,
-                self.is_up(interface, server),
-                rng.choice(made.round_trips) if measures else _EMPTY,
-            )
-            for server in self.held.peers.table
-            for interface in self.interfaces
+            PathReport(*pair, up, rng.choice(made.round_trips) if measures else _EMPTY)
+            for pair, up in self._told_up.items()
         )
         if not measures:
             return Report(paths=paths)

@@ -244,7 +244,7 @@ class ControlCore:
             return
         self._note_goodbyes(name, report.goodbyes)
         # Before the rest: after a restart a robot reports on servers that are not back yet.
-        reaches_again = not report.more and self._publisher.waits_for(
+        reaches_again = not (report.more or report.changes_only) and self._publisher.waits_for(
             name, report.servers_before.union(path.server for path in report.paths)
         )
         report, left_out = believable(report, name, self.registry, self.permits)

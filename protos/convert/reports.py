@@ -59,6 +59,7 @@ def report_from_proto(message: control_pb2.Report) -> Report:
         interface_joints=each(message.interface_joints, MAX_JOINTS, "interface_joints", _interface_joint_from_proto),
         penalties=penalties,
         goodbyes=tuple(node_name(server, "goodbyes") for server in message.goodbyes),
+        changes_only=message.changes_only,
     )
 
 
@@ -73,7 +74,9 @@ def report_parts(message: control_pb2.Report) -> Iterator[Report]:
     )
     for field, limit in lists:
         check_length(getattr(message, field), limit, field)
-    part = report_from_proto(control_pb2.Report(penalties=message.penalties, goodbyes=message.goodbyes))
+    changes_only = message.changes_only
+    first = control_pb2.Report(penalties=message.penalties, goodbyes=message.goodbyes, changes_only=changes_only)
+    part = report_from_proto(first)
     servers: frozenset[NodeName] = frozenset()
     for field, _ in lists:
         entries = getattr(message, field)
@@ -81,7 +84,7 @@ def report_parts(message: control_pb2.Report) -> Iterator[Report]:
             yield replace(part, more=True)
             servers |= {path.server for path in part.paths}
             part = report_from_proto(control_pb2.Report(**{field: entries[begin : begin + PART_ENTRIES]}))
-            part = replace(part, continues=True, servers_before=servers)
+            part = replace(part, changes_only=changes_only, continues=True, servers_before=servers)
     yield part
 
 
@@ -101,6 +104,7 @@ def report_to_proto(report: Report) -> control_pb2.Report:
         interface_joints=map(_interface_joint_to_proto, report.interface_joints),
         penalties=map(_penalty_to_proto, report.penalties),
         goodbyes=report.goodbyes,
+        changes_only=report.changes_only,
     )
 
 

@@ -37,6 +37,7 @@ from protos.model import (
 )
 from sidecar.core.backoff import Backoff
 from sidecar.core.peer_assembly import PeerAssembly
+from sidecar.core.report_scope import ReportScope
 
 if TYPE_CHECKING:
     import random
@@ -160,8 +161,12 @@ class ControlSession:
         self._reported_at = 0.0
         self._urgent_at = -math.inf
         self._urgent = False
-        """Whether the next report is."""
+        """Whether the next whole report is."""
         self._urgent_told_at = -math.inf
+        self._changes_at: float | None = None
+        """When to tell of changes alone."""
+        self._told_whole = False
+        """Whether this stream has had a whole report: to a control plane that knows nothing, changes say little."""
         self._heartbeat_at = 0.0
         self._report_at = 0.0
         self._clear_outgoing()
@@ -202,6 +207,7 @@ class ControlSession:
         """A stream is being opened: everything is said anew on it."""
         self._clear_outgoing()
         self._taken.clear()
+        self._changes_at, self._told_whole = None, False
         self._assembly.begin_stream()
         self.state = ControlState.REGISTERING
         self.stats.attempts += 1
@@ -375,30 +381,43 @@ class ControlSession:
             self._draining = True
             self._drain_due = self.state is not ControlState.OFFLINE
 
-    def report_due(self, now: float) -> bool:
-        """Whether the driver is to collect a report and pass it to `send_report`."""
-        return self.state is ControlState.ONLINE and self._report is None and now >= self._report_at
+    def report_due(self, now: float) -> ReportScope | None:
+        """What the driver is to collect and pass to `send_report`."""
+        if self.state is not ControlState.ONLINE or self._report is not None:
+            return None
+        if now >= self._report_at:
+            return ReportScope.ALL
+        return ReportScope.CHANGES if self._changes_at is not None and now >= self._changes_at else None
 
-    def report_at_once(self, now: float) -> None:
-        """Something happened that cannot wait for the interval: a path went, a deadline was missed.
+    def report_at_once(self, now: float, scope: ReportScope) -> None:
+        """Something happened that cannot wait for the interval: a path went, or a deadline was missed.
 
         The fleet's size counts all the same, as it may happen to all again and again: two of these reports are a tenth
         of the interval apart.
         Without a stream it waits for the next one.
         """
-        self._urgent, self._urgent_at = True, now
-        self._report_at = min(self._report_at, max(now, self._soonest_report()))
+        self._urgent_at = now
+        soonest = max(now, self._soonest_report())
+        if scope is ReportScope.CHANGES and self._told_whole:
+            self._changes_at = min(self._changes_at or soonest, soonest)
+        else:
+            self._urgent = True
+            self._report_at = min(self._report_at, soonest)
 
     def _soonest_report(self) -> float:
         return self._urgent_told_at + max(self._report_interval_s * URGENT_PART, URGENT_LEAST_S)
 
     def send_report(self, report: Report, now: float) -> None:
         """Send what was measured since the last report; one that holds nothing is left out."""
-        if self._urgent:
-            self._urgent, self._urgent_told_at = False, now
-        self._reported_at = now
-        self._report_at = now + self._report_interval_s
-        if report != _NOTHING_MEASURED and self.state is ControlState.ONLINE:
+        self._reported_at, self._changes_at = now, None
+        if report.changes_only:
+            self._urgent_told_at = now
+        else:
+            if self._urgent:
+                self._urgent, self._urgent_told_at = False, now
+            self._report_at = now + self._report_interval_s
+            self._told_whole = True
+        if replace(report, changes_only=False) != _NOTHING_MEASURED and self.state is ControlState.ONLINE:
             self._report = report
 
     # ── time ──
@@ -411,7 +430,7 @@ class ControlSession:
             case ControlState.REGISTERING:
                 return self._opened_at + self._patience_s
             case ControlState.ONLINE:
-                return min(self._heartbeat_at, self._report_at)
+                return min(self._heartbeat_at, self._report_at, self._changes_at or math.inf)
 
     def handle_timer(self, now: float) -> None:
         """Do what is due."""

@@ -61,6 +61,7 @@ from sidecar.core.outbox import Outbox
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.peers import Peers
 from sidecar.core.penalties import Penalties
+from sidecar.core.report_scope import ReportScope
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.revocation_exchange import RevocationExchange
@@ -326,13 +327,16 @@ class Engine:
         """Robot: (service, server, type) of servers left out because the others offer another type."""
         return frozenset(self._offers.conflicts)
 
-    def take_urgency(self) -> bool:
-        """Robot: whether a report is wanted before it is due, as a path changed or a deadline was missed."""
-        return self._config.role is Role.ROBOT and self._measurements.take_urgency()
+    def take_urgency(self) -> ReportScope | None:
+        """Robot: what is to be reported before the next report is due, as a path changed or a deadline was missed."""
+        return self._measurements.take_urgency() if self._config.role is Role.ROBOT else None
 
-    def take_report(self, now: float) -> Report:
+    def take_report(self, now: float, scope: ReportScope = ReportScope.ALL) -> Report:
         """Return what was measured since the last report."""
-        measured = self._measurements.take(self.routes, self.peers.names())
+        if scope is ReportScope.CHANGES:
+            measured = self._measurements.take_changes(self.routes)
+        else:
+            measured = self._measurements.take(self.routes, self.peers.names())
         return replace(measured, penalties=self._penalties.report(now), goodbyes=self._goodbyes.report())
 
     @property
@@ -457,7 +461,7 @@ class Engine:
             return
         reached = self.routes.reaches(path.peer)
         self.routes.set_state(path, state)
-        self._measurements.note_urgent()
+        self._measurements.note_path_change(path)
         if state is PathState.UP:
             self._goodbyes.is_back(path.peer)
             self._backlog.add_steps(self._outbox.on_path_up(path), now)

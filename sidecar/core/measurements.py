@@ -20,6 +20,7 @@ from protos.model import (
 from protos.size_class import size_class
 from sidecar.core.interface_outcomes import JointCounts
 from sidecar.core.path_id import PathState
+from sidecar.core.report_scope import ReportScope
 
 if TYPE_CHECKING:
     from protos.model import Assignment, InterfaceName, NodeName, ServiceName
@@ -63,20 +64,26 @@ class Measurements:
         self._answer_bytes: dict[ServiceName, int] = {}
         self._next_path = 0
         """Which path is told of first, where one report does not hold all."""
-        self._urgent = False
-        self._urgency_told = False
+        self._changed: dict[tuple[InterfaceName, NodeName], None] = {}
+        """Whose paths went up or down since the last report."""
+        self._missed = False
+        """Whether a deadline was missed since the last whole report."""
+        self._told: ReportScope | None = None
+        """What was asked to be told at once since the last report."""
         self._clear()
 
-    def note_urgent(self) -> None:
-        """Something happened that the control plane should hear of before the next report is due."""
-        self._urgent = True
+    def note_path_change(self, path: PathId) -> None:
+        """A path went up or down."""
+        if len(self._changed) < MAX_PATHS:
+            self._changed[path.interface, path.peer] = None
 
-    def take_urgency(self) -> bool:
-        """Whether that is so; True once for each report."""
-        if self._urgent and not self._urgency_told:
-            self._urgency_told = True
-            return True
-        return False
+    def take_urgency(self) -> ReportScope | None:
+        """What should be told before the next report is due, if that is more than was said since the last one."""
+        wanted = ReportScope.ALL if self._missed else ReportScope.CHANGES if self._changed else None
+        if wanted is None or self._told in (wanted, ReportScope.ALL):
+            return None
+        self._told = wanted
+        return wanted
 
     def _clear(self) -> None:
         self._carried: dict[Carried, _Counts] = {}
@@ -137,8 +144,7 @@ class Measurements:
 
     def outcome(self, service: ServiceName, outcome: str) -> None:
         """A request ended; a missed deadline may mean that the mapping is wrong."""
-        if outcome == "deadline_missed":
-            self.note_urgent()
+        self._missed |= outcome == "deadline_missed"
         self._outcomes[service, outcome] += 1
 
     def judged_together(
@@ -183,8 +189,23 @@ class Measurements:
         joints = tuple(JointReport(*key, count, self._both_missed[key]) for key, count in self._compared.items())
         interface_joints = tuple(counts.report(pair) for pair, counts in self._interfaces.items())
         self._clear()
-        self._urgent = self._urgency_told = False
+        self._changed.clear()
+        self._missed, self._told = False, None
         return Report(latencies, paths, outcomes, joints, interface_joints)
+
+    def take_changes(self, routes: Routes) -> Report:
+        """Return the state of the paths that went up or down since the last call, or `take`, and their measurements."""
+        there = [
+            (interface, server) for interface, server in self._changed if interface in routes.interfaces_to(server)
+        ]
+        paths = tuple(self._path_report(interface, server, routes) for interface, server in there)
+        for interface, server in there:
+            for route in routes.all_to(server):
+                if route.id.interface == interface:
+                    self._paths.pop(route.id, None)
+        self._changed.clear()
+        self._told = ReportScope.ALL if self._told is ReportScope.ALL else None
+        return Report(paths=paths, changes_only=True)
 
     def _in_turn(self, paths: list[tuple[InterfaceName, NodeName]]) -> list[tuple[InterfaceName, NodeName]]:
         """As many as one report holds, from where the last one ended: all are told of, if not always."""

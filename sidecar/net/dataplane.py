@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from sidecar.core.path_history import Change
     from sidecar.core.path_id import PathId
     from sidecar.core.path_view import PathView
+    from sidecar.core.report_scope import ReportScope
     from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
@@ -81,7 +82,7 @@ class DataPlaneHooks:
     """The best state of the paths over each interface that has some; called with the engine's lock held."""
     revocations: Callable[[NodeName, bytes], None]
     """A peer sent revocation lists (PEM), which nobody has judged; called with the engine's lock held."""
-    report_urgent: Callable[[], None] = lambda: None
+    report_urgent: Callable[[ReportScope], None] = lambda scope: None
     """Something happened that the next report should tell at once; called with the engine's lock held."""
     pong: Callable[[Pong], None] = lambda _: None
     """What became of a ping; called on an interface's thread, which must not wait there."""
@@ -331,10 +332,10 @@ class ThreadedDataPlane:
         with self._lock:
             return self._engine.apply_mapping(mapping)
 
-    def take_report(self) -> Report:
+    def take_report(self, scope: ReportScope) -> Report:
         """Return what was measured since the last call."""
         with self._lock:
-            return self._engine.take_report(self._clock())
+            return self._engine.take_report(self._clock(), scope)
 
     def check_paths(self, interface: InterfaceName) -> None:
         """The control stream is not answered over this interface: find out whether anything else is."""
@@ -455,8 +456,9 @@ class ThreadedDataPlane:
             self._hooks.application.handle(event)
         for peer, pem in self._engine.revocations.take_arrived():
             self._hooks.revocations(peer, pem)
-        if self._engine.take_urgency():
-            self._hooks.report_urgent()
+        urgent = self._engine.take_urgency()
+        if urgent is not None:
+            self._hooks.report_urgent(urgent)
         best = self._engine.routes.best
         if best is not self._told_paths:
             self._told_paths = best

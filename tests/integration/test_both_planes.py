@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from protos.tls_files import TlsFiles
+    from sidecar.core.report_scope import ReportScope
 
 
 class Engine:
@@ -49,7 +50,7 @@ class Engine:
         self.mappings.put(mapping)
         return None
 
-    def take_report(self) -> Report:
+    def take_report(self, scope: ReportScope) -> Report:
         return Report(paths=tuple(path(nic, server) for nic in ("wlan0", "wwan0") for server in self.known))
 
     def certificate_changed(self, files: TlsFiles) -> None:

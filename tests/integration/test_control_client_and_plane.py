@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     import pytest
 
     from protos.tls_files import TlsFiles
+    from sidecar.core.report_scope import ReportScope
 
 ROOT = Path(__file__).parents[2]
 PLAN = ServiceName("/plan_path")
@@ -131,7 +132,7 @@ class Sidecar:
         self.mappings.put(mapping)
         return self.refuse
 
-    def take_report(self) -> Report:
+    def take_report(self, scope: ReportScope) -> Report:
         return self.report
 
     def certificate_changed(self, files: TlsFiles) -> None:

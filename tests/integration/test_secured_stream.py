@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from protos.tls_files import TlsFiles
+    from sidecar.core.report_scope import ReportScope
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ class Robot:
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         return None
 
-    def take_report(self) -> Report:
+    def take_report(self, scope: ReportScope) -> Report:
         return Report()
 
     def look_at_revocations(self) -> None:

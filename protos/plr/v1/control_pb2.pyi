@@ -527,6 +527,9 @@ class Report(_message.Message):
     INTERFACE_JOINTS_FIELD_NUMBER: _builtins.int
     PENALTIES_FIELD_NUMBER: _builtins.int
     GOODBYES_FIELD_NUMBER: _builtins.int
+    CHANGES_ONLY_FIELD_NUMBER: _builtins.int
+    changes_only: _builtins.bool
+    """It tells of paths that went up or down, beside penalties and goodbyes; all else is in the next report without this."""
     @_builtins.property
     def latencies(self) -> _containers.RepeatedCompositeFieldContainer[Global___LatencyReport]: ...
     @_builtins.property
@@ -557,10 +560,11 @@ class Report(_message.Message):
         interface_joints: _abc.Iterable[Global___InterfaceJointReport] | None = ...,
         penalties: _abc.Iterable[Global___PenaltyReport] | None = ...,
         goodbyes: _abc.Iterable[_builtins.str] | None = ...,
+        changes_only: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["goodbyes", b"goodbyes", "interface_joints", b"interface_joints", "joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths", "penalties", b"penalties"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["changes_only", b"changes_only", "goodbyes", b"goodbyes", "interface_joints", b"interface_joints", "joints", b"joints", "latencies", b"latencies", "outcomes", b"outcomes", "paths", b"paths", "penalties", b"penalties"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

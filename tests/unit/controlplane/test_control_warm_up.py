@@ -68,6 +68,21 @@ def test_a_robot_whose_report_comes_in_parts_waits_for_all_servers_of_it() -> No
     assert robot.peer_names == set(servers)
 
 
+@pytest.mark.audit("ops-20")
+def test_changes_alone_do_not_tell_which_servers_a_robot_waits_for() -> None:
+    world = restarted()
+    robot = come_back(world)
+    world.all_up(robot, ("a", "b"))
+    world.run(1.0)
+    world.cloud("a")
+    world.say(robot, Report(paths=(path("wlan0", "a"),), changes_only=True))
+    world.run(1.0)
+    assert robot.peer_sets == []
+    world.cloud("b")
+    world.run(1.0)
+    assert robot.peer_names == {"a", "b"}
+
+
 def test_after_the_warm_up_a_robot_is_told_who_did_not_come_back() -> None:
     world = restarted()
     robot = come_back(world)

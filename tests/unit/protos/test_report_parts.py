@@ -48,6 +48,13 @@ def test_the_parts_are_short_and_together_the_whole() -> None:
 
 
 @pytest.mark.audit("ops-20")
+@pytest.mark.parametrize("changes_only", [False, True])
+def test_each_part_says_whether_there_is_more_than_changes(changes_only: bool) -> None:
+    parts = parts_of(Report(paths=LONG.paths, changes_only=changes_only))
+    assert {part.changes_only for part in parts} == {changes_only}
+
+
+@pytest.mark.audit("ops-20")
 def test_parts_teach_what_the_whole_teaches() -> None:
     whole, parted = Estimator(half_life_s=60.0), Estimator(half_life_s=60.0)
     for now in (0.0, 1.0):

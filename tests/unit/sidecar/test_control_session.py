@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protos.histogram import Histogram
 from protos.model import (
     MAX_VERSION,
     PROTOCOL_VERSION,
@@ -23,6 +24,7 @@ from protos.model import (
     Nack,
     NodeName,
     OutcomeReport,
+    PathReport,
     PeerSet,
     Registration,
     Report,
@@ -48,6 +50,7 @@ from sidecar.core.control_session import (
     ControlSession,
     ControlState,
 )
+from sidecar.core.report_scope import ReportScope
 
 WELCOME = Welcome(lease_s=3.0, report_interval_s=0.5, stun_servers=("192.0.2.9:3478",))
 CANDIDATES = CandidateSet((Candidate(InterfaceId(0), InterfaceName("wlan0"), CandidateKind.HOST, ("192.0.2.2", 1)),))
@@ -457,11 +460,11 @@ def test_what_is_urgent_is_reported_before_it_is_due_but_not_all_the_time() -> N
     session.receive(Welcome(lease_s=30.0, report_interval_s=10.0), 0.0)
     session.messages_to_send(0.0)
     assert not session.report_due(5.0)
-    session.report_at_once(5.0)
+    session.report_at_once(5.0, ReportScope.ALL)
     assert session.report_due(5.0)
     session.send_report(REPORT, 5.0)
     assert answer(session, 5.0) == REPORT
-    session.report_at_once(5.1)
+    session.report_at_once(5.1, ReportScope.ALL)
     assert not session.report_due(5.9)
     assert session.report_due(6.0)
     session.send_report(REPORT, 6.0)
@@ -475,11 +478,11 @@ def test_what_is_urgent_does_not_wait_for_having_reported_a_moment_ago() -> None
     session = welcomed(make_session(), 0.0)
     session.send_report(REPORT, 10.0)
     session.messages_to_send(10.0)
-    session.report_at_once(10.1)
+    session.report_at_once(10.1, ReportScope.ALL)
     assert session.report_due(10.1)
     session.send_report(REPORT, 10.1)
     session.messages_to_send(10.1)
-    session.report_at_once(10.2)
+    session.report_at_once(10.2, ReportScope.ALL)
     assert not session.report_due(11.0)
     assert session.report_due(11.1)
 
@@ -494,19 +497,72 @@ def welcomed(session: ControlSession, now: float, interval_s: float = 10.0) -> C
 
 @pytest.mark.audit("ops-18")
 @pytest.mark.parametrize("interval_s", [0.5, 10.0])
-def test_a_network_that_flaps_all_the_time_makes_no_more_than_ten_reports_in_an_interval(interval_s: float) -> None:
+@pytest.mark.parametrize("scope", list(ReportScope))
+def test_a_network_that_flaps_all_the_time_makes_no_more_than_ten_reports_in_an_interval(
+    scope: ReportScope, interval_s: float
+) -> None:
     session = welcomed(make_session(), 0.0, interval_s)
+    session.send_report(REPORT, 0.0)
+    session.messages_to_send(0.0)
+    told = REPORT if scope is ReportScope.ALL else CHANGES
     reported_at = []
     for tick in range(int(20 * interval_s / 0.05)):
         now = 0.05 * tick
-        session.report_at_once(now)
-        if session.report_due(now):
-            session.send_report(REPORT, now)
-            assert REPORT in session.messages_to_send(now)
-            reported_at.append(now)
+        session.report_at_once(now, scope)
+        due = session.report_due(now)
+        if due is not None:
+            session.send_report(told if due is scope else REPORT, now)
+            assert session.messages_to_send(now)
+            if due is scope:
+                reported_at.append(now)
     least_s = max(interval_s / 10, 0.1)
     assert 20 * interval_s / least_s / 2 < len(reported_at) <= 20 * interval_s / least_s + 1
     assert min(b - a for a, b in itertools.pairwise(reported_at)) >= least_s - 1e-9
+
+
+CHANGES = Report(
+    paths=(PathReport(InterfaceName("wlan0"), NodeName("cloud-1"), False, Histogram()),), changes_only=True
+)
+
+
+@pytest.mark.audit("ops-20")
+def test_changes_are_told_at_once_and_the_rest_when_it_is_due() -> None:
+    session = welcomed(make_session(), 0.0)
+    session.report_at_once(1.0, ReportScope.CHANGES)
+    assert session.report_due(1.0) is ReportScope.ALL, "a control plane that knows nothing is told everything first"
+    session.send_report(REPORT, 1.0)
+    session.messages_to_send(1.0)
+    session.report_at_once(4.0, ReportScope.CHANGES)
+    assert session.next_timer() == 4.0
+    assert session.report_due(4.0) is ReportScope.CHANGES
+    session.send_report(CHANGES, 4.0)
+    assert CHANGES in session.messages_to_send(4.0)
+    session.report_at_once(4.1, ReportScope.CHANGES)
+    assert session.report_due(4.9) is None
+    assert session.report_due(5.0) is ReportScope.CHANGES
+    session.report_at_once(4.2, ReportScope.ALL)
+    assert session.report_due(4.9) is None
+    assert session.report_due(5.0) is ReportScope.ALL
+    session.send_report(REPORT, 5.0)
+    session.messages_to_send(5.0)
+    assert session.report_due(14.9) is None, "a whole report tells of changes as well"
+    session.report_at_once(14.95, ReportScope.CHANGES)
+    session.send_report(CHANGES, 14.95)
+    session.messages_to_send(14.95)
+    assert session.report_due(15.0) is ReportScope.ALL
+
+
+@pytest.mark.audit("ops-20")
+def test_changes_told_into_a_stream_that_then_broke_are_told_again_with_everything() -> None:
+    session = welcomed(make_session(), 0.0)
+    session.send_report(REPORT, 10.0)
+    session.messages_to_send(10.0)
+    session.report_at_once(20.0, ReportScope.CHANGES)
+    session.send_report(CHANGES, 20.0)
+    assert CHANGES in session.messages_to_send(20.0)
+    session.closed(22.0)
+    welcomed(session, 23.0)
+    assert session.report_due(23.0) is ReportScope.ALL
 
 
 @pytest.mark.audit("ops-18")
@@ -515,7 +571,7 @@ def test_what_happens_without_a_stream_is_reported_as_soon_as_there_is_one() -> 
     session.send_report(REPORT, 10.0)
     session.messages_to_send(10.0)
     session.closed(20.0)
-    session.report_at_once(21.0)
+    session.report_at_once(21.0, ReportScope.ALL)
     assert not session.report_due(21.0)
     welcomed(session, 80.0)
     assert session.report_due(80.0)
@@ -524,7 +580,7 @@ def test_what_happens_without_a_stream_is_reported_as_soon_as_there_is_one() -> 
 @pytest.mark.audit("ops-18")
 def test_what_was_reported_into_a_stream_that_then_broke_is_reported_again() -> None:
     session = welcomed(make_session(), 0.0)
-    session.report_at_once(20.0)
+    session.report_at_once(20.0, ReportScope.ALL)
     session.send_report(REPORT, 20.0)
     assert REPORT in session.messages_to_send(20.0)
     session.closed(22.0)
@@ -535,7 +591,7 @@ def test_what_was_reported_into_a_stream_that_then_broke_is_reported_again() -> 
 @pytest.mark.audit("ops-18")
 def test_a_stream_that_comes_back_brings_no_report_of_its_own() -> None:
     session = welcomed(make_session(), 0.0)
-    session.report_at_once(20.0)
+    session.report_at_once(20.0, ReportScope.ALL)
     session.send_report(REPORT, 20.0)
     session.messages_to_send(20.0)
     session.closed(50.0)

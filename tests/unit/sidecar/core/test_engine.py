@@ -57,6 +57,7 @@ from sidecar.core.messages import (
 )
 from sidecar.core.path_id import PathId, PathState
 from sidecar.core.priority import Priority
+from sidecar.core.report_scope import ReportScope
 from tests.sessions import credential_of, session_of
 from tests.unit.sidecar.core.builders import (
     ECHO,
@@ -444,6 +445,12 @@ def test_a_path_that_goes_or_comes_is_urgent_to_a_robot() -> None:
         sidecar.engine.take_report(1.0)
     sidecar.change(PathState.UP, 2.0)
     assert not sidecar.engine.take_urgency(), "no news"
+    sidecar.change(PathState.DOWN, 3.0)
+    assert sidecar.engine.take_urgency() is ReportScope.CHANGES
+    told = sidecar.engine.take_report(3.0, ReportScope.CHANGES)
+    assert told.changes_only
+    assert [report.up for report in told.paths] == [False]
+    assert sidecar.engine.take_report(3.0, ReportScope.CHANGES).paths == ()
     other = cloud()
     other.change(PathState.DOWN, 1.0)
     assert not other.engine.take_urgency()

@@ -22,6 +22,7 @@ from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.measurements import Measurements
 from sidecar.core.path_id import PathState
+from sidecar.core.report_scope import ReportScope
 from sidecar.core.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 
@@ -91,6 +92,36 @@ def test_paths_between_the_same_two_are_one_report_and_the_unmeasured_are_told_t
         WLAN, True, 3, 15, 3,
     )  # fmt: skip
     assert (wwan.interface, wwan.up, wwan.datagrams_sent) == (WWAN, False, 0)
+
+
+@pytest.mark.audit("ops-20")
+def test_changes_are_told_without_the_rest_which_is_told_later(measurements: Measurements) -> None:
+    routes, gone = Routes(), path(WLAN, NodeName("gone"))
+    for known in (path(WLAN), path(WLAN, A, 1), path(WWAN)):
+        routes.set_state(known, PathState.UP)
+        measurements.path(PathMeasured(known, 0.1, (0.1,), 10, 1))
+    assert measurements.take_urgency() is None
+    routes.set_state(path(WLAN), PathState.DOWN)
+    measurements.note_path_change(path(WLAN))
+    measurements.note_path_change(gone)
+    measurements.answered(ON_WWAN, 0.1, 0.0, 0)
+    assert measurements.take_urgency() is ReportScope.CHANGES
+    assert measurements.take_urgency() is None
+    measurements.outcome(ECHO, "deadline_missed")
+    assert measurements.take_urgency() is ReportScope.ALL
+    told = measurements.take_changes(routes)
+    assert told.changes_only
+    assert told.latencies == told.outcomes == ()
+    (wlan,) = told.paths
+    assert (wlan.interface, wlan.up, wlan.datagrams_sent) == (WLAN, True, 20), "another path between the two is up"
+    assert measurements.take_changes(routes).paths == ()
+    assert measurements.take_urgency() is None, "the whole report was asked for"
+    rest = measurements.take(routes, [A])
+    assert [(one.interface, one.datagrams_sent) for one in rest.paths] == [(WLAN, 0), (WWAN, 10)]
+    assert len(rest.latencies) == len(rest.outcomes) == 1
+    measurements.note_path_change(path(WWAN))
+    measurements.take(routes, [A])
+    assert measurements.take_urgency() is None, "told by the whole report"
 
 
 def test_outcomes_are_counted_and_a_rejection_is_a_failure(measurements: Measurements) -> None:
@@ -179,12 +210,12 @@ def test_what_is_judged_at_the_deadline_is_told_before_its_times_are_known(measu
 @pytest.mark.audit("ops-18")
 def test_a_missed_deadline_is_urgent_once_for_each_report(measurements: Measurements) -> None:
     measurements.outcome(ECHO, "ok")
-    assert not measurements.take_urgency()
+    assert measurements.take_urgency() is None
     measurements.outcome(ECHO, "deadline_missed")
-    assert measurements.take_urgency()
+    assert measurements.take_urgency() is ReportScope.ALL
     measurements.outcome(ECHO, "deadline_missed")
-    assert not measurements.take_urgency()
+    assert measurements.take_urgency() is None
     measurements.take(Routes(), [])
-    assert not measurements.take_urgency()
+    assert measurements.take_urgency() is None
     measurements.outcome(ECHO, "deadline_missed")
-    assert measurements.take_urgency()
+    assert measurements.take_urgency() is ReportScope.ALL

@@ -1,0 +1,16 @@
+"""What a report is to tell. What is urgent is short, so that a control plane hears a whole fleet soon."""
+
+from __future__ import annotations
+
+import enum
+
+
+class ReportScope(enum.Enum):
+    """How much of what was measured."""
+
+    CHANGES = "changes"
+    """Paths that went up or down since the last report, with what was measured of them. The rest is told when the next
+    report is due anyway."""
+
+    ALL = "all"
+    """Everything since the last report."""
