@@ -1,7 +1,8 @@
 """A folder of a program's own, by descriptor: what others put beside or in place of it leads nowhere.
 
-Under a path in a folder such as /tmp somebody else may have made the folder before, with links to files that he may not
-write but we may. So a folder is opened once and judged by what was opened, and names in it are never followed.
+Under a path in a folder such as /tmp somebody else may have made the folder before, or one above it, with links to what
+he may not write but we may. So the way there is gone step by step, each judged by what was opened, and names in the
+folder are never followed.
 """
 
 from __future__ import annotations
@@ -10,21 +11,25 @@ import contextlib
 import errno
 import os
 import stat
+from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from protos.regular_file import refuse_irregular
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Container
     from typing import BinaryIO
 
 ASIDE_SUFFIX = ".new"
 _MAX_LINKS = 8
 
 
-def refuse_strange(folder: Path, status: os.stat_result) -> None:
-    """Raise OSError if others could exchange what is in a folder; in one such as /tmp they can only add to it."""
-    if status.st_uid not in (0, os.geteuid()):
+def refuse_strange(folder: Path, status: os.stat_result, trusted: Container[int] | None = None) -> None:
+    """Raise OSError if others could exchange what is in a folder; in one such as /tmp they can only add to it.
+
+    `trusted`: who may own it, by default root and this user.
+    """
+    if status.st_uid not in (trusted or (0, os.geteuid())):
         raise OSError(errno.EPERM, f"{folder} belongs to user {status.st_uid}: chown it, or name a folder of its own")
     if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
         raise OSError(errno.EPERM, f"everybody may change {folder}: chmod o-w, or name a folder of its own")
@@ -33,11 +38,11 @@ def refuse_strange(folder: Path, status: os.stat_result) -> None:
 class OwnFolder:
     """A folder that belongs to root or this user, made (0700) if it is not there; all methods raise OSError.
 
-    `path` may be a link that root or this user made, as systemd does.
+    The folders above it are judged like it, and made like those of `mkdir -p`. Any of them may be a link that root or
+    this user made, such as /var/run, or those of systemd.
     """
 
     def __init__(self, path: Path) -> None:
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.path = path
         self._descriptor = _open_folder(path)
         try:
@@ -107,22 +112,57 @@ def write_through(file: IO[bytes], data: bytes) -> None:
 
 
 def _open_folder(path: Path) -> int:
-    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-    for _ in range(_MAX_LINKS):
-        try:
-            return os.open(path, flags)
-        except OSError as error:
-            if error.errno not in (errno.ELOOP, errno.ENOTDIR):
-                raise
-            link = os.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)
-            try:
-                status = os.fstat(link)
-                if not stat.S_ISLNK(status.st_mode):
-                    raise
-                if status.st_uid not in (0, os.geteuid()):
-                    text = f"{path} is a link of user {status.st_uid}: remove it, or name a folder of its own"
-                    raise OSError(errno.EPERM, text) from error
-                path = path.parent / os.readlink("", dir_fd=link)
-            finally:
-                os.close(link)
-    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+    """Return a descriptor of the folder; whoever owns a folder or a link on the way could lead us elsewhere."""
+    # In a user namespace root's own folders belong to nobody that has a number there, and / is one of them.
+    trusted = {0, os.geteuid(), os.stat("/").st_uid}
+    names = [*reversed(path.absolute().parts)]
+    way, here, links = Path("/"), -1, 0
+    try:
+        while names:
+            name = names.pop()
+            way /= name
+            last = not names
+            there = _step(here, name, 0o700 if last else 0o777)
+            status = os.fstat(there)
+            if stat.S_ISLNK(status.st_mode):
+                target = _target(way, there, status, trusted)
+                links += 1
+                if links > _MAX_LINKS:
+                    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+                names += reversed(target.parts)
+                way = way.parent
+                continue
+            if here >= 0:
+                os.close(here)
+            here = there
+            if not last:
+                refuse_strange(way, status, trusted)
+        return os.open(".", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=here)
+    finally:
+        if here >= 0:
+            os.close(here)
+
+
+def _step(here: int, name: str, mode: int) -> int:
+    """Return a descriptor of what stands under a name in a folder; nothing does: a folder is made."""
+    flags = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
+    if name.startswith("/"):
+        return os.open("/", flags)
+    try:
+        return os.open(name, flags, dir_fd=here)
+    except FileNotFoundError:
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(name, mode, dir_fd=here)
+        return os.open(name, flags, dir_fd=here)
+
+
+def _target(way: Path, link: int, status: os.stat_result, trusted: Container[int]) -> Path:
+    """Return where a link leads, and close it."""
+    try:
+        if status.st_uid not in trusted:
+            raise OSError(
+                errno.EPERM, f"{way} is a link of user {status.st_uid}: remove it, or name a folder of its own"
+            )
+        return Path(os.readlink("", dir_fd=link))
+    finally:
+        os.close(link)

@@ -51,6 +51,54 @@ def test_a_link_in_place_of_the_folder_is_followed_if_we_made_it(tmp_path: Path)
 
 
 @OTHERS
+def test_a_link_or_folder_above_it_is_judged_as_it_is(tmp_path: Path) -> None:
+    """With a link of somebody else's above it, root would make and write the folder where that leads."""
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (tmp_path / "link").symlink_to("victim")
+    folder = OwnFolder(tmp_path / "link" / "more" / "state")
+    folder.write("file", b"content")
+    folder.close()
+    assert (victim / "more" / "state" / "file").read_bytes() == b"content", "root's own, as /var/run is"
+    assert (victim / "more" / "state").stat().st_mode & 0o777 == 0o700
+    os.chown(tmp_path / "link", NOBODY, NOBODY, follow_symlinks=False)
+    with pytest.raises(StateDirError, match=f"link is a link of user {NOBODY}"):
+        StateStore(tmp_path / "link" / "other" / "state", NodeName("robot"))
+    assert not (victim / "other").exists()
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    os.chown(theirs, NOBODY, NOBODY)
+    log = EventLog(theirs / "state")
+    assert f"theirs belongs to user {NOBODY}: chown it" in log.state.problem
+    log.close()
+    assert not (theirs / "state").exists()
+
+
+def test_what_everybody_may_change_above_it_is_refused_but_not_one_such_as_tmp(tmp_path: Path) -> None:
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(OSError, match="everybody may change"):
+        OwnFolder(tmp_path / "open" / "state")
+    (tmp_path / "open").chmod(0o1777)
+    OwnFolder(tmp_path / "open" / "state").close()
+
+
+def test_links_lead_on_from_where_they_stand_and_not_in_a_circle(tmp_path: Path) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "a" / "up").symlink_to("../c")
+    (tmp_path / "whole").symlink_to(tmp_path / "a" / "up")
+    OwnFolder(tmp_path / "whole" / ".." / "a" / "b" / "state").close()
+    assert (tmp_path / "a" / "b" / "state").is_dir()
+    assert (tmp_path / "c").is_dir()
+    (tmp_path / "round").symlink_to("round")
+    with pytest.raises(OSError, match="Too many levels"):
+        OwnFolder(tmp_path / "round" / "state")
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError):
+        OwnFolder(tmp_path / "file" / "state")
+
+
+@OTHERS
 def test_a_file_that_another_user_added_is_not_read(tmp_path: Path) -> None:
     tmp_path.chmod(0o1777)
     (tmp_path / "file").write_text("forged")
