@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import io
 import os
 import signal
 import sys
@@ -34,19 +35,20 @@ def ends_quietly(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
             _have_streams()
             try:
                 try:
+                    _answer_ctrl_c()
                     return main(*args, **kwargs)
                 finally:
                     # Here, where it can be answered for: the interpreter's own at its end prints a traceback.
                     sys.stdout.flush()
             except BrokenPipeError:
-                _write_nowhere()
+                print_no_more()
                 return EXIT_NO_READER
             except KeyboardInterrupt:
                 return EXIT_INTERRUPTED
             except OSError as error:
                 if error.errno not in _NO_ROOM or error.filename is not None:
                     raise
-                _write_nowhere()
+                print_no_more()
                 sys.stderr.write(f"{name}: what it prints cannot be written: {error.strerror}\n")
                 return EXIT_FAILURE
 
@@ -68,6 +70,12 @@ def ended_by_ctrl_c() -> Iterator[None]:
             signal.signal(signal.SIGINT, before)
 
 
+def _answer_ctrl_c() -> None:
+    """Ctrl-C is an exception again, which whatever is under way may tidy up after (see `entry`)."""
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def _have_streams() -> None:
     """A shell may start us without them (>&-).
 
@@ -76,13 +84,17 @@ def _have_streams() -> None:
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= _STDERR:
         os.set_inheritable(descriptor, True)
     os.close(descriptor)
-    for stream in ("stdout", "stderr"):
-        if getattr(sys, stream) is None:
-            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper):
+            # A locale without the character must not end the program: an escape stands for it.
+            stream.reconfigure(errors="backslashreplace")
 
 
-def _write_nowhere() -> None:
-    """Let go what is still to be written, by us and by the interpreter at its end."""
+def print_no_more() -> None:
+    """Let go what is still to be written and cannot be, by us and by the interpreter at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):

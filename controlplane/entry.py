@@ -1,0 +1,13 @@
+"""Where plr-controlplane begins."""
+
+from __future__ import annotations
+
+from protos.entry import end_by_ctrl_c
+
+
+def main() -> int:
+    """Run the program; returns its exit code."""
+    end_by_ctrl_c()
+    from controlplane.__main__ import main
+
+    return main()

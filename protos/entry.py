@@ -1,0 +1,22 @@
+"""Where `plr` begins, and how all programs do: before anything else is imported, which takes a fraction of a second."""
+
+from __future__ import annotations
+
+import signal
+
+
+def end_by_ctrl_c() -> None:
+    """From now on Ctrl-C ends the program as it ends one in C, until `program.ends_quietly` answers for it.
+
+    A program that was started with Ctrl-C ignored, as in the background, goes on ignoring it.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def plr() -> int:
+    """Run `plr`; returns its exit code."""
+    end_by_ctrl_c()
+    from protos.command_line import main
+
+    return main()
