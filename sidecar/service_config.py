@@ -19,6 +19,7 @@ from sidecar.config_fields import (
     RepairShare,
     Section,
     ServicePattern,
+    ServiceType,
     converted,
     is_glob,
 )
@@ -66,6 +67,7 @@ _MAX_LIFETIME_MS = MAX_LIFETIME_S * _MS_PER_S
 
 
 _ROBOTS_KEYS = (
+    "type",
     "deadline_ms",
     "idempotent",
     "drop_late",
@@ -129,6 +131,9 @@ class ServiceConfig(Section):
 
     name: ServicePattern
     """Full name such as /plan_path, or a glob such as /arm/*."""
+    type: ServiceType | None = None
+    """Robot: its type, such as nav_msgs/srv/GetPlan: servers that offer it with another get no requests. Default: the
+    type of most servers."""
     deadline_ms: Annotated[float, Field(gt=0, le=MAX_DEADLINE_MS)] | None = None
     """Robot, required: an answer is in time within this many milliseconds."""
     lifetime_ms: Annotated[float, Field(gt=0, le=_MAX_LIFETIME_MS)] | None = None
@@ -193,6 +198,7 @@ class ServiceConfig(Section):
             deadline_s=deadline_ms / _MS_PER_S,
             lifetime_s=lifetime_ms / _MS_PER_S,
             idempotent=bool(self.idempotent),
+            type=self.type or "",
             drop_late=bool(self.drop_late),
             priority=Priority[(self.priority or PriorityWord.NORMAL).name],
             fec=_redundancy(self.fec),

@@ -320,11 +320,24 @@ class Engine:
             self.stats.nacks += 1
             return error
         self.stats.mapping_version = self.mapping.version
+        if self._config.role is Role.ROBOT:
+            self._remember_types(mapping)
         return None
+
+    def _remember_types(self, mapping: MappingSet) -> None:
+        """Servers that are mapped offer a service with the type that it has here: after a restart that is all we know,
+        and a server that offers it with another type must not win for having come first."""
+        for service in mapping.services:
+            if self._offers.knows_type(service.service):
+                continue
+            peers = [self.peers.get(server) for server in {assignment.server for assignment in service.assignments}]
+            kinds = {offer.type for peer in peers if peer for offer in peer.offers if offer.name == service.service}
+            if len(kinds) == 1:
+                self._offers.remember_type(service.service, kinds.pop())
 
     @property
     def offer_conflicts(self) -> frozenset[tuple[ServiceName, NodeName, str]]:
-        """Robot: (service, server, type) of servers left out because the others offer another type."""
+        """Robot: (service, server, type) of servers left out: the configuration, or the others, have another type."""
         return frozenset(self._offers.conflicts)
 
     def take_urgency(self) -> ReportScope | None:

@@ -8,6 +8,7 @@ requests that still wait at it.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceUse
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from sidecar.core.routes import Routes
     from sidecar.core.rules import Rules
     from sidecar.core.stats import EngineStats
+
+MAX_TYPES = 2048
+"""Services whose type in use is remembered, the one noted longest ago goes: peers invent names under a glob."""
 
 MAX_OFFERED = 512
 """Services offered on the robot; each costs DDS endpoints and a slot in every wait. One peer may have half."""
@@ -42,6 +46,8 @@ class Offers:
         """In whose share each offered service is: one of its servers then."""
         self._refused: set[ServiceName] = set()
         """Wanted, and without room at the last look."""
+        self._types: OrderedDict[ServiceName, str] = OrderedDict()
+        """The type of each service that was offered last, in this run or the one before."""
         self._by_peer: dict[NodeName, tuple[dict[ServiceName, str], bool]] = {}
         """Peer -> (the type of each service that it offers, whether it drains)."""
         self._by_service: dict[ServiceName, dict[str, dict[NodeName, bool]]] = {}
@@ -63,7 +69,7 @@ class Offers:
 
     @property
     def conflicts(self) -> set[tuple[ServiceName, NodeName, str]]:
-        """Servers left out because they offer another type than the rest."""
+        """Servers left out because they offer another type than the configuration's, or than the rest."""
         self._choose_touched()
         return {conflict for of_service in self._conflicts.values() for conflict in of_service}
 
@@ -98,6 +104,7 @@ class Offers:
                 continue
             if self._charge(name, full):
                 self._offered[name] = kind
+                self._note_type(name, kind)
                 events.append(OfferService(name, kind))
             else:
                 refused.add(name)
@@ -159,6 +166,22 @@ class Offers:
                 )
         return tuple(uses)
 
+    def knows_type(self, name: ServiceName) -> bool:
+        """Whether it is known which type the service had last."""
+        return name in self._types
+
+    def remember_type(self, name: ServiceName, kind: str) -> None:
+        """An earlier run used this type."""
+        if name not in self._types:
+            self._note_type(name, kind)
+            self._touched.add(name)
+
+    def _note_type(self, name: ServiceName, kind: str) -> None:
+        self._types[name] = kind
+        self._types.move_to_end(name)
+        if len(self._types) > MAX_TYPES:
+            self._types.popitem(last=False)
+
     def set_peer(self, peer: Peer) -> None:
         """Take what a peer offers; `update` tells what comes of it."""
         offers = {offer.name: offer.type for offer in peer.offers if self._rules.find(offer.name) is not None}
@@ -205,13 +228,18 @@ class Offers:
         if by_type is None:
             self._gained.discard(name)
             return
-        current = self._offered.get(name)
-        # Most servers win; the type already offered wins a tie, so that one odd server changes nothing.
-        kind = max(sorted(by_type), key=lambda kind: (len(by_type[kind]), kind == current))
-        if len(by_type) > 1:
-            self._conflicts[name] = {
-                (name, peer, other) for other, peers in by_type.items() if other != kind for peer in peers
-            }
+        rule = self._rules.find(name)
+        kind = rule.type if rule is not None else ""
+        if not kind:
+            last = self._types.get(name)
+            # Most servers win; the type used last wins a tie, so that one odd server changes nothing.
+            kind = max(sorted(by_type), key=lambda kind: (len(by_type[kind]), kind == last))
+        odd = {(name, peer, other) for other, peers in by_type.items() if other != kind for peer in peers}
+        if odd:
+            self._conflicts[name] = odd
+        if kind not in by_type:
+            self._gained.discard(name)
+            return
         fresh = [peer for peer, drains in by_type[kind].items() if not drains]
         servers = tuple(fresh or by_type[kind])
         self._wanted[name] = kind, servers

@@ -60,6 +60,8 @@ class ServiceRule:
     """A request without a response is given up after this long, at most MAX_LIFETIME_S."""
     idempotent: bool = False
     """Copies of one request may run on several servers."""
+    type: str = ""
+    """Robot: the type that servers have to offer it with; empty: that of most of them."""
     drop_late: bool = False
     """A response after the deadline is not delivered."""
     priority: Priority = Priority.NORMAL

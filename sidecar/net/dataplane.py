@@ -249,7 +249,12 @@ class ThreadedDataPlane:
                 log.warning("%s: what the control plane tells of its addresses is not used: %s", name, why)
         self._logged_candidates = ignored
         for service, server, kind in sorted(conflicts - self._logged_conflicts):
-            log.warning("%s at %s has type %s, unlike the other servers: it gets no requests", service, server, kind)
+            log.warning(
+                "%s at %s has type %s, unlike the configuration or the other servers: it gets no requests",
+                service,
+                server,
+                kind,
+            )
         self._logged_conflicts = conflicts
 
     def _judge(self, peers: Iterable[Peer]) -> list[Peer]:

@@ -355,6 +355,22 @@ def test_a_flood_of_restarts_makes_little_work() -> None:
     assert len([command for command in sidecar.take()[0] if isinstance(command, SetPeers)]) == 1
 
 
+@pytest.mark.audit("ops-16")
+def test_what_a_mapping_of_the_run_before_rests_on_says_which_type_a_service_has() -> None:
+    """The rogue one comes first in each order: of the alphabet, of peers, of paths."""
+    engine = Engine(EngineConfig(Role.ROBOT, (rule("/*"),)), session_of("me", Role.ROBOT, 99), 0.0)
+    engine.set_interfaces([WLAN], 0.0)
+    peers = (peer(A, offers=(ServiceOffer(ECHO, "a/srv/A"),)), peer(B, session=2))
+    assert engine.apply_peers(PeerSet(Version(1), 1, peers), 0.0) is None
+    mapped = ServiceMapping(ECHO, (Assignment(WLAN, B),))
+    assert engine.apply_mapping(MappingSet(Version(1), 1, (mapped,))) is None
+    assert engine.apply_mapping(MappingSet(Version(2), 1, ())) is None, "as a robot that restarted is told first"
+    for server in (A, B):
+        engine.on_link_event(PathChanged(path(WLAN, server), PathState.UP, ""), 0.1)
+    offered = [event for event in engine.take_events() if isinstance(event, OfferService)]
+    assert offered == [OfferService(ECHO, TYPE)]
+
+
 def test_versions_and_refusals_are_counted() -> None:
     sidecar = robot()
     sidecar.view(peer(A), version=5)

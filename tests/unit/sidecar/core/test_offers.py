@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from protos.model import Peer, ServiceName, ServiceOffer
+from sidecar.core import offers
 from sidecar.core.events import OfferService, WithdrawService
 from sidecar.core.offers import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
 from sidecar.core.path_id import PathState
@@ -22,10 +24,10 @@ OTHER_TYPE = (ServiceOffer(ECHO, "t/srv/Other"),)
 class Robot:
     """Offers over routes that the test sets."""
 
-    def __init__(self, *peers: Peer, pattern: str = ECHO, lifetime_s: float = 10.0) -> None:
+    def __init__(self, *peers: Peer, pattern: str = ECHO, lifetime_s: float = 10.0, kind: str = "") -> None:
         self.routes = Routes()
         self.stats = EngineStats()
-        self.offers = Offers(Rules((rule(pattern, lifetime_s=lifetime_s),)), self.stats)
+        self.offers = Offers(Rules((replace(rule(pattern, lifetime_s=lifetime_s), type=kind),)), self.stats)
         for known in (A, B):
             self.reach(known)
         self.set_peers(peers)
@@ -144,6 +146,44 @@ def test_in_a_tie_the_type_already_offered_stays() -> None:
         robot.set_peers([peer(A, offers=(first,)), peer(B, session=2, offers=(second,))])
         assert robot.update() == []
         assert robot.offers.servers(ECHO) == (A,)
+
+
+@pytest.mark.audit("ops-16")
+def test_after_a_restart_the_type_of_the_run_before_wins_a_tie_whoever_comes_first() -> None:
+    """A rogue server that offers the service with another type may have a path before the real one."""
+    rogue, real = peer(A, offers=(ServiceOffer(ECHO, "a/srv/A"),)), peer(B, session=2)
+    robot = Robot(rogue, real)
+    robot.offers.remember_type(ECHO, TYPE)
+    assert robot.update() == [OfferService(ECHO, TYPE)]
+    assert robot.offers.servers(ECHO) == (B,)
+    for known in (A, B):
+        robot.reach(known, PathState.DOWN)
+    robot.update(10.0)
+    robot.update(10.0 + WITHDRAW_AFTER_S)
+    assert robot.offers.offered == {}
+    for known in (A, B):
+        robot.reach(known)
+    assert robot.update(99.0) == [OfferService(ECHO, TYPE)], "nor after all was dark"
+
+
+@pytest.mark.audit("ops-16")
+def test_the_type_of_the_configuration_stands_against_any_number_of_servers() -> None:
+    robot = Robot(peer(A, offers=OTHER_TYPE), peer(B, session=2, offers=OTHER_TYPE), kind=TYPE)
+    assert robot.update() == []
+    assert robot.offers.servers(ECHO) == ()
+    assert robot.offers.conflicts == {(ECHO, A, "t/srv/Other"), (ECHO, B, "t/srv/Other")}
+    robot.set_peers([peer(A, offers=OTHER_TYPE), peer(B, session=2)])
+    assert robot.update() == [OfferService(ECHO, TYPE)]
+    assert robot.offers.servers(ECHO) == (B,)
+
+
+def test_types_of_names_that_peers_invent_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(offers, "MAX_TYPES", 2)
+    robot = Robot(pattern="/*")
+    names = [ServiceName(f"/s{number}") for number in range(3)]
+    for name in names:
+        robot.offers.remember_type(name, TYPE)
+    assert [robot.offers.knows_type(name) for name in names] == [False, True, True]
 
 
 def test_when_the_type_changes_the_old_offer_goes_and_the_new_one_comes() -> None:
