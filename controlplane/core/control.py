@@ -8,11 +8,10 @@ after each call it drains `next_event`. Times are monotonic seconds.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, assert_never
 
-from controlplane.core import returning
 from controlplane.core.control_events import (
     Close,
     CloseReason,
@@ -73,7 +72,7 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Set
+    from collections.abc import Callable, Collection, Iterable, Iterator, Set
 
     from controlplane.core.policy import Policy
     from controlplane.core.registry import Sidecar
@@ -268,16 +267,24 @@ class ControlCore:
 
     def _note_goodbyes(self, robot: NodeName, servers: Iterable[NodeName]) -> None:
         """What a robot knows of those that went while the control plane was away, and that it may call."""
+        could_say = None
         for name in servers:
             if not self.permits.may_know(robot, name):
                 self.counters.report_entries_forbidden += 1
                 continue
-            self._returning.said_goodbye(name)
             gone = self.departed.get(name)
-            if gone is not None and gone.role is Role.CLOUD and gone.text == returning.TEXT:
-                stopped = returning.was_stopped(gone)
-                self.departed.note(stopped)
-                self._events.append(DepartureNotice(name, stopped))
+            if self._returning.said_goodbye(name, robot) and gone is not None:
+                could_say = could_say or self._could_say()
+                judged = self._returning.judged(gone, could_say)
+                self.departed.note(judged)
+                if judged.why is not gone.why:
+                    self._events.append(DepartureNotice(name, judged))
+
+    def _could_say(self) -> Callable[[NodeName], int]:
+        """Returns what tells how many of the robots that are there may call a server."""
+        groups = Counter(self.permits.group(one.name) for one in self.registry if one.role is Role.ROBOT)
+        may_know = self.permits.group_may_know
+        return lambda server: sum(count for group, count in groups.items() if may_know(group, server))
 
     def _receive_ack(self, name: NodeName, ack: Ack) -> None:
         if self._publisher.acked(name, ack):
@@ -434,7 +441,7 @@ class ControlCore:
             self._close(sidecar.stream, CloseReason.LEASE_EXPIRED, now)
             self._forget(sidecar, RemovalReason.LEASE_EXPIRED, now)
             self._members_changed(now, sidecar.role)
-        for gone in self._returning.missing(now):
+        for gone in self._returning.missing(now, self._could_say):
             self.departed.note(gone)
             self._events.append(DepartureNotice(gone.name, gone))
         for name, stream, waited in self.restlessness.due(now):

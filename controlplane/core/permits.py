@@ -84,9 +84,13 @@ class Permits:
 
     def may_know(self, robot: NodeName, cloud: NodeName) -> bool:
         """Whether a robot may call anything on a cloud of which no more is known than its name."""
+        return self.group_may_know(self.group(robot), cloud)
+
+    def group_may_know(self, group: Group, cloud: NodeName) -> bool:
+        """The same of all robots of a group."""
         if self._policy is None:
             return True
-        return any(self._policy.calls[index].leads_to(cloud) for index in self.group(robot))
+        return any(self._policy.calls[index].leads_to(cloud) for index in group)
 
     def may_offer(self, cloud: NodeName, service: ServiceName) -> bool:
         """Whether a cloud may offer a service."""

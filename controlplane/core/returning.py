@@ -1,5 +1,8 @@
 """Who was there before the control plane was restarted, and is not back yet: nobody's lease tells of these.
 
+Whether a server was stopped in order meanwhile, only robots know. A robot may lie, to hide that a server died, so one
+alone is believed only where there is no other that could say it; and it is said by whom it is known.
+
 Times are monotonic seconds.
 """
 
@@ -12,19 +15,18 @@ from protos.fleet_events import Why
 from protos.model import Role
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Collection, Iterable
 
     from controlplane.core.departed import Departure
     from protos.model import NodeName
 
 TEXT = "it was there before the control plane was restarted, and did not come back"
 
-GOODBYE_TEXT = "it said goodbye to robots while the control plane was away"
+ENOUGH_WITNESSES = 2
+"""Robots that say of a server that it said goodbye, where there are as many that may call it."""
 
-
-def was_stopped(gone: Departure) -> Departure:
-    """The same of one that was stopped in order."""
-    return replace(gone, why=Why.DRAINED, text=GOODBYE_TEXT)
+MAX_WITNESSES = 8
+"""Robots named; whatever further ones say is no news."""
 
 
 class Returning:
@@ -32,8 +34,10 @@ class Returning:
 
     def __init__(self) -> None:
         self._awaited: dict[NodeName, Departure] = {}
-        self._stopped: set[NodeName] = set()
-        """Of those, by what robots say."""
+        self._given_up: set[NodeName] = set()
+        """Servers that did not come back in time, and of which it is not believed that they were stopped."""
+        self._witnesses: dict[NodeName, list[NodeName]] = {}
+        """Of awaited servers and those given up: robots that say that it said goodbye."""
         self.until: float | None = None
         """When to ask who is `missing`; None while nobody is awaited."""
 
@@ -44,28 +48,54 @@ class Returning:
     def expect(self, present: Iterable[Departure], until: float) -> None:
         """These were there; they are noted as departures should they not come back until then."""
         self._awaited = {one.name: one for one in present}
-        self._stopped.clear()
+        self._given_up.clear()
+        self._witnesses.clear()
         self.until = until if self._awaited else None
 
     def is_back(self, name: NodeName) -> None:
         """It is registered."""
         self._awaited.pop(name, None)
+        self._given_up.discard(name)
+        self._witnesses.pop(name, None)
 
-    def said_goodbye(self, name: NodeName) -> None:
-        """A robot says so of a server."""
-        awaited = self._awaited.get(name)
-        if awaited is not None and awaited.role is Role.CLOUD:
-            self._stopped.add(name)
+    def said_goodbye(self, server: NodeName, robot: NodeName) -> bool:
+        """A robot says so of a server; whether that is news of one that was given up."""
+        awaited = self._awaited.get(server)
+        if (awaited is None or awaited.role is not Role.CLOUD) and server not in self._given_up:
+            return False
+        witnesses = self._witnesses.setdefault(server, [])
+        if robot in witnesses or len(witnesses) >= MAX_WITNESSES:
+            return False
+        witnesses.append(robot)
+        return server in self._given_up
 
-    def missing(self, now: float) -> list[Departure]:
-        """Those that did not come back in time, each once."""
+    def judged(self, gone: Departure, could_say: Callable[[NodeName], int]) -> Departure:
+        """A server's departure as it is to be noted, by what robots say of it.
+
+        `could_say` counts the robots that may call a server.
+        """
+        witnesses = self._witnesses.get(gone.name, ())
+        if witnesses and len(witnesses) >= min(could_say(gone.name), ENOUGH_WITNESSES):
+            self._given_up.discard(gone.name)
+            del self._witnesses[gone.name]
+            text = f"by what {_named(witnesses)} told, it said goodbye while the control plane was away"
+            return replace(gone, why=Why.DRAINED, text=text)
+        self._given_up.add(gone.name)
+        doubt = f"; {_named(witnesses)} alone told that it said goodbye" if witnesses else ""
+        return replace(gone, text=TEXT + doubt)
+
+    def missing(self, now: float, who_could_say: Callable[[], Callable[[NodeName], int]]) -> list[Departure]:
+        """Those that did not come back in time, each once; `who_could_say` returns what `judged` asks."""
         if self.until is None or self.until > now:
             return []
-        gone = [
-            was_stopped(replace(one, at=now)) if one.name in self._stopped else replace(one, at=now, text=TEXT)
-            for one in self._awaited.values()
-        ]
-        self._awaited.clear()
-        self._stopped.clear()
+        could_say = who_could_say()
+        awaited, self._awaited = self._awaited, {}
         self.until = None
-        return gone
+        return [
+            self.judged(replace(one, at=now), could_say) if one.role is Role.CLOUD else replace(one, at=now, text=TEXT)
+            for one in awaited.values()
+        ]
+
+
+def _named(robots: Collection[NodeName]) -> str:
+    return ", ".join(robots)

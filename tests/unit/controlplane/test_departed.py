@@ -191,6 +191,26 @@ def test_a_robot_says_who_was_stopped_of_servers_alone_and_of_those_that_it_may_
     assert world.core.counters.report_entries_forbidden == 3
 
 
+@pytest.mark.audit("ops-16")
+def test_one_robot_of_several_hides_no_dead_server_and_two_are_believed() -> None:
+    world = World(Settings(warm_up_s=5.0))
+    world.core.remember([], [replace(departure(name), role=Role.CLOUD) for name in ("soon", "late")], world.now)
+    liar, other = world.robot(), world.robot("other")
+    for _ in range(3):
+        world.say(liar, Report(goodbyes=(NodeName("soon"), NodeName("late"))))
+    world.say(other, Report(goodbyes=(NodeName("soon"),)))
+    world.run(5.0 + world.settings.lease_s + 1.0)
+    assert why(world) == {"soon": Why.DRAINED, "late": Why.LEASE_EXPIRED}
+    texts = {str(gone.name): gone.text for gone in world.core.departed}
+    assert texts["soon"] == "by what robot, other told, it said goodbye while the control plane was away"
+    assert texts["late"].endswith("did not come back; robot alone told that it said goodbye")
+    world.say(liar, Report(goodbyes=(NodeName("late"),)))
+    assert why(world)["late"] is Why.LEASE_EXPIRED
+    world.say(other, Report(goodbyes=(NodeName("late"),)))
+    assert why(world)["late"] is Why.DRAINED
+    assert world.departed == ["soon", "late", "late"]
+
+
 def test_no_robot_says_of_others_that_they_were_stopped(world: World) -> None:
     """Of those that the control plane itself has seen go it knows better."""
     robot = world.robot()
