@@ -31,27 +31,6 @@ BYTES_PER_TOKEN = 16 << 10
 """A message costs one token, and one more for each so many bytes."""
 
 
-ENTRIES_PER_S = 2000.0
-"""Entries of reports, each some 40 us to take at most: a robot with 8 interfaces that calls 4 services on 16 servers
-reports 1300 a second."""
-
-ENTRIES_BURST = 20_000.0
-"""One report as large as can be, and half of another."""
-
-
-class ReportPace:
-    """How fast the reports of one stream are read: what is not read waits where it is sent."""
-
-    def __init__(self) -> None:
-        self._paid_until = float("-inf")
-
-    def wait_s(self, entries: int, now: float) -> float:
-        """For how long nothing more is to be read after a report of so many entries."""
-        earliest = now - ENTRIES_BURST / ENTRIES_PER_S
-        self._paid_until = max(self._paid_until, earliest) + entries / ENTRIES_PER_S
-        return max(0.0, self._paid_until - now)
-
-
 class StreamRate:
     """How fast one stream may speak: its messages, weighted by size, and what its reports need at their interval."""
 

@@ -23,10 +23,12 @@ from controlplane.core.control_events import (
     StreamLostNotice,
     UnmetNotice,
 )
+from controlplane.core.line_share import LineShare
 from controlplane.core.plan import Plan
 from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
+from controlplane.core.report_share import ReportShares
 from controlplane.earliest_end import EarliestEnd
 from controlplane.fleet_metrics import MAX_GONE, Fleet
 from controlplane.garbage import Collector
@@ -165,8 +167,8 @@ class ControlLoop:
         """Since the loop was last busy; at QUIET_LOOKS the solver is ready."""
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
         self._garbage = Collector()
-        self.reports_slowed = 0
-        """Times that a stream was not read for a while, as its reports had more entries than its share."""
+        self.report_shares = ReportShares()
+        self._lines = LineShare()
         self.stun_servers: list[StunServer] = []
         self.has_unread: Callable[[NodeName, float], bool] = lambda name, since: False
         """Whether something of a member is there that came later than what was read of it at this time."""
@@ -187,7 +189,9 @@ class ControlLoop:
         if caller is not None:
             self._callers[registration.name] = caller
             self._earliest_end.note(caller.identity.not_after)
-        log.info(
+        self._say(
+            logging.INFO,
+            registration.name,
             "%s (%s, incarnation %d, software %s) connected",
             registration.name,
             registration.role.value,
@@ -285,7 +289,9 @@ class ControlLoop:
                     if stream in self._mailboxes:
                         self._mailboxes[stream].close(reason)
                 case NackNotice(sidecar=name, nack=nack):
-                    log.warning(
+                    self._say(
+                        logging.WARNING,
+                        name,
                         "%s refuses its %s, keeps version %d: %s",
                         name,
                         nack.resource.value,
@@ -294,7 +300,9 @@ class ControlLoop:
                     )
                     self._record(EventKind.NACK, name, f"{nack.resource.value}: {nack.error}")
                 case OffersRefusedNotice(sidecar=name, services=services):
-                    log.warning(
+                    self._say(
+                        logging.WARNING,
+                        name,
                         "%s offers %s, which the policy does not let it: told to no robot; missing under offers: %s",
                         name,
                         _few(services),
@@ -304,21 +312,30 @@ class ControlLoop:
                 case UnmetNotice(sidecar=name, services=services):
                     self._record(EventKind.UNMET, name, _few(services))
                 case DepartureNotice(sidecar=name, departure=gone):
-                    log.info("%s is gone: %s", name, gone.why.value)
+                    self._say(logging.INFO, name, "%s is gone: %s", name, gone.why.value)
                     seen_s = max(0.0, self._loop.time() - gone.seen_at)
                     self.events.record(EventKind.DEPARTED, name, gone.text, role=gone.role, why=gone.why, seen_s=seen_s)
                     self._callers.pop(name, None)
                 case StreamLostNotice(sidecar=name, role=role) if not self._closing:
                     self.events.record(EventKind.STREAM_LOST, name, role=role)
                 case CutOffNotice(sidecar=name, role=role, lifted=lifted):
-                    log.log(
+                    self._say(
                         logging.INFO if lifted else logging.WARNING,
+                        name,
                         "%s: the policy leaves it %s to talk to",
                         name,
                         "somebody" if lifted else "nobody",
                     )
                     self.events.record(EventKind.REJOINED if lifted else EventKind.CUT_OFF, name, role=role)
         self._wake.set()
+
+    def _say(self, level: int, member: str, text: str, *values: object) -> None:
+        """Log a line that a member causes, as often as it wants, within its share of lines."""
+        left_out = self._lines.take(member, self._loop.time())
+        if left_out:
+            text, values = f"{text} (%d lines on it were left out before)", (*values, left_out)
+        if left_out is not None:
+            log.log(level, text, *values)
 
     def _record(self, kind: EventKind, name: NodeName, text: str) -> None:
         sidecar = self._core.registry.get(name)
@@ -366,18 +383,25 @@ class ControlLoop:
         """Count a connection or call that was refused or ended, by one of metrics.REFUSAL_REASONS."""
         self._metrics.refused_connection(reason)
 
-    def unknown_message(self, peer: str, problem: str, *, again: bool) -> None:
+    def unknown_message(self, who: str, problem: str, *, again: bool) -> None:
         """Count a message that was left out; `again`: not the first of its stream, whose line stands in the log."""
         self._metrics.unknown_messages.inc()
         if not again and self._ended_lines.take(self._loop.time()):
-            log.info("stream of %s: left out %s", peer, problem)
+            self._say(logging.INFO, who, "stream of %s: left out %s", who, problem)
 
-    def stream_ended(self, peer: str, code: str, details: str) -> None:
-        """A stream was ended by us; `peer` is where it came from."""
+    def stream_ended(self, who: str, address: str, code: str, details: str) -> None:
+        """A stream was ended by us; `who` is the member, if that is known, and `address` where it came from."""
         self._metrics.streams_ended.labels(code).inc()
         # A member that breaks the rules as often as it can must not fill the disk; the counter tells how often.
         if self._ended_lines.take(self._loop.time()):
-            log.warning("stream of %s ended: %s: %s", peer, code, details)
+            self._say(
+                logging.WARNING,
+                who,
+                "stream of %s ended: %s: %s",
+                address if who == address else f"{who} at {address}",
+                code,
+                details,
+            )
 
     # ── the loop ──
 
@@ -398,6 +422,8 @@ class ControlLoop:
                 if now >= metrics_at:
                     share = used.share(time.thread_time(), now)
                     self._core.follow_load(now, share)
+                    if share is not None:
+                        self.report_shares.follow(share, now)
                     self._prepare_if_quiet(share)
                     self.update_metrics()
                     self._garbage.look_if_worth(len(self._core.registry))
@@ -461,7 +487,11 @@ class ControlLoop:
     def update_metrics(self) -> None:
         """Leave the values of this moment for whoever scrapes."""
         superseded = self._superseded + sum(mailbox.superseded for mailbox in self._mailboxes.values())
-        self._metrics.update(self._core, self.stun_servers, superseded, self.events.state, self.reports_slowed)
+        self._metrics.update(self._core, self.stun_servers, superseded, self.events.state, self._dropped())
+
+    def _dropped(self) -> dict[str, int]:
+        """What the driver itself left out or put off, by reason."""
+        return {"report_slowed": self.report_shares.slowed, "log_line_left_out": self._lines.left_out}
 
     def close_streams(self) -> None:
         """Tell every stream that the control plane stops."""

@@ -39,6 +39,8 @@ SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 
 NO_EVENTS = EventLogState()
 
+NOTHING_DROPPED: Mapping[str, int] = {"report_slowed": 0, "log_line_left_out": 0}
+
 REFUSAL_REASONS = (
     identity.MALFORMED,
     identity.UNTRUSTED,
@@ -135,14 +137,14 @@ class Metrics:
         stun_servers: Sequence[StunServer],
         superseded: int,
         events: EventLogState = NO_EVENTS,
-        reports_slowed: int = 0,
+        dropped: Mapping[str, int] = NOTHING_DROPPED,
     ) -> None:
         """Take the values of this moment."""
         self._values.families = (
             *_members(core),
             *_sync(core),
             *_plan(core),
-            *_drops(core, superseded, reports_slowed, events),
+            *_drops(core, superseded, dropped, events),
             *_events(events),
             *_stun(stun_servers),
             *_certificate(self._own),
@@ -262,7 +264,7 @@ def _plan(core: ControlCore) -> Iterable[Metric]:
     yield _counter("plr_reports_total", "Reports merged.", [], {(): core.counters.reports})
 
 
-def _drops(core: ControlCore, superseded: int, reports_slowed: int, events: EventLogState) -> Iterable[Metric]:
+def _drops(core: ControlCore, superseded: int, dropped: Mapping[str, int], events: EventLogState) -> Iterable[Metric]:
     yield _counter(
         "plr_control_dropped_total",
         "What was dropped, by reason.",
@@ -283,7 +285,7 @@ def _drops(core: ControlCore, superseded: int, reports_slowed: int, events: Even
             ("announced_too_often",): core.restlessness.held,
             ("urgent_too_often",): core.urgency.held,
             ("interface_left_out",): core.counters.interfaces_left_out,
-            ("report_slowed",): reports_slowed,
+            **{(reason,): count for reason, count in dropped.items()},
             ("superseded_before_sent",): superseded,
         },
     )

@@ -15,7 +15,6 @@ from controlplane.limits import (
     MAX_STREAMS_PER_NAME,
     TOO_FAST,
     TOO_MANY_STREAMS,
-    ReportPace,
     StreamCount,
     StreamRate,
 )
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from controlplane.loop import ControlLoop
     from controlplane.mailbox import Mailbox
     from controlplane.tls_gate import Caller, TlsGate
-    from protos.model import SidecarMessage
+    from protos.model import NodeName, SidecarMessage
 
     Context = grpc.aio.ServicerContext[bytes, bytes]
 
@@ -48,6 +47,9 @@ REGISTER_TIMEOUT_S = 10.0
 
 REGISTERED_AT_ONCE = 4
 """In one turn of the loop."""
+
+LOOK_AGAIN_S = 1.0
+"""How long a member that sent too much is left alone at most, before its share is looked at again."""
 
 SHORT_BYTES = 4096
 """A message up to this long is taken at once."""
@@ -108,9 +110,11 @@ class ControlPlaneService:
 
     async def connect(self, _: object, context: Context) -> None:
         """Serve one stream until either side ends it."""
+        who = context.peer()
         try:
             caller = self._caller_of(context)
-            who = context.peer() if caller is None else caller.identity.name
+            if caller is not None:
+                who = caller.identity.name
             if not self._streams.enter(who):
                 self._loop.refused(TOO_MANY_STREAMS)
                 raise _StreamEndError(
@@ -122,19 +126,20 @@ class ControlPlaneService:
                 self._streams.leave(who)
         except _StreamEndError as end:
             if end.code is not None:
-                self._loop.stream_ended(context.peer(), end.code.name.lower(), end.details)
+                address = context.peer() if self._gate is None else self._gate.address(context.peer())
+                self._loop.stream_ended(who, address, end.code.name.lower(), end.details)
                 await context.abort(end.code, end.details)
 
     async def _serve(self, context: Context, caller: Caller | None) -> NoReturn:
         try:
-            stream, mailbox, incremental = await self._register(context, caller)
+            name, stream, mailbox, incremental = await self._register(context, caller)
         finally:
             if self._gate is not None:
                 self._gate.is_served(context.peer())
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._write(mailbox, context, incremental=incremental))
-                tasks.create_task(self._read(stream, context))
+                tasks.create_task(self._read(name, stream, context))
         except BaseExceptionGroup as group:
             end = _only_end(group)
             if end is None:
@@ -145,8 +150,8 @@ class ControlPlaneService:
             self._loop.disconnected(stream)
         raise _StreamEndError(*end)
 
-    async def _register(self, context: Context, caller: Caller | None) -> tuple[StreamId, Mailbox, bool]:
-        """Returns the stream, what to write to it, and whether it takes changes."""
+    async def _register(self, context: Context, caller: Caller | None) -> tuple[NodeName, StreamId, Mailbox, bool]:
+        """Returns whose stream it is, which, what to write to it, and whether it takes changes."""
         try:
             async with asyncio.timeout(REGISTER_TIMEOUT_S):
                 found = _first_message(await self._receive(context))
@@ -161,7 +166,7 @@ class ControlPlaneService:
             result = self._loop.register(registration, caller)
         if isinstance(result, Refusal):
             raise _StreamEndError(_REFUSAL_CODES[result], f"{registration.name}: {result.value}")
-        return *result, registration.incremental
+        return registration.name, *result, registration.incremental
 
     def _caller_of(self, context: Context) -> Caller | None:
         if self._gate is None:
@@ -179,11 +184,11 @@ class ControlPlaneService:
             raise _StreamEndError(None, "the sidecar ended the stream")
         return data
 
-    async def _read(self, stream: StreamId, context: Context) -> NoReturn:
+    async def _read(self, name: NodeName, stream: StreamId, context: Context) -> NoReturn:
         told = False
         malformed: str | None = None
         rate = StreamRate(report_interval_s=self._report_interval_s, now=time.monotonic())
-        pace = ReportPace()
+        shares = self._loop.report_shares
         while True:
             data = await self._receive(context)
             if not rate.take(len(data), time.monotonic()):
@@ -194,7 +199,7 @@ class ControlPlaneService:
                 try:
                     parts = await self._parse(data)
                 except UnknownKindError as error:
-                    self._loop.unknown_message(context.peer(), str(error), again=told)
+                    self._loop.unknown_message(name, str(error), again=told)
                     told, parts = True, [Heartbeat()]
                 if len(parts) == 1:
                     self._loop.receive(stream, parts[0])
@@ -207,10 +212,9 @@ class ControlPlaneService:
                 # Out here: an error holds all that was parsed where it was raised, and so would this one.
                 raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, malformed)
             entries = sum(report_entries(part) for part in parts if isinstance(part, Report))
-            wait_s = pace.wait_s(entries, time.monotonic())
-            if wait_s:
-                self._loop.reports_slowed += 1
-                await asyncio.sleep(wait_s)
+            if entries and shares.take(name, entries, time.monotonic()):
+                while wait_s := shares.wait_s(name, time.monotonic()):  # noqa: ASYNC110 - the load may be over sooner
+                    await asyncio.sleep(min(wait_s, LOOK_AGAIN_S))
 
     async def _parse(self, data: bytes) -> list[SidecarMessage]:
         """A message; a long report in parts, in turns with whatever else is due."""

@@ -206,6 +206,12 @@ class TlsGate:
         connection = self._connections.get(peer)
         return None if connection is None else connection.caller
 
+    def address(self, peer: str) -> str:
+        """Where the connection that gRPC calls `peer` comes from; that name itself if it has ended."""
+        connection = self._connections.get(peer)
+        known = None if connection is None else connection.outside.transport.get_extra_info("peername")
+        return str(known[0]) if known else peer
+
     def is_served(self, peer: str) -> None:
         """This one has what it came for, registered or refused: the next one may come."""
         connection = self._connections.get(peer)

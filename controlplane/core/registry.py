@@ -55,7 +55,10 @@ class Refusal(enum.Enum):
     """Why a registration is not accepted."""
 
     OLDER_INCARNATION = "a newer incarnation of this name is registered"
-    NAME_TAKEN = "another sidecar holds this name, and its lease has not ended"
+    NAME_TAKEN = (
+        "another sidecar holds this name, and its lease has not ended: issue a certificate of its own to each node "
+        "(plr ca issue); one that was set up anew gets in when the lease has ended"
+    )
     SESSION_TAKEN = "another sidecar has this session number: draw a new one"
     FULL = f"{MAX_SIDECARS} sidecars are registered, which is the limit"
     TOO_OFTEN = "it registers too often: see why it starts or loses its connection all the time"

@@ -9,6 +9,7 @@ import grpc
 import pytest
 
 from controlplane import service as module
+from controlplane.core.report_share import ReportShares
 from controlplane.limits import MAX_FIRST_BYTES
 from controlplane.mailbox import Mailbox
 from controlplane.service import ControlPlaneService
@@ -27,6 +28,7 @@ class Loop:
 
     def __init__(self) -> None:
         self.gone: list[object] = []
+        self.report_shares = ReportShares()
 
     def register(self, *_: object) -> tuple[int, Mailbox]:
         mailbox = Mailbox()

@@ -5,29 +5,15 @@ from __future__ import annotations
 import pytest
 
 from controlplane.limits import (
-    ENTRIES_BURST,
-    ENTRIES_PER_S,
     MAX_MESSAGE_BYTES,
     MAX_STREAMS_PER_NAME,
     MESSAGES_BURST,
     MESSAGES_PER_S,
-    ReportPace,
     StreamCount,
     StreamRate,
 )
-from protos.convert.fields import MAX_OUTCOMES
 from protos.convert.reports import report_entries
-from protos.model import (
-    MAX_GOODBYES,
-    MAX_JOINTS,
-    MAX_LATENCIES,
-    MAX_PATHS,
-    MAX_PENALTIES,
-    NodeName,
-    OutcomeReport,
-    PenaltyReport,
-    Report,
-)
+from protos.model import NodeName, OutcomeReport, PenaltyReport, Report
 from tests.unit.controlplane.samples import PLAN
 
 
@@ -61,20 +47,6 @@ def test_streams_are_counted_by_name_and_forgotten_when_they_end() -> None:
     streams.leave("a")
     assert streams.enter("a")
     assert not streams.enter("a")
-
-
-@pytest.mark.audit("ops-20")
-def test_reports_of_a_large_robot_are_read_at_once_and_of_more_at_a_bearable_pace() -> None:
-    pace = ReportPace()
-    large = 8 * 16 * (4 + 1)
-    assert not any(pace.wait_s(large, second / 2) for second in range(100)), "8 interfaces, 16 servers, 4 services"
-    largest = MAX_LATENCIES + MAX_PATHS + MAX_OUTCOMES + 2 * MAX_JOINTS + MAX_PENALTIES + MAX_GOODBYES
-    assert not pace.wait_s(largest, 60.0), "the largest there is"
-    now, entries = 100.0, 0
-    while now < 200.0:
-        now += pace.wait_s(1600, now) + 0.01
-        entries += 1600
-    assert entries <= ENTRIES_BURST + 100.0 * ENTRIES_PER_S + 1600
 
 
 @pytest.mark.audit("ops-16")

@@ -1,0 +1,29 @@
+from __future__ import annotations
+
+import pytest
+
+from controlplane.core import line_share
+from controlplane.core.line_share import LINES_BURST, LINES_PER_S, LineShare
+
+
+@pytest.mark.audit("ops-16")
+def test_one_that_registers_every_second_fills_no_log_and_is_counted() -> None:
+    lines = LineShare()
+    day_s = 86_400
+    told = [left_out for second in range(day_s) if (left_out := lines.take("robot", float(second))) is not None]
+    assert len(told) <= LINES_BURST + day_s * LINES_PER_S + 1
+    assert len(told) + lines.left_out == day_s
+    assert lines.left_out - 1 / LINES_PER_S <= sum(told) <= lines.left_out
+    assert told[int(LINES_BURST) + 1] == pytest.approx(1.0 / LINES_PER_S, abs=2.0), "the line says how many"
+    assert lines.take("another", float(day_s)) == 0
+
+
+def test_the_table_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line_share, "MAX_MEMBERS", 2)
+    lines = LineShare()
+    for _ in range(int(LINES_BURST) + 1):
+        lines.take("a", 0.0)
+    assert lines.take("a", 0.0) is None
+    lines.take("b", 0.0)
+    lines.take("c", 0.0)
+    assert lines.take("a", 0.0) == 0, "forgotten, and counted anew"
