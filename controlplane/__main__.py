@@ -19,13 +19,14 @@ import signal
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from protos import extras, interpreter, program
 
 with extras.required("plr-controlplane", "controlplane"):
     from controlplane.certificates import load_own_files
     from controlplane.config import load_config, refuse_exposed
+    from protos.arguments import OneLineParser
     from protos.certificate_term import term_problem
     from protos.errors import ConfigError
     from protos.log_lines import line_formatter
@@ -50,11 +51,6 @@ _NO_STUN_SERVERS = (
 )
 
 log = logging.getLogger("controlplane")
-
-
-class _OneLineParser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        self.exit(EXIT_USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 @program.ends_quietly("plr-controlplane")
@@ -124,7 +120,7 @@ def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> 
 
 def _parser() -> argparse.ArgumentParser:
     summary, _, epilog = (__doc__ or "").partition("\n\n")
-    parser = _OneLineParser(
+    parser = OneLineParser(
         prog="plr-controlplane",
         description=summary,
         epilog=epilog,

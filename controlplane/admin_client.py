@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import grpc
 
 from protos import tls_advice
+from protos.arguments import number
 from protos.errors import ConfigError, DecodeError
 from protos.host_port import check_remote
 from protos.identity import CONTROL_PLANE_DNS
@@ -26,6 +27,8 @@ A = TypeVar("A")
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 
+MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 3600.0
+
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 
@@ -36,6 +39,12 @@ _OPTIONS = (
     ("grpc.enable_http_proxy", 0),
     # Whatever its address: the name in the certificate of every control plane of the fleet.
     ("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),
+)
+
+
+_NO_IDENTITY = (
+    "expected --tls-dir DIR, the folder with your operator's certificate (have one issued: plr ca issue NAME --role "
+    "operator), or --insecure for a control plane without TLS"
 )
 
 
@@ -50,12 +59,12 @@ class AskError(Exception):
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that say which control plane is asked, by whom, and how the answer is printed."""
     parser.add_argument("--address", type=_address, default=DEFAULT_ADDRESS, metavar="HOST:PORT")
-    security = parser.add_mutually_exclusive_group(required=True)
+    security = parser.add_mutually_exclusive_group()
     security.add_argument(
         "--tls-dir", type=Path, metavar="DIR", help="folder with an operator's certificate, as plr ca issue writes it"
     )
     security.add_argument("--insecure", action="store_true", help="without TLS, for a control plane that has none")
-    parser.add_argument("--timeout-s", type=float, default=5.0, metavar="SECONDS")
+    parser.add_argument("--timeout-s", type=number(MIN_TIMEOUT_S, MAX_TIMEOUT_S), default=5.0, metavar="SECONDS")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
@@ -74,6 +83,8 @@ def ask(arguments: argparse.Namespace, call: Callable[[admin_pb2_grpc.AdminStub,
     """
     files = None
     address = arguments.address
+    if arguments.tls_dir is None and not arguments.insecure:
+        raise AskError(_NO_IDENTITY, EXIT_USAGE)
     try:
         files = load_tls_files(arguments.tls_dir) if arguments.tls_dir is not None else None
         with _open_channel(address, files) as channel:
@@ -84,12 +95,22 @@ def ask(arguments: argparse.Namespace, call: Callable[[admin_pb2_grpc.AdminStub,
         code = getattr(error, "code", lambda: None)()
         if code is grpc.StatusCode.NOT_FOUND:
             raise AskError(detail, EXIT_FAILED) from error
-        advice = tls_advice.explain(detail, files, time.time()) if code is grpc.StatusCode.UNAVAILABLE else None
+        advice = _advice(detail, files) if code is grpc.StatusCode.UNAVAILABLE else None
         raise AskError(f"{address}: {advice or detail}", EXIT_FAILED) from error
     except ConfigError as error:
         raise AskError(str(error), EXIT_USAGE) from error
     except DecodeError as error:
         raise AskError(f"{address}: answers what it must not: {error}", EXIT_FAILED) from error
+
+
+def _advice(detail: str, files: TlsFiles | None) -> str | None:
+    """What gRPC's words for a failed connection mean, and what to do; None if they have to speak for themselves."""
+    if "Connection refused" in detail:
+        return (
+            "nobody listens there (TCP): see whether the control plane runs, and give the address of its "
+            "listen (port 50051 unless configured), not that of STUN"
+        )
+    return tls_advice.explain(detail, files, time.time())
 
 
 def _open_channel(address: str, files: TlsFiles | None) -> grpc.Channel:

@@ -1,10 +1,5 @@
 """plr: ask a running control plane, plan ahead, certify nodes, try out a policy, look up configuration keys.
 
-on a robot or a server itself, without the control plane (each has --help):
-  plr doctor               look at this node: what is wrong, and what to do
-  plr ping PEER            how long each path to a peer takes
-  plr bugreport            a tar file for whoever helps
-
 examples:
   plr status --tls-dir ~/.plr/alice --address control.example.org:50051
   plr status --insecure --json
@@ -12,6 +7,8 @@ examples:
   plr explain --tls-dir ~/.plr/alice robot-7 /plan
   plr events --tls-dir ~/.plr/alice --node robot-7 --since 2h
   plr plan --traces drive.csv.gz --request-bytes 120000 --deadline-ms 250 --target 0.01
+  plr doctor
+  plr ping cloud-a
   plr ca init
   plr ca issue robot-1 --role robot
   plr request robot-2 --role robot
@@ -30,12 +27,13 @@ import sys
 from typing import TYPE_CHECKING
 
 from protos import extras
+from protos.arguments import OneLineParser
 from protos.version_option import ShowVersion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from controlplane.arguments import Commands
+    from protos.arguments import Commands
 
 # Each command imports what it needs when it is the one that is asked for: `plr status` is used where each second
 # counts, and what all commands import together takes longer than its answer.
@@ -47,25 +45,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     with extras.required("plr", "controlplane"):
         parser = _parser(argv[0] if argv else "")
     arguments = parser.parse_args(argv)
+    if arguments.run is None:
+        parser.error(f"expected COMMAND before all else, got {argv[0]!r}")
     code: int = arguments.run(arguments)
     return code
 
 
 def _parser(asked_for: str) -> argparse.ArgumentParser:
     summary, _, epilog = (__doc__ or "").partition("\n\n")
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="plr",
         description=summary,
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action=ShowVersion)
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    parser.set_defaults(run=None)
+    commands: Commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=OneLineParser)
     for name, (about, add) in _COMMANDS.items():
         if name == asked_for:
             add(commands, about)
         else:
             commands.add_parser(name, help=about)
+    for name, about in _ON_A_NODE.items():
+        commands.add_parser(name, help=about)
     return parser
 
 
@@ -128,6 +131,14 @@ _COMMANDS: dict[str, tuple[str, Callable[[Commands, str], None]]] = {
     "policy": ("about the access policy in a control plane's configuration", _policy),
 }
 """By name: what it is for, and what adds its options."""
+
+
+_ON_A_NODE = {
+    "doctor": "on a robot or a server: what is wrong with this node, and what to do",
+    "ping": "on a robot or a server: how long each path to a peer takes",
+    "bugreport": "on a robot or a server: a tar file for whoever helps",
+}
+"""The sidecar's, which never come here (protos/command_line.py): to be listed, and found by who mistypes one."""
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from controlplane.config import ControlPlaneConfig
 if TYPE_CHECKING:
     import argparse
 
-    from controlplane.arguments import Commands
+    from protos.arguments import Commands
 
 EXIT_OK = 0
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 from controlplane import event_lines, event_text
 from controlplane.admin_client import AskError, add_options, ask
-from controlplane.arguments import checked_name
+from protos.arguments import checked, whole
 from protos.convert import event_list_from_proto, event_query_to_proto
 from protos.fleet_events import EventQuery
 from protos.names import node_name
 
 if TYPE_CHECKING:
-    from controlplane.arguments import Commands
+    from protos.arguments import Commands
     from protos.fleet_events import EventList
 
 EXIT_OK = 0
@@ -51,7 +51,7 @@ def add_to(commands: Commands, summary: str) -> None:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    events.add_argument("--node", type=checked_name(node_name), metavar="NAME", help="of this sidecar alone")
+    events.add_argument("--node", type=checked(node_name), metavar="NAME", help="of this sidecar alone")
     events.add_argument(
         "--since",
         type=_since,
@@ -61,7 +61,7 @@ def add_to(commands: Commands, summary: str) -> None:
     )
     events.add_argument(
         "--last",
-        type=_count,
+        type=whole(0, 1 << 31),
         metavar="N",
         help=f"so many at most, the newest; 0: all (default {LAST}; with --since all)",
     )
@@ -78,13 +78,7 @@ def _since(text: str) -> float:
         at = datetime.fromisoformat(text)
         return max(0.0, (at if at.tzinfo is not None else at.replace(tzinfo=UTC)).timestamp())
     except (ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f"expected such as 30m, 2h, 7d or 2026-03-01T08:00, got '{text}'") from None
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) > 1 << 31:
-        raise argparse.ArgumentTypeError(f"expected a number of events, got '{text}'")
-    return int(text)
+        raise argparse.ArgumentTypeError(f"expected such as 30m, 2h, 7d or 2026-03-01T08:00, got {text!r}") from None
 
 
 def _events(arguments: argparse.Namespace) -> int:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from controlplane import explanation_text
 from controlplane.admin_client import AskError, add_options, ask
-from controlplane.arguments import checked_name
+from protos.arguments import checked
 from protos.convert import explanation_from_proto
 from protos.names import node_name, service_name
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
-    from controlplane.arguments import Commands
+    from protos.arguments import Commands
     from protos.explanation import Explanation
     from protos.plr.v1 import admin_pb2_grpc
 
@@ -40,8 +40,8 @@ def add_to(commands: Commands, summary: str) -> None:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    explain.add_argument("robot", type=checked_name(node_name), metavar="ROBOT")
-    explain.add_argument("service", type=checked_name(service_name), metavar="SERVICE")
+    explain.add_argument("robot", type=checked(node_name), metavar="ROBOT")
+    explain.add_argument("service", type=checked(service_name), metavar="SERVICE")
     add_options(explain)
     explain.set_defaults(run=_explain)
 

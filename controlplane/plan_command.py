@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -15,13 +16,15 @@ from controlplane.planning.prospects import least_set
 from controlplane.planning.traces import TraceError, read_trace
 from controlplane.planning.workload import DEFAULT, Compute, Workload
 from protos import extras
+from protos.arguments import whole
+from protos.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from controlplane.arguments import Commands
     from controlplane.planning.prospects import Source
     from controlplane.planning.traces import RecordedPaths
+    from protos.arguments import Commands
 
 EXIT_MET = 0
 EXIT_NOT_MET = 1
@@ -29,6 +32,8 @@ EXIT_USAGE = 2
 
 MAX_REQUESTS = 5_000_000
 """Requests sent through traces in one run: some minutes."""
+
+MAX_MESSAGE_BYTES = 1 << 24
 
 _EPILOG = """\
 The LSC theorem says that one server behind one path can not be latency-reliable on commodity infrastructure: it misses
@@ -70,8 +75,9 @@ def add_to(commands: Commands, summary: str) -> None:
     plan.add_argument("--plot", type=Path, metavar="FILE", help="draw it over the deadline: .svg or .html")
     plan.add_argument("--json", action="store_true", help="print the table as JSON")
     workload = plan.add_argument_group("what is sent through traces")
-    workload.add_argument("--request-bytes", type=_whole, metavar="N", help=f"the default is {DEFAULT.request_bytes}")
-    workload.add_argument("--answer-bytes", type=_whole, metavar="N", help=f"the default is {DEFAULT.answer_bytes}")
+    size = whole(1, MAX_MESSAGE_BYTES)
+    workload.add_argument("--request-bytes", type=size, metavar="N", help=f"the default is {DEFAULT.request_bytes}")
+    workload.add_argument("--answer-bytes", type=size, metavar="N", help=f"the default is {DEFAULT.answer_bytes}")
     workload.add_argument(
         "--rate-hz", type=_number(0.0), metavar="N", help=f"requests a second; the default is {DEFAULT.rate_hz:g}"
     )
@@ -93,16 +99,10 @@ def _number(above: float, below: float = float("inf")) -> Callable[[str], float]
             value = above
         if not above < value < below:
             limit = f" and below {below:g}" if below < float("inf") else ""
-            raise argparse.ArgumentTypeError(f"expected a number above {above:g}{limit}, got {text}")
+            raise argparse.ArgumentTypeError(f"expected a number above {above:g}{limit}, got {text!r}")
         return value
 
     return parse
-
-
-def _whole(text: str) -> int:
-    if not text.isdecimal() or not 0 < int(text) <= 1 << 24:
-        raise argparse.ArgumentTypeError(f"expected 1 to {1 << 24} bytes, got {text}")
-    return int(text)
 
 
 def _compute(text: str) -> Compute:
@@ -112,7 +112,7 @@ def _compute(text: str) -> Compute:
     except ValueError:
         found = Compute(0.0, 0.0)
     if not 0.0 < found.median_s <= found.p99_s < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected MEDIAN:P99 in milliseconds, such as 20:40, got {text}")
+        raise argparse.ArgumentTypeError(f"expected MEDIAN:P99 in milliseconds, such as 20:40, got {text!r}")
     return found
 
 
@@ -138,7 +138,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         if arguments.plot is not None:
             draw(arguments.plot, source, deadline_s, arguments.target)
     except (_UsageError, RecordingError, TraceError, PlotError) as error:
-        sys.stderr.write(f"plr: {error}\n")
+        sys.stderr.write(escaped(f"plr: {error}") + "\n")
         return EXIT_USAGE
     least = least_set(prospects, arguments.target) if arguments.target is not None else None
     if arguments.json:
@@ -183,8 +183,20 @@ def _replayed(arguments: argparse.Namespace) -> tuple[Source, float]:
 def _read(paths: Sequence[Path]) -> list[RecordedPaths]:
     files: list[Path] = []
     for path in paths:
-        inside = sorted((*path.glob("*.csv"), *path.glob("*.csv.gz"))) if path.is_dir() else [path]
+        inside = _inside(path)
         if not inside:
             raise _UsageError(f"{path}: no .csv or .csv.gz in this folder")
         files += inside
     return [read_trace(file) for file in files]
+
+
+def _inside(path: Path) -> list[Path]:
+    """The traces of a folder; of anything else itself."""
+    try:
+        names = sorted(os.listdir(path))
+    except NotADirectoryError:
+        return [path]
+    except (OSError, ValueError) as error:
+        # A name with a NUL, or too long for one, is not asked about in the file system.
+        raise _UsageError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    return [path / name for name in names if name.endswith((".csv", ".csv.gz"))]

@@ -6,16 +6,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from controlplane.arguments import checked_name
 from controlplane.config import load_config
 from controlplane.core.policy_explain import explain
+from protos.arguments import checked
 from protos.errors import ConfigError
 from protos.names import node_name, service_name
 
 if TYPE_CHECKING:
     import argparse
 
-    from controlplane.arguments import Commands
+    from protos.arguments import Commands
 
 EXIT_ALLOWED = 0
 EXIT_DENIED = 1
@@ -32,9 +32,9 @@ def add_to(commands: Commands, summary: str) -> None:
         epilog="exit codes: 0 allowed, 1 denied, 2 bad usage or configuration",
     )
     check.add_argument("--config", type=Path, required=True, metavar="FILE", help="the control plane's configuration")
-    check.add_argument("--robot", type=checked_name(node_name), required=True, metavar="NAME")
-    check.add_argument("--service", type=checked_name(service_name), required=True, metavar="NAME")
-    check.add_argument("--cloud", type=checked_name(node_name), required=True, metavar="NAME")
+    check.add_argument("--robot", type=checked(node_name), required=True, metavar="NAME")
+    check.add_argument("--service", type=checked(service_name), required=True, metavar="NAME")
+    check.add_argument("--cloud", type=checked(node_name), required=True, metavar="NAME")
     check.set_defaults(run=_check)
 
 

@@ -12,7 +12,7 @@ import grpc
 
 from controlplane import event_text, status_table
 from controlplane.admin_client import EXIT_FAILED, AskError, add_options, ask
-from controlplane.arguments import checked_name
+from protos.arguments import checked
 from protos.convert import (
     departed_from_proto,
     events_from_proto,
@@ -30,7 +30,7 @@ from protos.status import StatusQuery
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from controlplane.arguments import Commands
+    from protos.arguments import Commands
     from protos.fleet_events import DepartedSidecar
     from protos.model import NodeName
     from protos.plr.v1 import admin_pb2_grpc
@@ -57,7 +57,7 @@ def add_to(commands: Commands, summary: str) -> None:
     status = commands.add_parser(
         "status", help=summary, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    status.add_argument("names", nargs="*", type=checked_name(node_name), metavar="NAME", help="these sidecars alone")
+    status.add_argument("names", nargs="*", type=checked(node_name), metavar="NAME", help="these sidecars alone")
     status.add_argument("--all", action="store_true", help="mapping and paths of all, however many they are")
     add_options(status)
     status.set_defaults(run=_status)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, BeforeValidator
 
 from protos.host_port import canonical_ip, check_remote, split_host_port
 
@@ -36,9 +37,26 @@ def check_absolute(path: Path) -> Path:
     """Return `path`; raises ValueError when it is relative, or no path at all."""
     if not path.is_absolute():
         raise ValueError(f"expected an absolute path, got '{path}'")
-    if "\0" in str(path):
-        raise ValueError(f"expected a path, got one with a NUL: '{path}'")
+    encoded_path(str(path))
     return path
+
+
+def encoded_path(text: str) -> bytes:
+    """Return what the system is asked for; raises ValueError if nothing can have such a name."""
+    try:
+        name = os.fsencode(text)
+    except UnicodeEncodeError:
+        # JSON writes an emoji as two halves, which YAML takes for two characters; a locale may have few characters.
+        raise ValueError(f"expected a path, got one with characters that no name has here: {text!a}") from None
+    if b"\0" in name:
+        raise ValueError(f"expected a path, got one with a NUL: {text!a}")
+    return name
+
+
+def _refuse_port_alone(value: object) -> object:
+    if isinstance(value, int):
+        raise ValueError(f"expected address:port, such as [::]:{value} for all addresses, got {value}")
+    return value
 
 
 AbsolutePath = Annotated[Path, AfterValidator(check_absolute)]
@@ -50,7 +68,7 @@ TlsDir = AbsolutePath
 RemoteAddress = Annotated[str, AfterValidator(check_remote)]
 """host:port to talk to."""
 
-ListenAddress = Annotated[str, AfterValidator(_check_listen)]
+ListenAddress = Annotated[str, BeforeValidator(_refuse_port_alone), AfterValidator(_check_listen)]
 """address:port to listen on, port 0 for any free one."""
 
 IpAddress = Annotated[str, AfterValidator(canonical_ip)]

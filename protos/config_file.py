@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from protos.errors import ConfigError
-from protos.regular_file import open_regular
+from protos.regular_file import read_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -119,8 +119,7 @@ def _refused(rule: str, node: yaml.Node) -> yaml.constructor.ConstructorError:
 def read_text(path: Path) -> str:
     """Return the file's text; raises ConfigError."""
     try:
-        with open_regular(path) as file:
-            data = file.read(MAX_CONFIG_BYTES + 1)
+        data = read_regular(path, MAX_CONFIG_BYTES + 1)
     except OSError as error:
         raise ConfigError(str(path), "", f"cannot be read: {error.strerror or error}") from error
     if len(data) > MAX_CONFIG_BYTES:

@@ -26,6 +26,12 @@ def open_regular(path: Path, *, folder: int | None = None) -> BinaryIO:
     return open(descriptor, "rb")
 
 
+def read_regular(path: Path, most: int) -> bytes:
+    """Return what a file holds, its first `most` bytes; raises OSError as `open_regular`."""
+    with open_regular(path) as file:
+        return file.read(most)
+
+
 def refuse_irregular(descriptor: int) -> None:
     """Close what is no regular file, and raise OSError."""
     mode = os.fstat(descriptor).st_mode

@@ -13,11 +13,12 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from protos import commit, extras, program
 
 with extras.required("plr-sidecar", "sidecar"):
+    from protos.arguments import OneLineParser
     from protos.certificate_term import term_problem
     from protos.errors import ConfigError, StartError
     from protos.log_lines import line_formatter
@@ -62,11 +63,6 @@ exit codes:
 """
 
 
-class _OneLineParser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        self.exit(EXIT_BAD_CONFIG, f"{self.prog}: {message}; see {self.prog} --help\n")
-
-
 @program.ends_quietly(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
@@ -100,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _OneLineParser(
+    parser = OneLineParser(
         prog=PROGRAM,
         description=_DESCRIPTION,
         epilog=_EPILOG,

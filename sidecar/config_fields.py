@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
-from protos.config_fields import refuse_duplicates
+from protos.config_fields import encoded_path, refuse_duplicates
 from protos.convert.fields import MAX_COPIES
 from protos.errors import DecodeError
 from protos.host_port import check_remote
@@ -18,6 +17,7 @@ from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 _INTERFACE = re.compile(r"[!-.0-~]{1,15}")
 _INTERFACE_GLOB = re.compile(r"[!-.0-~]{1,64}")
 _SERVICE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_SERVICE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/srv/[A-Za-z][A-Za-z0-9_]*")
 _SERVICE_GLOB = re.compile(r"[/*?\[][A-Za-z0-9_/*?\[\]!-]*")
 _GLOB_CHARACTERS = frozenset("*?[")
 _MAX_SERVICE_CHARACTERS = 255
@@ -29,8 +29,7 @@ _COPIES_WORDS = {"each": EVERY_INTERFACE, "at_most": AT_MOST_EVERY_INTERFACE}
 
 
 def _check_local_socket(text: str) -> str:
-    is_path = text.startswith("/") and "\0" not in text and len(os.fsencode(text)) <= _MAX_SOCKET_BYTES
-    if text != "auto" and not is_path:
+    if text != "auto" and not (text.startswith("/") and len(encoded_path(text)) <= _MAX_SOCKET_BYTES):
         raise ValueError(f"expected auto, null or an absolute path of at most {_MAX_SOCKET_BYTES} bytes, got {text!r}")
     return text
 
@@ -58,6 +57,12 @@ def _check_service(text: str) -> str:
     pattern = _SERVICE_GLOB if is_glob(text) else _SERVICE
     if len(text) > _MAX_SERVICE_CHARACTERS or not pattern.fullmatch(text):
         raise ValueError(f"expected a service name such as /plan_path or a glob such as /arm/*, got {text!r}")
+    return text
+
+
+def _check_service_type(text: str) -> str:
+    if len(text) > _MAX_SERVICE_CHARACTERS or not _SERVICE_TYPE.fullmatch(text):
+        raise ValueError(f"expected a type of services such as nav_msgs/srv/GetPlan, got {text!r}")
     return text
 
 
@@ -119,6 +124,7 @@ class Section(BaseModel):
 SidecarName = Annotated[str, AfterValidator(_check_node_name)]
 InterfacePattern = Annotated[str, AfterValidator(_check_interface)]
 ServicePattern = Annotated[str, AfterValidator(_check_service)]
+ServiceType = Annotated[str, AfterValidator(_check_service_type)]
 FullServiceName = Annotated[str, AfterValidator(_check_service_name)]
 RepairShare = Annotated[
     float | str,

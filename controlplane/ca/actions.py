@@ -1,4 +1,7 @@
-"""What the commands of `plr ca` do; they raise AuthorityError, ConfigError or OSError, and print one line."""
+"""What the commands of `plr ca` do; they raise AuthorityError, ConfigError or OSError, and return what to print of it.
+
+What is returned is done, whether or not it can be printed.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,8 @@ from controlplane.ca.folder import AuthorityFolder, Protection
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE, PassphraseSource
 from protos.errors import ConfigError
 from protos.identity import IdentityRole
-from protos.regular_file import open_regular
+from protos.printable import escaped
+from protos.regular_file import read_regular
 from protos.tls_files import (
     CA_FILE,
     CERTIFICATE_FILE,
@@ -39,7 +43,7 @@ if TYPE_CHECKING:
 _OPTION = "--passphrase-file"
 
 
-def init(arguments: argparse.Namespace) -> None:
+def init(arguments: argparse.Namespace) -> str:
     """Make a CA."""
     AuthorityFolder(arguments.dir).refuse_existing()
     source = PassphraseSource("passphrase for the CA's key", _OPTION, VARIABLE, arguments.passphrase_file)
@@ -48,10 +52,10 @@ def init(arguments: argparse.Namespace) -> None:
     authority = Authority.create(arguments.name, days=arguments.days)
     folder.create(authority)
     kept = "not encrypted" if passphrase is None else "encrypted"
-    say(f"made the CA {arguments.name}, good until {listing.day(authority.not_after)}, its key {kept}: {folder.path}")
+    return f"made the CA {arguments.name}, good until {listing.day(authority.not_after)}, its key {kept}: {folder.path}"
 
 
-def issue(arguments: argparse.Namespace) -> None:
+def issue(arguments: argparse.Namespace) -> str:
     """Write a new node's files."""
     folder = opened(arguments)
     role = IdentityRole(arguments.role)
@@ -62,10 +66,10 @@ def issue(arguments: argparse.Namespace) -> None:
         save(folder, authority)
         write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
     until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
-    say(f"issued {arguments.name} ({role.value}), good until {until}: {out}")
+    return f"issued {arguments.name} ({role.value}), good until {until}: {out}"
 
 
-def renew(arguments: argparse.Namespace) -> None:
+def renew(arguments: argparse.Namespace) -> str:
     """Write a node's files with a further certificate."""
     folder = opened(arguments)
     with folder.locked() as authority:
@@ -77,62 +81,62 @@ def renew(arguments: argparse.Namespace) -> None:
         save(folder, authority)
         write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
     until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
-    say(f"renewed {arguments.name} ({last.role.value}), good until {until}: {out}")
+    return f"renewed {arguments.name} ({last.role.value}), good until {until}: {out}"
 
 
-def revoke(arguments: argparse.Namespace) -> None:
+def revoke(arguments: argparse.Namespace) -> str:
     """Revoke what a node has."""
     folder = opened(arguments)
     with folder.locked() as authority:
         revoked = authority.revoke(arguments.name, x509.ReasonFlags(arguments.reason))
         save(folder, authority)
     where = "copy to the control plane's tls_dir, or any node's"
-    say(f"revoked {len(revoked)} of {arguments.name}; {where}: {folder.path / CRL_FILE}")
+    return f"revoked {len(revoked)} of {arguments.name}; {where}: {folder.path / CRL_FILE}"
 
 
-def publish(arguments: argparse.Namespace) -> None:
+def publish(arguments: argparse.Namespace) -> str:
     """Sign the revocation lists again."""
     folder = opened(arguments)
     with folder.locked() as authority:
         authority.publish()
         save(folder, authority)
-    say(f"signed revocation list {authority.crl_number}; copy to any node's tls_dir: {folder.path / CRL_FILE}")
+    return f"signed revocation list {authority.crl_number}; copy to any node's tls_dir: {folder.path / CRL_FILE}"
 
 
-def show(arguments: argparse.Namespace) -> None:
+def show(arguments: argparse.Namespace) -> str:
     """Print what was issued."""
     folder = AuthorityFolder(arguments.dir)
     records = folder.records()
-    say(listing.render(records, [folder.certificate(record) for record in records], time.time()))
+    return listing.render(records, [folder.certificate(record) for record in records], time.time())
 
 
-def rotate(arguments: argparse.Namespace) -> None:
+def rotate(arguments: argparse.Namespace) -> str:
     """Put a new CA before the one in use."""
     folder = opened(arguments)
     with folder.locked() as authority:
         authority.rotate(arguments.name, days=arguments.days)
         save(folder, authority)
     files = f"{folder.path / CA_FILE} and {folder.path / CRL_FILE}"
-    say(f"made the CA {arguments.name}; before renewing any node, copy to every tls_dir: {files}")
+    return f"made the CA {arguments.name}; before renewing any node, copy to every tls_dir: {files}"
 
 
-def retire(arguments: argparse.Namespace) -> None:
+def retire(arguments: argparse.Namespace) -> str:
     """Forget the former CAs."""
     folder = opened(arguments)
     with folder.locked() as authority:
         authority.retire()
         save(folder, authority)
-    say(f"retired; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}")
+    return f"retired; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}"
 
 
-def change_passphrase(arguments: argparse.Namespace) -> None:
+def change_passphrase(arguments: argparse.Namespace) -> str:
     """Encrypt the CA's key with another passphrase, in the way of today."""
     folder = opened(arguments, warn=False)
     source = PassphraseSource("new passphrase", "--new-passphrase-file", NEW_VARIABLE, arguments.new_passphrase_file)
     new = None if arguments.no_passphrase else source.choose()
     folder.change_passphrase(new)
     kept = "no longer encrypted" if new is None else "encrypted with the new passphrase; copies from before are not"
-    say(f"the CA's key is {kept}: {folder.path}")
+    return f"the CA's key is {kept}: {folder.path}"
 
 
 def opened(arguments: argparse.Namespace, *, warn: bool = True) -> AuthorityFolder:
@@ -144,13 +148,17 @@ def opened(arguments: argparse.Namespace, *, warn: bool = True) -> AuthorityFold
     protections = folder.protections()
     if warn and min(protections) is not Protection.GOOD:
         how = "not encrypted" if min(protections) is Protection.CLEAR else "encrypted in an old way, cheap to guess at"
-        sys.stderr.write(f"plr: warning: {folder.path}: the CA's key is {how}; do: {_mend(arguments)}\n")
+        _warn(f"{folder.path}: the CA's key is {how}; do: {_mend(arguments)}")
     if max(protections) is Protection.CLEAR:
         if arguments.passphrase_file is not None:
             raise ConfigError(str(folder.path), "", f"the CA's key has no passphrase; leave out {_OPTION}")
         return AuthorityFolder(arguments.dir, on_wait=_tell_of_wait)
     source = PassphraseSource("passphrase of the CA's key", _OPTION, VARIABLE, arguments.passphrase_file)
     return AuthorityFolder(arguments.dir, source.get(), _tell_of_wait)
+
+
+def _warn(problem: str) -> None:
+    sys.stderr.write(f"plr: warning: {escaped(problem)}\n")
 
 
 def _tell_of_wait() -> None:
@@ -165,7 +173,7 @@ def _mend(arguments: argparse.Namespace) -> str:
 def save(folder: AuthorityFolder, authority: Authority) -> None:
     """Keep the CA as it is now, and warn of nodes' folders that could not be brought up to date; raises OSError."""
     for problem in folder.save(authority):
-        sys.stderr.write(f"plr: warning: {problem}\n")
+        _warn(problem)
 
 
 def refuse_taken(out: Path, name: str, *, own: bool) -> None:
@@ -181,8 +189,7 @@ def refuse_taken(out: Path, name: str, *, own: bool) -> None:
         return
     try:
         # In a folder of the node's own user, who may put anything there.
-        with open_regular(path) as file:
-            certificate = x509.load_pem_x509_certificate(file.read(MAX_FILE_BYTES))
+        certificate = x509.load_pem_x509_certificate(read_regular(path, MAX_FILE_BYTES))
         owners = [each.value for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
     except (OSError, ValueError):
         owners = []
@@ -194,9 +201,3 @@ def kept_key(out: Path) -> ec.EllipticCurvePrivateKey:
     """Return the key of a node's folder; raises ConfigError."""
     path = out / KEY_FILE
     return load_private_key(read_guarded(path, KEY_FORBIDDEN), None, path)
-
-
-def say(line: str) -> None:
-    """Print a line of what was done; nowhere, if there is no standard output."""
-    if sys.stdout is not None:
-        sys.stdout.write(f"{line}\n")

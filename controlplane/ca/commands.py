@@ -12,6 +12,8 @@ from cryptography.x509 import ReasonFlags
 from controlplane.ca import actions, request_actions
 from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityError
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
+from protos import program
+from protos.arguments import checked
 from protos.errors import ConfigError, DecodeError
 from protos.identity import IdentityRole
 from protos.names import node_name, text
@@ -20,7 +22,7 @@ from protos.printable import escaped
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from controlplane.arguments import Commands
+    from protos.arguments import Commands
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -121,7 +123,7 @@ def add_request(commands: Commands, summary: str) -> None:
         epilog=_REQUEST_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("name", type=_node_name, metavar="NAME")
+    parser.add_argument("name", type=checked(node_name), metavar="NAME")
     parser.add_argument("--role", required=True, choices=_ROLES)
     parser.add_argument(
         "--out",
@@ -171,7 +173,7 @@ def _no_passphrase(choice: argparse._MutuallyExclusiveGroup) -> None:
 
 
 def _out_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", type=_node_name, metavar="NAME")
+    parser.add_argument("name", type=checked(node_name), metavar="NAME")
     _certificate_arguments(parser)
 
 
@@ -188,7 +190,7 @@ def _issue_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _sign_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("request", type=Path, metavar="REQUEST", help="the request.pem that plr request wrote")
-    parser.add_argument("--name", type=_node_name, help="the name that it must ask for")
+    parser.add_argument("--name", type=checked(node_name), help="the name that it must ask for")
     parser.add_argument("--role", choices=_ROLES, help="the role that it must ask for")
     parser.add_argument(
         "--fingerprint", metavar="SHA256:...", help="the key that it must be of, as plr request shows it"
@@ -203,7 +205,7 @@ def _renew_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _revoke_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", type=_node_name, metavar="NAME")
+    parser.add_argument("name", type=checked(node_name), metavar="NAME")
     parser.add_argument("--reason", choices=_REASONS, default=ReasonFlags.unspecified.value)
     _signing(parser)
 
@@ -223,11 +225,11 @@ _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
 
 
 def _reported(
-    command: Callable[[argparse.Namespace], None], folder: Callable[[argparse.Namespace], Path]
+    command: Callable[[argparse.Namespace], str], folder: Callable[[argparse.Namespace], Path]
 ) -> Callable[[argparse.Namespace], int]:
     def run(arguments: argparse.Namespace) -> int:
         try:
-            command(arguments)
+            text = command(arguments)
         except AuthorityError as error:
             _complain(str(error))
             return EXIT_FAILED
@@ -240,21 +242,31 @@ def _reported(
         except OSError as error:
             _complain(f"{error.filename or folder(arguments)}: {error.strerror or error}")
             return EXIT_FAILED
+        shown = "\n".join(map(escaped, text.split("\n")))
+        if command is actions.show:
+            sys.stdout.write(f"{shown}\n")
+        else:
+            _tell_of_what_is_done(shown)
         return EXIT_OK
 
     return run
 
 
+def _tell_of_what_is_done(shown: str) -> None:
+    """Print it; a script that took this for refused would do it again, and find the name taken."""
+    if sys.stdout is None:
+        return
+    try:
+        sys.stdout.write(f"{shown}\n")
+        sys.stdout.flush()
+    except OSError as error:
+        program.print_no_more()
+        sys.stderr.write(f"plr: done, but it cannot be printed ({error.strerror}): {shown.partition(chr(10))[0]}\n")
+
+
 def _complain(problem: str) -> None:
     # It may name a file that somebody else has named.
     sys.stderr.write(f"plr: {escaped(problem)}\n")
-
-
-def _node_name(value: str) -> str:
-    try:
-        return node_name(value, "the name")
-    except DecodeError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _common_name(value: str) -> str:

@@ -27,11 +27,11 @@ from controlplane.ca.files import PRIVATE_FILE, PRIVATE_FOLDER, PUBLIC_FILE, wri
 from controlplane.ca.index import decode_index, encode_index
 from controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
 from protos.errors import ConfigError
-from protos.regular_file import open_regular
+from protos.regular_file import read_regular
 from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -159,8 +159,7 @@ class AuthorityFolder:
     def _lists(self) -> tuple[x509.CertificateRevocationList, ...]:
         """Return the revocation lists that stand here: of a command cut short, nodes may have them already."""
         try:
-            with open_regular(self.path / CRL_FILE) as file:
-                pem = file.read()
+            pem = read_regular(self.path / CRL_FILE, MAX_INDEX_BYTES)
             return tuple(x509.load_pem_x509_crl(one) for one in _PEM_LIST.findall(pem))
         except (OSError, ValueError):
             return ()
@@ -197,27 +196,25 @@ class AuthorityFolder:
             )
         for each, record in zip((authority, *authority.former), records, strict=True):
             self._keep_key(each, self._own_folder(record))
-        write_atomically(self.path / CRL_FILE, authority.crl_pem(), PUBLIC_FILE)
+        current = {CA_FILE: authority.ca_pem, CRL_FILE: authority.crl_pem()}
+        write_atomically(self.path / CRL_FILE, current[CRL_FILE], PUBLIC_FILE)
         write_atomically(self.path / INDEX_FILE, index, PRIVATE_FILE)
-        write_atomically(self.path / CA_FILE, authority.ca_pem, PUBLIC_FILE)
-        problems = self._refresh_nodes()
+        write_atomically(self.path / CA_FILE, current[CA_FILE], PUBLIC_FILE)
+        problems = self._refresh_nodes(current)
         kept = {self._own_folder(record) for record in records}
         for path in (self.path / AUTHORITIES).iterdir():
             if path not in kept:
                 shutil.rmtree(path)
         return problems
 
-    def _refresh_nodes(self) -> list[str]:
+    def _refresh_nodes(self, current: Mapping[str, bytes]) -> list[str]:
         """Give every node's folder the CAs and revocations of now: whoever copies it again takes nothing back."""
         problems = []
-        for name in (CA_FILE, CRL_FILE):
-            data = (self.path / name).read_bytes()
+        for name, data in current.items():
             for path in (self.path / NODES).glob(f"*/{name}"):
                 try:
                     # A service's folder is its own: it may hold anything under this name.
-                    with open_regular(path) as file:
-                        is_same = file.read(len(data) + 1) == data
-                    if not is_same:
+                    if read_regular(path, len(data) + 1) != data:
                         write_atomically(path, data, PUBLIC_FILE)
                 except OSError as error:
                     problems.append(f"{path}: not brought up to date: {error.strerror or error}")

@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from cryptography.x509 import ReasonFlags
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from protos.config_file import key_path
 from protos.errors import ConfigError
@@ -18,6 +27,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from protos.model import NodeName
+
+
+LAST_MOMENT = 253_402_300_799.0
+"""The last second of the year 9999 (seconds since 1970), at which a certificate may end (RFC 5280)."""
+
+MAX_CRL_NUMBER = (1 << 159) - 1
+"""20 octets hold it (RFC 5280)."""
+
+MAX_SERIAL = (1 << 159) - 1
+"""The same; above 0."""
+
+_REASONS = frozenset(reason.value for reason in ReasonFlags)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +76,10 @@ class Record:
 def _number(text: object) -> int:
     if not isinstance(text, str):
         raise ValueError("expected a hexadecimal number in quotes")
-    return int(text, 16)
+    number = int(text, 16)
+    if not 0 < number <= MAX_SERIAL:
+        raise ValueError("expected a serial number: above 0, of at most 20 octets")
+    return number
 
 
 _Serial = Annotated[int, BeforeValidator(_number)]
@@ -64,17 +88,26 @@ _Serial = Annotated[int, BeforeValidator(_number)]
 _Name = Annotated[str, AfterValidator(lambda text: node_name(text, "the name"))]
 
 
+_Time = Annotated[float, Field(ge=0.0, le=LAST_MOMENT, allow_inf_nan=False)]
+
+
 class _EntryRow(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: _Name
     role: IdentityRole
     serial: _Serial
-    not_before: float
-    not_after: float
-    revoked_at: float | None = None
+    not_before: _Time
+    not_after: _Time
+    revoked_at: _Time | None = None
     reason: str = ""
     key: str = ""
+
+    @model_validator(mode="after")
+    def _revoked_for_a_reason(self) -> Self:
+        if self.revoked_at is not None and self.reason not in _REASONS:
+            raise ValueError(f"expected a reason with revoked_at, one of {', '.join(sorted(_REASONS))}")
+        return self
 
     def entry(self) -> Entry:
         return Entry(
@@ -93,8 +126,8 @@ class _RecordRow(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     serial: _Serial
-    crl_number: int = Field(ge=0)
-    published_at: float | None = None
+    crl_number: int = Field(ge=0, le=MAX_CRL_NUMBER)
+    published_at: _Time | None = None
     entries: tuple[_EntryRow, ...]
     past: tuple[_EntryRow, ...] = ()
 

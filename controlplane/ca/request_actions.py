@@ -9,7 +9,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from controlplane.ca import listing
-from controlplane.ca.actions import kept_key, opened, refuse_taken, save, say
+from controlplane.ca.actions import kept_key, opened, refuse_taken, save
 from controlplane.ca.authority import AuthorityError
 from controlplane.ca.certificates import generate_key
 from controlplane.ca.files import PRIVATE_FILE, PUBLIC_FILE, make_private, write_atomically, write_certificate
@@ -19,6 +19,7 @@ from controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_reque
 from protos.errors import ConfigError, DecodeError
 from protos.identity import IdentityRole
 from protos.printable import escaped
+from protos.regular_file import read_regular
 from protos.tls_files import KEY_FILE
 
 if TYPE_CHECKING:
@@ -37,18 +38,22 @@ _MAY = {
 }
 
 
-def request(arguments: argparse.Namespace) -> None:
+def request(arguments: argparse.Namespace) -> str:
     """Make a key and a request for a certificate of it."""
     out: Path = arguments.out
     role = IdentityRole(arguments.role)
     key = _own_key(out, arguments.name) if arguments.keep_key else _new_key(out)
     write_atomically(out / REQUEST_FILE, build_request(arguments.name, role, key), PUBLIC_FILE)
-    say(f"wrote a request for {arguments.name} ({role.value}): {out / REQUEST_FILE}")
-    say(f"its key is {fingerprint(key.public_key())} and stays here: {out / KEY_FILE}")
-    say(f"copy {REQUEST_FILE} to where the CA is, and there do: plr ca sign {REQUEST_FILE}")
+    return "\n".join(
+        (
+            f"wrote a request for {arguments.name} ({role.value}): {out / REQUEST_FILE}",
+            f"its key is {fingerprint(key.public_key())} and stays here: {out / KEY_FILE}",
+            f"copy {REQUEST_FILE} to where the CA is, and there do: plr ca sign {REQUEST_FILE}",
+        )
+    )
 
 
-def sign(arguments: argparse.Namespace) -> None:
+def sign(arguments: argparse.Namespace) -> str:
     """Certify the key of a request, with the name and role that the operator confirms."""
     asked = _read(arguments.request)
     _confirm(arguments, asked, AuthorityFolder(arguments.dir).records())
@@ -62,7 +67,7 @@ def sign(arguments: argparse.Namespace) -> None:
         save(folder, authority)
         write_certificate(out, certificate.public_bytes(Encoding.PEM), authority.ca_pem, authority.crl_pem())
     until = listing.day(certificate.not_valid_after_utc.timestamp())
-    say(f"signed {asked.name} ({asked.role.value}), good until {until}; copy to where its key is: {out}")
+    return f"signed {asked.name} ({asked.role.value}), good until {until}; copy to where its key is: {out}"
 
 
 def _new_key(out: Path) -> ec.EllipticCurvePrivateKey:
@@ -84,8 +89,10 @@ def _own_key(out: Path, name: str) -> ec.EllipticCurvePrivateKey:
 
 
 def _read(path: Path) -> Request:
-    with path.open("rb") as file:
-        pem = file.read(MAX_REQUEST_BYTES + 1)
+    try:
+        pem = read_regular(path, MAX_REQUEST_BYTES + 1)
+    except OSError as error:
+        raise AuthorityError(f"{path}: cannot be read: {error.strerror or error}") from error
     try:
         return parse_request(pem)
     except DecodeError as error:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.planning.prospects import least_set, paths_needed
 from controlplane.text_table import columns
+from protos.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -28,7 +29,8 @@ def render(source: Source, prospects: Sequence[Prospect], deadline_s: float, tar
         )
         for found in prospects
     ]
-    lines = [source.title, f"predicted probability to miss {deadline_s * 1e3:g} ms:", "", *columns([HEADER, *rows])]
+    head = [escaped(source.title), f"predicted probability to miss {deadline_s * 1e3:g} ms:", ""]
+    lines = [*head, *columns([HEADER, *rows])]
     if target is not None:
         lines += ["", *verdict(source, prospects, target)]
     return "\n".join(lines)

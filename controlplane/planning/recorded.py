@@ -18,6 +18,7 @@ from protos.convert import explanation_from_proto
 from protos.errors import DecodeError
 from protos.explanation import SAMPLE
 from protos.plr.v1 import admin_pb2
+from protos.regular_file import read_regular
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -41,6 +42,10 @@ MIN_REQUESTS = 20.0
 """Requests a pair must have carried before it tells how much slower requests are than probes."""
 
 
+MAX_RECORDING_BYTES = 64 << 20
+"""An answer takes some MB at most: 16 interfaces, 4,096 servers."""
+
+
 class RecordingError(ValueError):
     """Not a recording; the text names the file."""
 
@@ -48,10 +53,19 @@ class RecordingError(ValueError):
 def read_recording(file: Path) -> Explanation:
     """Read what `plr explain --json` printed. Raises RecordingError."""
     try:
-        answer = json_format.Parse(file.read_text(encoding="utf-8"), admin_pb2.ExplainResponse())
+        answer = json_format.Parse(_text(file), admin_pb2.ExplainResponse())
         return explanation_from_proto(answer)
-    except (OSError, UnicodeDecodeError, json_format.ParseError, DecodeError) as error:
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot be read: {error.strerror or error}") from None
+    except (UnicodeDecodeError, json_format.ParseError, DecodeError, RecursionError) as error:
         raise RecordingError(f"{file}: not an answer of plr explain --json: {' '.join(str(error).split())}") from None
+
+
+def _text(file: Path) -> str:
+    data = read_regular(file, MAX_RECORDING_BYTES + 1)
+    if len(data) > MAX_RECORDING_BYTES:
+        raise DecodeError(f"more than {MAX_RECORDING_BYTES} bytes")
+    return data.decode()
 
 
 class RecordedService:

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from protos.regular_file import read_regular
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -27,6 +29,9 @@ COLUMNS = (
     *("b_up_kbps", "b_down_kbps", "b_rtt_ms", "b_loss"),
 )
 PATHS = ("a", "b")
+
+MAX_TRACE_BYTES = 64 << 20
+"""Of one trace, unpacked: a day of steps 0.1 s apart."""
 
 DEFAULT_QUEUE_BYTES = 1_200_000
 """What a cellular base station or a Wi-Fi driver commonly holds back for one station."""
@@ -77,12 +82,15 @@ def read_trace(file: Path, *, queue_bytes: int = DEFAULT_QUEUE_BYTES) -> Recorde
         TraceError: unreadable, or not in the format above.
     """
     try:
-        raw = file.read_bytes()
+        raw = read_regular(file, MAX_TRACE_BYTES + 1)
         if file.suffix == ".gz":
-            raw = gzip.decompress(raw)
+            with gzip.open(io.BytesIO(raw)) as unpacked:
+                raw = unpacked.read(MAX_TRACE_BYTES + 1)
         text = raw.decode("ascii")
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        raise TraceError(f"trace {file}: {error}") from None
+        raise TraceError(f"trace {file}: {getattr(error, 'strerror', None) or error}") from None
+    if len(raw) > MAX_TRACE_BYTES:
+        raise TraceError(f"trace {file}: expected at most {MAX_TRACE_BYTES} bytes")
     return parse_trace(text, name=file.name.removesuffix(".gz").removesuffix(".csv"), queue_bytes=queue_bytes)
 
 

@@ -14,7 +14,7 @@ from protos.config_file import parse_yaml, read_text
 from protos.errors import ConfigError, DecodeError
 from protos.identity import Identity, IdentityRole
 from protos.model import NodeName, ServiceName
-from protos.regular_file import open_regular
+from protos.regular_file import read_regular
 from protos.tls_files import load_tls_files
 from sidecar.config import load_config
 from sidecar.core.rules import Rules
@@ -230,8 +230,7 @@ def _certificate_and_clock(
 def _read_state(path: Path, decode: Callable[[bytes], T]) -> T | None:
     """Return what a file of the state folder holds, if it is there, for this user to read, and good."""
     try:
-        with open_regular(path) as file:
-            return decode(file.read(MAX_FILE_BYTES))
+        return decode(read_regular(path, MAX_FILE_BYTES))
     except (OSError, DecodeError):
         return None
 

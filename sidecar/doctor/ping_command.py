@@ -21,19 +21,22 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from protos.errors import ConfigError
+from protos.arguments import checked, number, whole
+from protos.errors import ConfigError, DecodeError
+from protos.names import interface_name, node_name
 from protos.printable import escaped
 from sidecar.core.pinging import LEAST_BYTES
 from sidecar.core.pmtu import MAX_BYTES
 from sidecar.doctor.examination import connect, read_config
 from sidecar.doctor.finding import share
-from sidecar.doctor.options import number, parser_of, where_of, whole
+from sidecar.doctor.options import parser_of, where_of
 from sidecar.local.client import LocalBusyError, LocalError, refusal
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Sequence
 
+    from protos.model import InterfaceName
     from sidecar.config import SidecarConfig
     from sidecar.doctor.examination import Where
     from sidecar.local.client import LocalClient
@@ -43,6 +46,8 @@ EXIT_NO_ANSWER = 1
 LEAST_INTERVAL_S = 0.1
 """The sidecar sends 20 pings a second over an interface, at most."""
 DEFAULT_BYTES = 64
+MAX_INTERFACE_CHARACTERS = 15
+"""Linux' limit."""
 MAX_PATHS = 4096
 """To one peer: more are not counted."""
 MAX_WAITING = 128
@@ -168,7 +173,7 @@ class Pinger:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `plr ping`; returns its exit code."""
     parser = parser_of("plr ping", __doc__)
-    parser.add_argument("peer", metavar="PEER", help="a node's name, as plr doctor shows it")
+    parser.add_argument("peer", type=checked(node_name), metavar="PEER", help="a node's name, as plr doctor shows it")
     parser.add_argument("-c", "--count", type=whole(1, 1_000_000), metavar="N", help="stop after so many")
     parser.add_argument(
         "-i", "--interval", type=number(LEAST_INTERVAL_S, 3600), default=1.0, metavar="S", help="seconds between two"
@@ -176,7 +181,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "-s", "--size", type=whole(LEAST_BYTES, MAX_BYTES), default=DEFAULT_BYTES, metavar="BYTES", help="UDP payload"
     )
-    parser.add_argument("-I", "--interface", metavar="NAME", help="over this interface only")
+    parser.add_argument(
+        "-I", "--interface", type=checked(_interface, "the interface"), metavar="NAME", help="over this interface only"
+    )
     parser.add_argument(
         "-W", "--wait", type=number(0.1, 10), default=2.0, metavar="S", help="seconds for the last answers"
     )
@@ -188,6 +195,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except LocalError as error:
         sys.stderr.write(f"plr ping: {error}\n")
         return EXIT_NO_ANSWER
+
+
+def _interface(name: str, what: str) -> InterfaceName:
+    if len(name) > MAX_INTERFACE_CHARACTERS:
+        raise DecodeError(f"{what} {name!a} is longer than an interface's, {MAX_INTERFACE_CHARACTERS} characters")
+    return interface_name(name, what)
 
 
 def _connect(where: Where) -> LocalClient:

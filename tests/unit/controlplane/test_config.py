@@ -98,7 +98,10 @@ def test_a_policy_is_read_with_lists_or_single_patterns() -> None:
         ("listen: '[::g]:1'", "listen: expected an IP address, got '::g'"),
         ("listen: 'a:70000'", "listen: expected host:port with a port up to 65535, got 'a:70000'"),
         ("stun_listen: ['0.0.0.0:1', '0.0.0.0:1']", "stun_listen: expected each entry once, got '0.0.0.0:1' twice"),
-        ("stun_listen: [0.0.0.0:1, 2]", "stun_listen[1]: expected text, got 2"),
+        (
+            "stun_listen: [0.0.0.0:1, 2]",
+            "stun_listen[1]: expected address:port, such as [::]:2 for all addresses, got 2",
+        ),
         ("stun_servers: '0.0.0.0:3478'", "stun_servers[0]: expected an address that can be reached, got"),
         ("stun_servers: 'a:0'", "stun_servers[0]: expected host:port with a port from 1 to 65535, got 'a:0'"),
         ("log_level: loud", "log_level: expected 'debug', 'info', 'warning' or 'error', got 'loud'"),

@@ -255,7 +255,7 @@ def test_it_reads_what_explain_printed(tmp_path: Path, capsys: pytest.CaptureFix
         (("--traces", "DIR", "--deadline-ms", "9", "--compute-ms", "20:nan"), "expected MEDIAN:P99"),
         (("--traces", "DIR", "--deadline-ms", "nan"), "expected a number above 0"),
         (("--traces", "DIR", "--deadline-ms", "9", "--target", "1"), "below 1"),
-        (("--traces", "DIR", "--deadline-ms", "9", "--request-bytes", "0"), "bytes, got 0"),
+        (("--traces", "DIR", "--deadline-ms", "9", "--request-bytes", "0"), "from 1 to 16777216, got '0'"),
         (("--recorded", "DIR/one.csv"), "not an answer of plr explain --json"),
         (("--recorded", "DIR/none.json"), "none.json"),
         (("--recorded", "DIR/one.csv", "--rate-hz", "5"), "go with --traces"),

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import os
+import re
 import sys
 from typing import TYPE_CHECKING
 
 import pytest
 
+from controlplane import cli
 from controlplane.ca import Authority, AuthorityError, folder
 from controlplane.ca.actions import refuse_taken
 from controlplane.ca.files import write_atomically
@@ -81,7 +85,7 @@ def test_an_index_of_a_large_fleet_is_read_again_and_a_full_one_not_written(
     with kept.locked() as ca:
         ca.issue("r0", IdentityRole.ROBOT)
         (entry,) = ca.entries
-        many = [Entry(entry.name, entry.role, number, 0.0, 1.0, key="k" * 64) for number in range(20_000)]
+        many = [Entry(entry.name, entry.role, number, 0.0, 1.0, key="k" * 64) for number in range(1, 20_001)]
         ca.entries = [*many, entry]
         kept.save(ca)
     with kept.locked() as ca:
@@ -92,6 +96,64 @@ def test_an_index_of_a_large_fleet_is_read_again_and_a_full_one_not_written(
             kept.save(ca)
     monkeypatch.undo()
     assert len(kept.records()[0].entries) == 20_001
+
+
+@pytest.mark.audit("ops-14")
+@pytest.mark.parametrize(
+    ("pattern", "value"),
+    [
+        ('"not_after": [0-9.]*', '"not_after": NaN'),
+        ('"not_after": [0-9.]*', '"not_after": 1e300'),
+        ('"not_before": [0-9.]*', '"not_before": -1.0'),
+        ('"revoked_at": null', '"revoked_at": 1.0'),
+        ('"revoked_at": null', '"reason": "x", "revoked_at": Infinity'),
+        ('"serial": "[0-9a-f]*"', '"serial": "-1"'),
+        ('"crl_number": 0', '"crl_number": 99999999999999999999999999999999999999999999999999'),
+    ],
+)
+def test_an_index_that_somebody_damaged_is_told_in_one_line(
+    shell: Shell, tmp_path: Path, pattern: str, value: str
+) -> None:
+    ca = str(tmp_path / "ca")
+    shell("init", "--no-passphrase", "--dir", ca)
+    shell("issue", "r1", "--role", "robot", "--dir", ca)
+    index = tmp_path / "ca" / "index.json"
+    changed, times = re.subn(pattern, value, index.read_text())
+    assert times
+    index.write_text(changed)
+    for command in (("list",), ("publish",), ("issue", "r2", "--role", "robot"), ("revoke", "r1")):
+        assert "not what plr ca wrote" in shell(*command, "--dir", ca, code=2)
+
+
+@pytest.mark.audit("ops-8")
+def test_a_fifo_in_the_place_of_a_list_is_not_waited_for(shell: Shell, tmp_path: Path) -> None:
+    ca = tmp_path / "ca"
+    shell("init", "--no-passphrase", "--dir", str(ca))
+    shell("issue", "r1", "--role", "robot", "--dir", str(ca))
+    for path in (ca / "crl.pem", ca / "nodes" / "r1" / "crl.pem"):
+        path.unlink()
+        os.mkfifo(path)
+    shell("publish", "--dir", str(ca))
+    assert any("r1/crl.pem: not brought up to date" in line for line in shell.warnings)
+    assert (ca / "crl.pem").is_file()
+    os.mkfifo(tmp_path / "request.pem")
+    assert "no regular file" in shell("sign", str(tmp_path / "request.pem"), "--dir", str(ca), code=1)
+
+
+@pytest.mark.audit("ops-14")
+def test_what_is_done_is_not_called_refused_when_it_cannot_be_printed(
+    shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ca = str(tmp_path / "ca")
+    shell("init", "--no-passphrase", "--dir", ca)
+    for buffering in (-1, 0):
+        with io.TextIOWrapper(open("/dev/full", "wb", buffering), write_through=not buffering) as full:
+            monkeypatch.setattr(sys, "stdout", full)
+            assert cli.main(["ca", "issue", f"r{buffering}", "--role", "robot", "--dir", ca]) == 0
+            monkeypatch.undo()
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert error.startswith(f"plr: done, but it cannot be printed (No space left on device): issued r{buffering} ")
+    assert "r0 " in shell("list", "--dir", ca)
 
 
 def test_a_folder_that_cannot_be_brought_up_to_date_is_warned_of_and_stops_nothing(

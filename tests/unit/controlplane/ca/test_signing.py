@@ -205,7 +205,7 @@ def test_a_file_that_is_no_request_is_one_line(
 
 
 def test_an_endless_file_is_not_read_to_its_end(shell: Shell, ca: Path) -> None:
-    assert "longer than" in shell("sign", "/dev/zero", *ROBOT, code=1)
+    assert "it is no regular file" in shell("sign", "/dev/zero", *ROBOT, code=1)
 
 
 def test_no_ca_and_no_file_are_told(shell: Shell, ca: Path) -> None:

@@ -1,0 +1,67 @@
+"""How all programs read their command lines: a mistake is told in one line, fit for a terminal, with exit code 2."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, NoReturn, TypeVar
+
+from protos.errors import DecodeError
+from protos.printable import escaped
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Commands = argparse._SubParsersAction["OneLineParser"]
+
+N = TypeVar("N")
+
+EXIT_USAGE = 2
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Tells of a mistake in one line; so do the parsers of its commands."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, and end the program."""
+        # A glob names files of others, and argparse repeats what it does not know as it is.
+        self.exit(EXIT_USAGE, escaped(f"{self.prog}: {message}; see {self.prog} --help") + "\n")
+
+
+def checked(check: Callable[[str, str], N], what: str = "the name") -> Callable[[str], N]:
+    """An argument's type: what passes one of the checks of protos/names.py; `what` it is begins the error."""
+
+    def parse(text: str) -> N:
+        try:
+            return check(text, what)
+        except DecodeError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return parse
+
+
+def number(least: float, most: float) -> Callable[[str], float]:
+    """Return what reads a number from `least` to `most`, both finite."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"expected a number from {least:g} to {most:g}, got {text!r}")
+        return value
+
+    return read
+
+
+def whole(least: int, most: int) -> Callable[[str], int]:
+    """Return what reads a whole number from `least` to `most`."""
+    digits = len(str(most))
+
+    def read(text: str) -> int:
+        # Python refuses to read thousands of digits, by an error of its own.
+        if not (text.isascii() and text.isdigit() and len(text) <= digits and least <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"expected a whole number from {least} to {most}, got {text!r}")
+        return int(text)
+
+    return read
