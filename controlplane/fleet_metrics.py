@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from prometheus_client import Metric
 
-    from controlplane.core.fleet_view import MemberView, MissView
+    from controlplane.core.fleet_view import MemberView, MissView, ServedView
     from protos.fleet_events import DepartedSidecar
     from protos.model import NodeName
 
@@ -34,7 +34,10 @@ MAX_SERIES = 100_000
 """Of all members."""
 
 SERIES_OF_MEMBER = 6
-"""Of each at most, there or gone, beside a robot's own: a server's."""
+"""Of each at most, there or gone, beside a robot's own and a server's by service: a server's."""
+
+MAX_SERIES_OF_SERVICES = 20_000
+"""Of all servers by service, two for each; they have equal shares of it."""
 
 MAX_GONE = 1024
 """Members that are gone and still have series, those that went last."""
@@ -116,10 +119,20 @@ def families(fleet: Fleet) -> Iterable[Metric]:
     """Write everything down, while it is read."""
     fleet = replace(fleet, gone=fleet.gone[:MAX_GONE])
     robots = [member for member in fleet.members if member.role is Role.ROBOT]
-    free = MAX_SERIES - SERIES_OF_MEMBER * (len(fleet.members) + len(fleet.gone))
+    services = _services(fleet)
+    of_services = sum(2 * len(found) for _, found, _ in services)
+    free = MAX_SERIES - SERIES_OF_MEMBER * (len(fleet.members) + len(fleet.gone)) - of_services
     share = max(0, free) // max(1, len(robots))
     rooms = [(robot, _room(robot, share)) for robot in robots]
-    return (*_members(fleet), _servers(fleet), *_robots(rooms))
+    left_out = sum(room.left_out for _, room in rooms) + sum(2 * more for _, _, more in services)
+    return (*_members(fleet), _servers(fleet), *_served(services), *_robots(rooms), _left_out(left_out))
+
+
+def _services(fleet: Fleet) -> list[tuple[NodeName, Sequence[ServedView], int]]:
+    """Each server's services that have series, and how many more there are."""
+    servers = [member for member in fleet.members if member.role is Role.CLOUD]
+    most = MAX_SERIES_OF_SERVICES // 2 // max(1, len(servers))
+    return [(server.name, server.served[:most], len(server.served[most:])) for server in servers]
 
 
 def _room(robot: MemberView, share: int) -> _Room:
@@ -220,6 +233,27 @@ def _servers(fleet: Fleet) -> Metric:
     return _gauge("plr_server_robots", text, ("server", "path"), reach)
 
 
+def _served(services: Sequence[tuple[NodeName, Sequence[ServedView], int]]) -> Iterator[Metric]:
+    def up() -> Iterator[tuple[Labels, float]]:
+        yield from (((server, one.service), float(one.up)) for server, found, _ in services for one in found)
+
+    def unanswered() -> Iterator[tuple[Labels, float]]:
+        yield from (((server, one.service), float(one.unanswered)) for server, found, _ in services for one in found)
+
+    labels = ("server", "service")
+    text = "1 while a node beside the server's sidecar serves it; 0: its configuration names it, or it was served."
+    yield _gauge("plr_server_service_up", text, labels, up)
+    text = "Requests in a row that the server had and did not answer, of those that robots measure."
+    yield _gauge("plr_server_service_unanswered", text, labels, unanswered)
+
+
+def _left_out(series: int) -> Metric:
+    def rows() -> Iterator[tuple[Labels, float]]:
+        yield (), float(series)
+
+    return _gauge("plr_fleet_series_left_out", "Series of robots and servers beyond their share.", (), rows)
+
+
 def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     def misses(pick: Callable[[MissView], float | None], before: Sequence[Callable[[MissView], float | None]]) -> Rows:
         def rows() -> Iterator[tuple[Labels, float]]:
@@ -269,6 +303,9 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
             for interface in robot.interfaces[: room.interfaces]:
                 yield (robot.name, interface.name), float(interface.up)
 
+    def servers() -> Iterator[tuple[Labels, float]]:
+        yield from (((robot.name,), float(robot.servers)) for robot, _ in rooms)
+
     def follows() -> Iterator[tuple[Labels, float]]:
         yield from (((robot.name,), float(robot.follows)) for robot, _ in rooms)
 
@@ -283,9 +320,6 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
             for path in robot.paths[: room.round_trips]:
                 if not math.isnan(path.round_trip_s):
                     yield (robot.name, path.interface, path.server), path.round_trip_s
-
-    def left_out() -> Iterator[tuple[Labels, float]]:
-        yield (), float(sum(room.left_out for _, room in rooms))
 
     path, service = ("robot", "interface", "server"), ("robot", "service")
     yield _gauge(
@@ -340,6 +374,7 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     yield _gauge(
         "plr_robot_mapping_synced", "1 while the robot has confirmed the mapping sent last.", ("robot",), follows
     )
+    yield _gauge("plr_robot_servers", "Servers that the robot was told of, as sent last.", ("robot",), servers)
     yield _info(
         "plr_robot_mapping",
         "Over which interfaces to which servers requests go.",
@@ -347,4 +382,3 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
         mapped,
     )
     yield _gauge("plr_robot_path_rtt_seconds", "Median round trip of the robot's path.", path, round_trips)
-    yield _gauge("plr_fleet_series_left_out", "Series of robots beyond their share.", (), left_out)

@@ -274,6 +274,7 @@ def _drops(core: ControlCore, superseded: int, dropped: Mapping[str, int], event
             ("mapping_history_evicted",): core.history.dropped,
             ("departure_forgotten",): core.departed.forgotten,
             ("reach_forgotten",): core.reached.forgotten,
+            ("unanswered_forgotten",): core.unanswered.forgotten,
             ("event_evicted",): events.evicted,
             ("event_too_often",): events.too_often,
             ("event_damaged",): events.damaged,

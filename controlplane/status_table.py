@@ -36,7 +36,8 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
     lines += columns([_HEADER, *(_row(status) for status in sidecars)])
     offered = sorted({offer.name for status in sidecars for offer in status.peer.offers})
     for status in sidecars:
-        details = [*_details(status), *_unmet(status, offered), *_revocations(status.revocations, newest, now_wall)]
+        details = [*_details(status), *_unmet(status, offered), *_unserved(status)]
+        details += _revocations(status.revocations, newest, now_wall)
         if details:
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in details)]
     abridged = sum(status.abridged for status in sidecars)
@@ -77,6 +78,13 @@ def _details(status: SidecarStatus) -> Iterator[str]:
     yield from columns([_path(path) for path in status.paths])
     for interface in status.down:
         yield f"{interface} DOWN: it would be used, and is not there, or has no link or no address"
+
+
+def _unserved(status: SidecarStatus) -> Iterator[str]:
+    for name in status.withdrawn:
+        yield f"LOST {name}: a node there offered it, and none does now"
+    for name, requests in status.unanswered.items():
+        yield f"UNANSWERED {name}: had the last {requests} requests that robots measured, and answered none of them"
 
 
 def _unmet(status: SidecarStatus, offered: Sequence[str]) -> Iterator[str]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from protos.model import NO_REVOCATIONS, RevocationSet, Version
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from protos.model import InterfaceName, NodeName, PathReport, Peer, ServiceMapping, ServiceName, ServiceUse
 
 _NONE_YET = Version(0)
@@ -65,5 +67,9 @@ class SidecarStatus:
     """Services that its configuration names and nobody serves."""
     down: tuple[InterfaceName, ...] = ()
     """Interfaces that it would use and that carry nothing now."""
+    withdrawn: tuple[ServiceName, ...] = ()
+    """Services that it offered since it registered, does not now, and that its configuration does not name."""
+    unanswered: Mapping[ServiceName, int] = field(default_factory=dict)
+    """How many requests in a row it had and did not answer, by service; those without any are left out."""
     abridged: bool = False
     """Its addresses, mapping and paths are left out, as it is in order and one of many."""

@@ -51,6 +51,7 @@ from controlplane.core.restlessness import Restlessness
 from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
 from controlplane.core.status import is_met, statuses
+from controlplane.core.unanswered import Unanswered
 from controlplane.core.urgency import Urgency
 from protos.errors import DecodeError
 from protos.fleet_events import Why
@@ -154,6 +155,7 @@ class ControlCore:
         self.restlessness = Restlessness()
         self.urgency = Urgency()
         self.reached = Reached()
+        self.unanswered = Unanswered()
         self._publish_at: float | None = None
         self._publications: deque[Iterator[Send | None]] = deque()
         """Begun, and told to some; the first one goes on first."""
@@ -179,6 +181,7 @@ class ControlCore:
         self._streams[stream] = name
         if result.new_run:
             self._forget_paths(name)
+            self._begin_serving(name)
         self._publisher.begin_stream(registration)
         self._welcome(name, stream)
         self._came_or_went(name, registration.role, now)
@@ -229,6 +232,8 @@ class ControlCore:
             if told.unmet and known is not None and told.unmet != known.unmet:
                 self._events.append(UnmetNotice(name, told.unmet))
             changed = self.registry.set_services(name, told)
+            offered = {one.name for one in known.offers} if known is not None else set()
+            self.unanswered.begin(name, offered ^ {one.name for one in told.offers})
         sidecar = self.registry.get(name)
         if changed and sidecar is not None:
             self._publisher.changed(name, sidecar.role)
@@ -252,6 +257,7 @@ class ControlCore:
         for path in report.paths:
             if path.up:
                 self.reached.note(name, path.server)
+        self.unanswered.note(report.latencies)
         surprised = self._drawing.reported(name, report)
         change = Change.MISSES if surprised else Change.REPORT
         if self.estimator.merge(name, report, now):
@@ -482,10 +488,16 @@ class ControlCore:
         self.departed.note(gone, last)
         self._events.append(DepartureNotice(name, gone))
         self._forget_paths(name)
+        self.unanswered.begin(name, sidecar.offered)
         self._refused_offers.forget(name)
         self.restlessness.forget(name)
         self._publisher.forget(name, sidecar.role)
         del self._told_intervals[name]
+
+    def _begin_serving(self, name: NodeName) -> None:
+        sidecar = self.registry.get(name)
+        if sidecar is not None:
+            self.unanswered.begin(name, sidecar.offered)
 
     def _forget_paths(self, name: NodeName) -> None:
         self.estimator.forget_paths(name)
@@ -624,7 +636,16 @@ class ControlCore:
         if names is None:
             names = sorted(sidecar.name for sidecar in self.registry)
         return list(
-            statuses(names, self.registry, self._publisher, self.estimator, self.permits, now, abridged=abridged)
+            statuses(
+                names,
+                self.registry,
+                self._publisher,
+                self.estimator,
+                self.permits,
+                self.unanswered,
+                now,
+                abridged=abridged,
+            )
         )
 
     def explain(self, robot: NodeName, service: ServiceName, now: float) -> Explanation:
@@ -658,13 +679,15 @@ class ControlCore:
             return None
         return view_of(
             sidecar,
-            self._publisher[name].mapping,
+            self._publisher[name],
             self.plan,
             self._picture,
             self.estimator,
             self.reached,
+            self.unanswered,
             is_there=lambda server: is_met(name, server, self.registry, self.permits),
             is_offered=self.registry.is_offered,
+            may_offer=lambda service: self.permits.may_offer(name, service),
             seen_at=self.registry.heard_at(name, now),
             now=now,
         )

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from controlplane.core.plan import Plan
     from controlplane.core.reached import Reached
     from controlplane.core.registry import Sidecar
-    from controlplane.core.snapshots import Track
+    from controlplane.core.snapshots import Snapshots
+    from controlplane.core.unanswered import Unanswered
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
 
 MAX_VIEWED = 512
@@ -69,6 +70,17 @@ class MissView:
 
 
 @dataclass(frozen=True, slots=True)
+class ServedView:
+    """One service of a server."""
+
+    service: ServiceName
+    up: bool
+    """Whether a node beside its sidecar serves it now, or else is missed."""
+    unanswered: int
+    """Requests in a row, of those that robots measure, that it had and did not answer."""
+
+
+@dataclass(frozen=True, slots=True)
 class MemberView:
     """One registered sidecar."""
 
@@ -88,26 +100,34 @@ class MemberView:
     """Servers that it does not reach, and nobody ever has."""
     follows: bool = True
     """Whether it has confirmed the mapping that it was sent last, if there is one."""
+    servers: int = 0
+    """How many servers a robot was told of: registered, and the policy lets it call something there."""
+    served: tuple[ServedView, ...] = ()
+    """Of a server that is not about to go: what it serves, and before that what it should."""
 
 
 def view_of(
     sidecar: Sidecar,
-    mapping: Track[tuple[ServiceMapping, ...]],
+    snapshots: Snapshots,
     plan: Plan,
     picture: Picture,
     estimator: Estimator,
     reached: Reached,
+    unanswered: Unanswered,
     *,
     is_there: Callable[[NodeName], bool],
     is_offered: Callable[[ServiceName], bool],
+    may_offer: Callable[[ServiceName], bool],
     seen_at: float,
     now: float,
 ) -> MemberView:
     """Look at one; some 40 us for a robot with 15 paths. `is_there` tells which servers the robot has to
-    do with, `is_offered` which services anybody offers."""
+    do with, `is_offered` which services anybody offers, `may_offer` which ones the policy lets a cloud offer."""
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
-        return MemberView(sidecar.name, sidecar.role, connected, seen_at)
+        served = _served(sidecar, unanswered, may_offer)
+        return MemberView(sidecar.name, sidecar.role, connected, seen_at, served=served)
+    mapping, peers = snapshots.mapping, snapshots.peers.sent
     # Whatever a robot reports: it makes no series of interfaces that it has not announced, nor of servers that are
     # gone.
     carriers = dict.fromkeys(interfaces_of(sidecar)[:MAX_VIEWED], "")
@@ -140,7 +160,18 @@ def view_of(
         lost=frozenset(server for server in unreached if reached.by(sidecar.name, server)),
         unproven=frozenset(server for server in unreached if not reached.by_anyone(server)),
         follows=mapping.state not in (SyncState.STALE, SyncState.REJECTED),
+        servers=len(peers.peers) if peers is not None else 0,
     )
+
+
+def _served(cloud: Sidecar, unanswered: Unanswered, may_offer: Callable[[ServiceName], bool]) -> tuple[ServedView, ...]:
+    if cloud.draining:
+        return ()
+    missed = sorted({*cloud.unmet, *cloud.withdrawn})
+    found = [ServedView(name, False, 0) for name in missed if may_offer(name)]
+    offered = (offer.name for offer in cloud.offers if may_offer(offer.name))
+    found += (ServedView(name, True, unanswered.row(cloud.name, name)) for name in offered)
+    return tuple(found[:MAX_VIEWED])
 
 
 def _paths_of_services(

@@ -132,6 +132,11 @@ class Sidecar:
         """Services that its configuration names and nobody serves."""
         return self.services.unmet if self.services is not None else ()
 
+    @property
+    def withdrawn(self) -> frozenset[ServiceName]:
+        """Services that it offered since it registered, and does not now."""
+        return self.offered.difference(offer.name for offer in self.offers)
+
     def as_peer(self) -> Peer:
         """What its peers are told of it, but with its own token; each is told the one made for it (`ToldPeers`)."""
         # A signature of the run before, or of the certificate before, is none under this credential: they say it anew

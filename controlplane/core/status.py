@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from controlplane.core.permits import Permits
     from controlplane.core.publisher import Publisher
     from controlplane.core.registry import Registry
+    from controlplane.core.unanswered import Unanswered
     from protos.model import NodeName
 
 
@@ -30,6 +31,7 @@ def statuses(
     publisher: Publisher,
     estimator: Estimator,
     permits: Permits,
+    unanswered: Unanswered,
     now: float,
     *,
     abridged: bool,
@@ -63,5 +65,9 @@ def statuses(
             revocations=sidecar.revocations,
             unmet=sidecar.unmet,
             down=tuple(label.interface for label in sidecar.down),
+            withdrawn=tuple(sorted(sidecar.withdrawn.difference(sidecar.unmet))),
+            unanswered={
+                offer.name: row for offer in sidecar.offers if (row := unanswered.row(sidecar.name, offer.name))
+            },
             abridged=shorter,
         )

@@ -35,7 +35,9 @@ from protos.plr.v1 import admin_pb2
 from protos.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
+
+    from protos.model import ServiceName
 
 _SYNC_STATES = {
     admin_pb2.SYNC_STATE_NOT_SENT: SyncState.NOT_SENT,
@@ -91,6 +93,8 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         revocations=revocations_from_proto(message.revocations),
         unmet=service_names(message.unmet, MAX_UNMET, "unmet"),
         down=interface_names(message.down, "down"),
+        withdrawn=service_names(message.withdrawn, MAX_OFFERS, "withdrawn"),
+        unanswered=_unanswered_from_proto(message.unanswered),
         abridged=message.abridged,
     )
 
@@ -110,8 +114,18 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         revocations=revocations_to_proto(status.revocations),
         unmet=status.unmet,
         down=status.down,
+        withdrawn=status.withdrawn,
+        unanswered=(
+            admin_pb2.UnansweredService(service=service, requests=requests)
+            for service, requests in status.unanswered.items()
+        ),
         abridged=status.abridged,
     )
+
+
+def _unanswered_from_proto(messages: Collection[admin_pb2.UnansweredService]) -> dict[ServiceName, int]:
+    names = service_names([message.service for message in messages], MAX_OFFERS, "unanswered")
+    return {name: message.requests for name, message in zip(names, messages, strict=True)}
 
 
 def resource_from_proto(message: admin_pb2.ResourceStatus) -> ResourceStatus:

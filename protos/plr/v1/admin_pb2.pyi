@@ -273,6 +273,8 @@ class SidecarStatus(_message.Message):
     UNMET_FIELD_NUMBER: _builtins.int
     ABRIDGED_FIELD_NUMBER: _builtins.int
     DOWN_FIELD_NUMBER: _builtins.int
+    WITHDRAWN_FIELD_NUMBER: _builtins.int
+    UNANSWERED_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
@@ -306,6 +308,14 @@ class SidecarStatus(_message.Message):
     def down(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Interfaces that it would use and that carry nothing now."""
 
+    @_builtins.property
+    def withdrawn(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Clouds: services it offered since it registered, does not now, and that its configuration does not name."""
+
+    @_builtins.property
+    def unanswered(self) -> _containers.RepeatedCompositeFieldContainer[Global___UnansweredService]:
+        """Clouds: services whose requests it had and did not answer, since it answered one last."""
+
     def __init__(
         self,
         *,
@@ -323,14 +333,39 @@ class SidecarStatus(_message.Message):
         unmet: _abc.Iterable[_builtins.str] | None = ...,
         abridged: _builtins.bool = ...,
         down: _abc.Iterable[_builtins.str] | None = ...,
+        withdrawn: _abc.Iterable[_builtins.str] | None = ...,
+        unanswered: _abc.Iterable[Global___UnansweredService] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unmet", b"unmet", "uses", b"uses"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unanswered", b"unanswered", "unmet", b"unmet", "uses", b"uses", "withdrawn", b"withdrawn"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___SidecarStatus: _TypeAlias = SidecarStatus  # noqa: Y015
+
+@_typing.final
+class UnansweredService(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SERVICE_FIELD_NUMBER: _builtins.int
+    REQUESTS_FIELD_NUMBER: _builtins.int
+    service: _builtins.str
+    requests: _builtins.int
+    """In a row, of those that robots measure."""
+    def __init__(
+        self,
+        *,
+        service: _builtins.str = ...,
+        requests: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["requests", b"requests", "service", b"service"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___UnansweredService: _TypeAlias = UnansweredService  # noqa: Y015
 
 @_typing.final
 class DepartedSidecar(_message.Message):

@@ -16,19 +16,36 @@ from controlplane.config import ControlPlaneConfig
 from controlplane.core.control_events import Settings
 from controlplane.core.departed import Departure
 from controlplane.core.fading import FadedHistogram
-from controlplane.core.fleet_view import InterfaceView, MemberView, MissView, PathView
-from controlplane.core.policy import Policy
+from controlplane.core.fleet_view import (
+    MAX_VIEWED,
+    InterfaceView,
+    MemberView,
+    MissView,
+    PathView,
+    ServedView,
+)
+from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.registry import Refusal
+from controlplane.core.unanswered import MAX_ROWS, Unanswered
 from controlplane.event_log import EventLog
-from controlplane.fleet_metrics import MAX_GONE, MAX_SERIES, REUSED_S, Fleet, FleetCollector, families
+from controlplane.fleet_metrics import (
+    MAX_GONE,
+    MAX_SERIES,
+    MAX_SERIES_OF_SERVICES,
+    REUSED_S,
+    Fleet,
+    FleetCollector,
+    families,
+)
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
 from controlplane.status_table import render
 from protos.fleet_events import DepartedSidecar, Why
-from protos.histogram import Histogram
+from protos.histogram import MAX_COUNT, Histogram
 from protos.model import (
     Assignment,
     CandidateSet,
+    Drain,
     InterfaceName,
     NodeName,
     OutcomeReport,
@@ -41,7 +58,16 @@ from protos.model import (
 from protos.preferences import InterfaceLabel
 from protos.redundancy_mode import RedundancyMode
 from tests.sim.control_world import SETTLED_S, SimSidecar, World
-from tests.unit.controlplane.samples import PLAN, histogram, interfaces, offer, path, registration, use
+from tests.unit.controlplane.samples import (
+    PLAN,
+    histogram,
+    interfaces,
+    latency,
+    offer,
+    path,
+    registration,
+    use,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -214,6 +240,123 @@ def test_a_policy_that_forbids_a_service_leaves_it_no_path() -> None:
     assert value(found, "plr_robot_service_paths", robot="robot", service=PLAN) == 0.0
 
 
+def served(world: World, server: str) -> dict[str, tuple[float, float | None]]:
+    """Whether it serves each service, and how many requests in a row it left unanswered."""
+    found = series(families(fleet_of(world)))
+    ups = {key[1]: up for key, up in found.items() if key[0] == "plr_server_service_up"}
+    return {
+        dict(labels)["service"]: (up, found["plr_server_service_unanswered", labels])
+        for labels, up in ups.items()
+        if ("server", server) in labels
+    }
+
+
+@pytest.mark.audit("ops-12")
+def test_a_server_that_lost_a_service_is_told_of_and_one_that_goes_in_order_is_not() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    server = world.cloud("a")
+    assert served(world, "a") == {PLAN: (1.0, 0.0)}
+    world.say(server, ServiceSet(unmet=(ServiceName("/named"),)))
+    assert served(world, "a") == {PLAN: (0.0, 0.0), "/named": (0.0, 0.0)}, "by a glob, and by its name"
+    (status,) = world.core.status(world.now)
+    assert (status.withdrawn, status.unmet) == ((PLAN,), ("/named",))
+    assert f"LOST {PLAN}" in render([status])
+    world.say(server, ServiceSet((offer(), offer("/named"))))
+    assert served(world, "a") == {PLAN: (1.0, 0.0), "/named": (1.0, 0.0)}
+    world.say(server, ServiceSet((offer("/named"),)))
+    world.say(server, Drain())
+    assert served(world, "a") == {}, "it is about to be stopped"
+    world.leave(server)
+    world.say(world.join(registration("a", Role.CLOUD)), ServiceSet((offer("/named"),)))
+    assert served(world, "a") == {"/named": (1.0, 0.0)}, "a new run, which may be configured otherwise"
+
+
+@pytest.mark.audit("ops-12")
+def test_what_the_policy_lets_nobody_offer_is_not_missed() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    server = world.cloud("a")
+    world.say(server, ServiceSet(unmet=(ServiceName("/named"),)))
+    world.core.set_policy(Policy(), world.now)
+    assert served(world, "a") == {}
+
+
+@pytest.mark.audit("ops-12")
+def test_a_server_that_answers_nobody_is_told_of_until_it_answers_somebody() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    server = world.cloud("a")
+    world.cloud("b")
+    robot, other = world.robot(), world.robot("other")
+
+    def reports(who: SimSidecar, *, answered: int = 0, lost: int = 0, name: str = "a") -> float | None:
+        times = histogram(0.01, times=answered, lost=lost)
+        world.say(who, Report(latencies=(latency("wlan0", name, histogram(0.02), processing=times),)))
+        return served(world, "a")[PLAN][1]
+
+    assert reports(robot, answered=3) == 0.0
+    assert reports(robot, lost=3) == 3.0
+    assert reports(robot) == 3.0, "what the network lost tells nothing of it"
+    assert reports(robot, answered=9, name="b") == 3.0, "nor what another server answers"
+    assert reports(other, lost=4) == 7.0
+    (status,) = world.core.status(world.now, [NodeName("a")])
+    assert status.unanswered == {PLAN: 7}
+    assert f"UNANSWERED {PLAN}: had the last 7 requests" in render([status])
+    of_both = (histogram(0.01), histogram(lost=9))
+    latencies = [
+        latency(nic, "a", Histogram(), processing=of) for nic, of in zip(("wlan0", "wwan0"), of_both, strict=True)
+    ]
+    world.say(other, Report(latencies=tuple(latencies)))
+    assert served(world, "a")[PLAN] == (1.0, 0.0)
+    assert reports(robot, lost=5) == 5.0
+    world.say(server, ServiceSet())
+    world.say(server, ServiceSet((offer(),)))
+    assert served(world, "a") == {PLAN: (1.0, 0.0)}, "its node was started anew"
+    assert reports(robot, lost=5) == 5.0
+    world.drop_stream(server)
+    world.say(world.join(registration("a", Role.CLOUD, incarnation=2)), ServiceSet((offer(),)))
+    assert served(world, "a") == {PLAN: (1.0, 0.0)}, "the whole host was"
+    assert len(world.core.unanswered) == 0
+
+
+@pytest.mark.audit("ops-12")
+def test_who_is_gone_has_no_row_of_unanswered_requests_and_rows_are_bounded() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    server = world.cloud("a")
+    robot = world.robot()
+    world.say(robot, Report(latencies=(latency("wlan0", "a", histogram(0.02), processing=histogram(lost=5)),)))
+    assert len(world.core.unanswered) == 1
+    world.leave(server)
+    assert len(world.core.unanswered) == 0
+    rows = Unanswered()
+    for number in range(MAX_ROWS + 2):
+        for name in (f"cloud-{number}", "cloud-0"):
+            rows.note([latency("wlan0", name, Histogram(), processing=histogram(lost=MAX_COUNT))])
+    assert (len(rows), rows.forgotten) == (MAX_ROWS, 2)
+    assert rows.row(NodeName("cloud-0"), PLAN) == MAX_COUNT
+    assert rows.row(NodeName("cloud-1"), PLAN) == 0
+
+
+@pytest.mark.audit("ops-12")
+def test_a_robot_is_told_of_the_servers_that_the_policy_lets_it_call() -> None:
+    """Where the only one is stopped, no network of the robot is at fault."""
+    world = World(Settings(warm_up_s=0.0))
+    first = world.cloud("a")
+    world.cloud("b")
+    world.robot("first")
+    world.robot("second")
+
+    def servers() -> list[float | None]:
+        world.run(SETTLED_S)
+        found = series(families(fleet_of(world)))
+        return [value(found, "plr_robot_servers", robot=name) for name in ("first", "second")]
+
+    assert servers() == [2.0, 2.0]
+    calls = (CallRule(("first",), ("*",), ("a",)), CallRule(("second",), ("*",), ("*",)))
+    world.core.set_policy(Policy(calls, (OfferRule(("*",), ("*",)),)), world.now)
+    assert servers() == [1.0, 2.0]
+    world.leave(first)
+    assert servers() == [0.0, 1.0]
+
+
 def test_who_has_never_reached_a_server_is_no_witness_of_its_end() -> None:
     """Of two sites, each with a server that the other's robots do not reach."""
     world = World(Settings(warm_up_s=0.0))
@@ -365,16 +508,22 @@ def robot_view(name: str, interfaces: int, servers: int, services: int) -> Membe
     )
 
 
-def fleet(robots: list[MemberView], *, gone: int = 0) -> Fleet:
-    clouds = [MemberView(NodeName(f"cloud-{number}"), Role.CLOUD, True, 0.0) for number in range(5)]
-    members = [*robots, *clouds]
+def cloud_view(name: str, services: int) -> MemberView:
+    served = tuple(ServedView(ServiceName(f"/service_{number}"), up=True, unanswered=0) for number in range(services))
+    return MemberView(NodeName(name), Role.CLOUD, True, 0.0, served=served)
+
+
+def fleet(robots: list[MemberView], *, gone: int = 0, clouds: int = 5, services: int = 1) -> Fleet:
+    servers = [cloud_view(f"cloud-{number}", services) for number in range(clouds)]
+    members = [*robots, *servers]
     left = [DepartedSidecar(NodeName(f"gone-{n}"), Role.ROBOT, Why.LEASE_EXPIRED, 1.0, 1.0) for n in range(gone)]
     return Fleet(members, left, {member.name: 1.0 for member in members}, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(("services", "expected"), [(1, 49_031), (4, 76_031)])
+@pytest.mark.parametrize(("services", "expected"), [(1, 50_041), (4, 77_071)])
 def test_a_thousand_robots_take_as_many_series_as_documented(services: int, expected: int) -> None:
-    found = series(families(fleet([robot_view(f"robot-{number}", 3, 5, services) for number in range(1000)])))
+    robots = [robot_view(f"robot-{number}", 3, 5, services) for number in range(1000)]
+    found = series(families(fleet(robots, services=services)))
     assert len(found) == expected
     assert value(found, "plr_fleet_series_left_out") == 0.0
 
@@ -385,14 +534,28 @@ def test_series_are_bounded_and_one_robot_takes_none_of_others() -> None:
     found = series(families(fleet([greedy, *robots], gone=MAX_GONE)))
     assert len(found) <= MAX_SERIES + 1
     of_robot = Counter(dict(labels).get("robot") for _, labels in found)
-    assert {of_robot[f"robot-{number}"] for number in range(999)} == {73}
+    assert {of_robot[f"robot-{number}"] for number in range(999)} == {74}
     assert of_robot["greedy"] < 100
     assert (value(found, "plr_fleet_series_left_out") or 0.0) > 1000.0
+
+
+def test_servers_have_equal_shares_for_their_services_and_what_is_missed_comes_first() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    server = world.cloud("a")
+    world.say(server, ServiceSet(tuple(offer(f"/glob/{number:04}") for number in range(1000)), unmet=(PLAN,)))
+    (view,) = fleet_of(world).members
+    assert (view.served[0], len(view.served)) == (ServedView(PLAN, up=False, unanswered=0), MAX_VIEWED)
+    found = series(families(fleet([], clouds=100, services=MAX_VIEWED)))
+    of_server = Counter(dict(labels)["server"] for name, labels in found if name == "plr_server_service_up")
+    assert set(of_server.values()) == {MAX_SERIES_OF_SERVICES // 2 // 100}
+    left_out = 100 * (MAX_VIEWED - MAX_SERIES_OF_SERVICES // 2 // 100) * 2
+    assert value(found, "plr_fleet_series_left_out") == left_out
 
 
 def test_also_as_many_members_as_can_be_there_at_all() -> None:
     robots = [robot_view(f"robot-{number}", 8, 8, 8) for number in range(4096)]
     assert len(series(families(fleet(robots, gone=MAX_GONE)))) <= MAX_SERIES + 1
+    assert len(series(families(fleet(robots[:3000], gone=MAX_GONE, clouds=1096, services=64)))) <= MAX_SERIES + 1
 
 
 @pytest.mark.parametrize("seconds", [0.001, 0.03, 5.0])
