@@ -6,6 +6,9 @@ import json
 import re
 import shutil
 import subprocess
+import time
+import urllib.error
+import urllib.request
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +29,7 @@ from sidecar.core.control_session import ControlStats
 from sidecar.core.stats import EngineStats
 from sidecar.metrics import MetricSources, SidecarCollector
 from sidecar.revocations import RevocationState
+from tests.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -83,7 +87,10 @@ BEYOND_CONTRACT: dict[str, set[str]] = {
     "plr_robot_requests_missed_total": {"robot", "service"},
     "plr_robot_requests_total": {"robot", "service"},
     "plr_robot_service_paths": {"robot", "service"},
+    "plr_robot_servers": {"robot"},
     "plr_server_robots": {"server", "path"},
+    "plr_server_service_unanswered": {"server", "service"},
+    "plr_server_service_up": {"server", "service"},
     "plr_service_unmet": {"service"},
     "plr_sidecar_certificate_expiry_timestamp_seconds": {"sidecar", "role"},
     "plr_sidecar_gone_info": {"sidecar", "role", "why"},
@@ -265,15 +272,126 @@ def test_the_alertmanager_accepts_its_configuration() -> None:
 
 
 @pytest.mark.audit("ops-12")
-def test_what_a_stranger_can_cause_keeps_back_next_to_nothing() -> None:
+def test_what_a_stranger_can_cause_keeps_back_nothing() -> None:
     config = yaml.safe_load((PROMETHEUS / "alertmanager.yml").read_text())
     causes = re.compile('alertname="(PlrControlPlaneOverloaded|PlrConnectionsRefused)"')
-    kept_back = [
-        inhibits["target_matchers"]
-        for inhibits in config["inhibit_rules"]
-        if causes.match(inhibits["source_matchers"][0])
+    assert not [rule for rule in config["inhibit_rules"] if causes.match(rule["source_matchers"][0])]
+
+
+@pytest.fixture(scope="module")
+def alertmanager(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a real one with the shipped configuration; nobody hears what it notifies."""
+    program = shutil.which("prometheus-alertmanager")
+    assert program, "prometheus-alertmanager is missing: run deploy/dev/setup.sh"
+    address = f"127.0.0.1:{free_port()}"
+    options = ["--storage.path", str(tmp_path_factory.mktemp("alertmanager")), "--cluster.listen-address="]
+    command = [
+        program,
+        "--config.file",
+        str(PROMETHEUS / "alertmanager.yml"),
+        "--web.listen-address",
+        address,
+        *options,
     ]
-    assert kept_back == [['alertname="PlrMappingStale"']]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+        try:
+            give_up_at = time.monotonic() + 30.0
+            while not ask(f"http://{address}/-/ready"):
+                assert process.poll() is None
+                assert time.monotonic() < give_up_at
+                time.sleep(0.05)
+            yield f"http://{address}/api/v2/alerts"
+        finally:
+            process.terminate()
+
+
+def ask(url: str, sent: object = None) -> bytes:
+    """What it answers; nothing if it does not."""
+    body = None if sent is None else json.dumps(sent).encode()
+    request = urllib.request.Request(url, body, {"Content-Type": "application/json"})
+    try:
+        with urllib.request.urlopen(request, timeout=10.0) as answer:
+            return bytes(answer.read()) or b" "
+    except urllib.error.URLError:
+        return b""
+
+
+Labels = dict[str, str]
+
+
+@pytest.mark.audit("ops-12")
+@pytest.mark.parametrize(
+    ("cause", "kept_back", "told"),
+    [
+        (
+            {"alertname": "PlrRobotNoPath", "robot": "r1"},
+            [{"alertname": "PlrMissesAboveTarget", "robot": "r1", "service": "/s"}],
+            [
+                {"alertname": "PlrMissesAboveTarget", "robot": "r2", "service": "/s"},
+                {"alertname": "PlrMappingStale", "robot": "r1"},
+            ],
+        ),
+        (
+            {"alertname": "PlrMissesAboveTarget", "robot": "r3", "service": "/s"},
+            [{"alertname": "PlrMissesAbovePrediction", "robot": "r3", "service": "/s"}],
+            [{"alertname": "PlrMissesAbovePrediction", "robot": "r3", "service": "/other"}],
+        ),
+        (
+            {"alertname": "PlrCertificateEnded", "sidecar": "r1"},
+            [{"alertname": "PlrCertificateEnding", "sidecar": "r1"}],
+            [{"alertname": "PlrCertificateEnding", "sidecar": "r2"}],
+        ),
+        # What follows from these lasts seconds, or is another alert's business.
+        ({"alertname": "PlrCarrierDown", "carrier": "c"}, [], [{"alertname": "PlrRobotUnreachable", "robot": "r4"}]),
+        (
+            {"alertname": "PlrServerDown", "server": "a"},
+            [],
+            [
+                {"alertname": "PlrServerLostService", "server": "b", "service": "/s"},
+                {"alertname": "PlrServerAnswersNobody", "server": "b", "service": "/s"},
+                {"alertname": "PlrServiceUnserved", "service": "/s"},
+            ],
+        ),
+        ({"alertname": "PlrControlPlaneOverloaded"}, [], [{"alertname": "PlrMappingStale", "robot": "r4"}]),
+        # Last, as it keeps back most.
+        (
+            {"alertname": "PlrControlPlaneDown"},
+            [
+                {"alertname": "PlrServerLostService", "server": "a", "service": "/s"},
+                {"alertname": "PlrServerAnswersNobody", "server": "a", "service": "/s"},
+                {"alertname": "PlrNotConnected", "sidecar": "a"},
+                {"alertname": "PlrRobotUnreachable", "robot": "r5"},
+            ],
+            [
+                {"alertname": "PlrServiceUnserved", "service": "/s"},
+                {"alertname": "PlrRequestsFailed", "sidecar": "r1", "service": "/s"},
+                {"alertname": "PlrRevocationListTooOld", "sidecar": "r1"},
+            ],
+        ),
+    ],
+    ids=lambda labels: labels["alertname"] if isinstance(labels, dict) else "",
+)
+def test_an_alert_keeps_back_what_follows_from_it_and_nothing_else(
+    alertmanager: str, cause: Labels, kept_back: list[Labels], told: list[Labels]
+) -> None:
+    """In a real Alertmanager."""
+    severities = {rule["alert"]: rule["labels"]["severity"] for rule in alerts()}
+    sent = [labels | {"severity": severities[labels["alertname"]]} for labels in (cause, *kept_back, *told)]
+    assert ask(alertmanager, [{"labels": labels} for labels in sent])
+    wanted = {labels["alertname"] + str(sorted(labels.items())) for labels in sent[1 : 1 + len(kept_back)]}
+
+    def found() -> tuple[bool, set[str]]:
+        known = [one for one in json.loads(ask(alertmanager)) if one["labels"] in sent]
+        complete = len(known) == len(sent) and all(one["status"]["state"] != "unprocessed" for one in known)
+        kept = [one["labels"] for one in known if one["status"]["inhibitedBy"]]
+        return complete, {labels["alertname"] + str(sorted(labels.items())) for labels in kept}
+
+    give_up_at = time.monotonic() + 30.0
+    while found() != (True, wanted) and time.monotonic() < give_up_at:
+        time.sleep(0.05)
+    assert found() == (True, wanted)
+    over = [{"labels": labels, "endsAt": "2020-01-01T00:00:00Z"} for labels in sent]
+    assert ask(alertmanager, over)
 
 
 def alerts() -> list[dict[str, Any]]:
