@@ -23,6 +23,7 @@ with extras.required("plr-sidecar", "sidecar"):
     from protos.errors import ConfigError, StartError
     from protos.log_lines import line_formatter
     from protos.logging_setup import Logging
+    from protos.model import Role
     from protos.printable import escaped
     from protos.tls_files import load_tls_files
     from protos.version_option import ShowVersion
@@ -85,6 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _warn_of_short_deadlines(config)
             _check_certificate(config)
             _check_ros(thorough=True)
+            _warn_of_missing_types(config)
             sys.stdout.write(f"{escaped(str(options.config))}: ok\n")
             return EXIT_OK
         return _run(config)
@@ -133,6 +135,17 @@ def _check_ros(*, thorough: bool) -> None:
     problem = environment.problem(thorough=thorough)
     if problem is not None:
         raise ConfigError("", "", problem)
+
+
+def _warn_of_missing_types(config: SidecarConfig) -> None:
+    if config.role is not Role.ROBOT:
+        return  # which type a local server has shows when it runs
+    from sidecar.ros.known_types import missing_types
+    from sidecar.state_store import peek_last_good
+
+    peers = peek_last_good(config.state_dir, config.node_name).peers
+    for line in missing_types(peers.peers if peers is not None else (), config.service_rules()):
+        sys.stderr.write(f"{PROGRAM}: warning: {escaped(line)}\n")
 
 
 def _certificate_problem(config: SidecarConfig) -> TermProblem | None:

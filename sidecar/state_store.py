@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, TypeVar
 from protos.errors import DecodeError
 from protos.model import TOKEN_BYTES
 from protos.own_folder import OwnFolder
+from protos.regular_file import open_regular
 from sidecar.state_file import (
     MAX_FILE_BYTES,
     ControlAddresses,
@@ -217,6 +218,19 @@ class StateStore:
             self._failing.remove(name)
             log.info("%s is on the disk again", self._folder.path / name)
         return True
+
+
+def peek_last_good(folder: Path, owner: NodeName) -> LastGood:
+    """Return what the control plane said last, as the files tell while a sidecar may be using them; nothing is changed.
+
+    It is empty where there is none that this user can read. Files are replaced whole, so that none is found half done.
+    """
+    try:
+        with open_regular(folder / LAST_GOOD_FILE) as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+        return decode_last_good(data, owner)
+    except (OSError, DecodeError):
+        return LastGood(owner)
 
 
 def _lock(path: Path) -> tuple[OwnFolder, int]:

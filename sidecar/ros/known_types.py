@@ -1,0 +1,49 @@
+"""Before the start: whether the types of configured services are installed here, as far as they are known.
+
+A configuration names services, not types. What servers offered when the sidecar last ran stands in its `state_dir`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sidecar.core.rules import Rules
+from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.types import load_service_type
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from protos.model import Peer
+    from sidecar.core.rules import ServiceRule
+
+MAX_LINES = 10
+
+
+def missing_types(peers: Iterable[Peer], rules: Iterable[ServiceRule]) -> list[str]:
+    """Return a line for each service that `peers` offer, `rules` carry, and whose type is not here; at most MAX_LINES
+    and one that counts the rest."""
+    carried = Rules(rules)
+    servers = {
+        (offer.name, offer.type): peer.name
+        for peer in peers
+        for offer in peer.offers
+        if carried.find(offer.name) is not None
+    }
+    problems: dict[str, str | None] = {}
+    lines = []
+    for (name, kind), server in sorted(servers.items()):
+        if kind not in problems:
+            problems[kind] = _problem(kind)
+        if (problem := problems[kind]) is not None:
+            lines.append(f"{name}, which {server} offered last, will not be carried: {problem}")
+    left_out = len(lines) - MAX_LINES
+    return [*lines[:MAX_LINES], f"and {left_out} more"] if left_out > 0 else lines
+
+
+def _problem(kind: str) -> str | None:
+    try:
+        load_service_type(kind)
+    except RosBridgeError as error:
+        return str(error)
+    return None
