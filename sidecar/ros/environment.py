@@ -40,7 +40,8 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
     if importlib.util.find_spec("rclpy") is None:
         return (
             f"ROS 2's rclpy is not there for {sys.executable}: with ROS from apt, source /opt/ros/jazzy/setup.bash "
-            "before (under systemd: Environment= of the unit); without, pip install 'fogros2-plr[ros]'"
+            "before (for the unit: /etc/plr/sidecar.env, deploy/README.md); without, in the checkout: pip install "
+            "'.[ros]'"
         )
     rmw = environment.get("RMW_IMPLEMENTATION", "")
     if not thorough and rmw in ("", DEFAULT_RMW):
