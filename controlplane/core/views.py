@@ -32,6 +32,15 @@ class KnownPeers:
 
     def __init__(self) -> None:
         self._made: dict[NodeName, tuple[Sidecar, dict[CallPermit, Peer]]] = {}
+        self._former: dict[NodeName, tuple[Sidecar, dict[CallPermit, Peer]]] = {}
+        """Those made under the permits before: most are as good under the present ones, the others go with the next."""
+        self._permits: Permits | None = None
+
+    def under(self, permits: Permits) -> None:
+        """These permits are in force."""
+        if permits is not self._permits:
+            self._permits = permits
+            self._former, self._made = self._made, {}
 
     def peer(self, sidecar: Sidecar, permit: CallPermit) -> Peer:
         """A robot that has this permit, or a cloud to those who have it there."""
@@ -41,13 +50,16 @@ class KnownPeers:
         peer = made[1].get(permit)
         if peer is None:
             if len(made[1]) >= MAX_PERMITS_KEPT:
-                made[1].clear()  # of policies that are not in force any more
-            peer = made[1][permit] = _as_told(sidecar, permit)
+                made[1].clear()
+            former = self._former.get(sidecar.name)
+            known = former[1].get(permit) if former is not None and former[0] is sidecar else None
+            peer = made[1][permit] = known if known is not None else _as_told(sidecar, permit)
         return peer
 
     def forget(self, name: NodeName) -> None:
         """It is not registered any more."""
         self._made.pop(name, None)
+        self._former.pop(name, None)
 
 
 def _as_told(sidecar: Sidecar, permit: CallPermit) -> Peer:
@@ -62,6 +74,7 @@ class Views:
 
     def __init__(self, registry: Registry, permits: Permits, known: KnownPeers) -> None:
         self._known = known
+        known.under(permits)
         self._registry = registry
         self._permits = permits
         ready = sorted((sidecar for sidecar in registry if sidecar.ready), key=lambda sidecar: sidecar.name)

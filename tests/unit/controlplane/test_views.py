@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -139,3 +140,19 @@ def test_views_tell_what_is_allowed_and_nothing_else(policy: Policy, offered: tu
         assert set(names(views, of(members, robot))) == {cloud for name, _, cloud in allowed if name == robot}
     for cloud in CLOUDS:
         assert set(names(views, of(members, cloud))) == {robot for robot, _, name in allowed if name == cloud}
+
+
+@pytest.mark.audit("ops-16")
+def test_what_was_made_under_former_policies_goes_and_what_is_as_before_stays() -> None:
+    members, known = registry({"a": ("/plan",), "b": ("/plan",)}), KnownPeers()
+    robot = of(members, "robot")
+    everything = Views(members, Permits(None), known).peers_of(robot)
+    (only,) = Views(members, Permits(ONLY_A), known).peers_of(robot)
+    again = Views(members, Permits(ONLY_A), known).peers_of(robot)
+    assert again == (only,)
+    assert again[0] is only, "so that views are compared without a look inside"
+    Views(members, Permits(ONLY_A), known)
+    Views(members, Permits(ONLY_A), known)
+    assert not known._made
+    assert not known._former
+    assert Views(members, Permits(None), known).peers_of(robot) == everything
