@@ -17,8 +17,8 @@ ROUTINE_TIMES = 10.0
 
 ROBOTS_TIMES = 4.0
 """So many times as long as the last solving took, robots that come wait for the next one. A fleet that comes back keeps
-its mappings meanwhile; each solving looks at all who are there, so one for every few who come would cost more than all
-else that they need: 40 of the 62 s of processor time until 4,000 were back."""
+its mappings meanwhile; each solving looks at all who are there, so one for every few who come would cost the more for
+each of them the more there are."""
 
 ROBOTS_WAIT_S = 2.0
 """They wait no longer than this."""
