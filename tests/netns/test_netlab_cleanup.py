@@ -145,7 +145,7 @@ def test_nothing_is_left_however_the_owner_ends(how: str) -> None:
 def world_readable_copy() -> Iterator[Path]:
     """The lab where anybody may read it; a checkout may lie in a home directory that is closed to others."""
     folder = Path(tempfile.mkdtemp(prefix="netlab-test-"))
-    for package in ("bench", "controlplane"):  # it reads traces as `plr plan` does
+    for package in ("bench", "controlplane", "protos"):  # it reads traces as `plr plan` does
         shutil.copytree(REPOSITORY / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
     for path in (folder, *folder.rglob("*")):
         path.chmod(0o755 if path.is_dir() else 0o644)
