@@ -1,4 +1,5 @@
-"""`python -m bench alerts`: what a real Alertmanager says when a server of a fleet dies, and then the control plane.
+"""`python -m bench alerts`: what a real Alertmanager says when a server of a fleet hangs, another one's ROS node dies,
+then a whole server, and then the control plane.
 
 The control plane and its mutual TLS are real, the members are control streams alone (`bench.control`).
 """
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from bench.alerts.monitoring import Monitoring, MonitoringError, Ports
 from bench.control.crowd import Crowd
-from bench.control.member import Member
+from bench.control.member import SERVICE, Member
 from bench.control.plane import Plane
 from controlplane.ca import Authority
 from protos.identity import IdentityRole
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 LONGEST_FOR_S = 300.0
 """No rule waits longer before it fires."""
+SHORT_S = 120.0
+"""A ROS node may be away for so long."""
 PATIENCE_S = 300.0
 LOOK_EVERY_S = 0.05
 
@@ -36,7 +39,7 @@ LOOK_EVERY_S = 0.05
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m bench alerts`."""
     parser.add_argument("--robots", type=int, default=50, metavar="N", help="robots (default %(default)s)")
-    parser.add_argument("--servers", type=int, default=5, metavar="N", help="servers (default %(default)s)")
+    parser.add_argument("--servers", type=int, default=5, metavar="N", help="servers, 4 at least (default %(default)s)")
     parser.add_argument("--interfaces", type=int, default=2, metavar="N", help="of a robot (default %(default)s)")
     parser.add_argument("--scrape-s", type=float, default=1.0, help="scrape interval (default %(default)s)")
     parser.add_argument(
@@ -77,6 +80,7 @@ class _Trial:
         control, metrics, *others = (_free_port() for _ in range(5))
         self._plane = Plane(folder, authority, (control, metrics))
         self._crowd = Crowd(self._members, self._plane.target, authority.ca_pem)
+        self._heard_before = 0
         self._monitoring = Monitoring(folder, metrics, Ports(*others), scrape_s=options.scrape_s, pace=options.pace)
 
     async def run(self) -> int:
@@ -108,11 +112,22 @@ class _Trial:
         await self._tell_series()
         if self._options.series_only:
             return 0
-        dead = self._members[0].name
+        self._heard_before = len(self._monitoring.notifications)
+        dead, hung, bare = (member.name for member in self._members[:3])
+        _say(f"the ROS node of {hung} hangs")
+        self._crowd.hang_server(hung)
+        well = await self._notified([f"PlrServerAnswersNobody{{server={hung}, service={SERVICE}}}"])
+        _say(f"the ROS node of {bare} is restarted, and dies some seconds later")
+        self._crowd.serve(bare, up=False)
+        await asyncio.sleep(SHORT_S / self._options.pace)
+        self._crowd.serve(bare, up=True)
+        await asyncio.sleep(SHORT_S / self._options.pace)
+        self._crowd.serve(bare, up=False)
+        well &= await self._notified([f"PlrServerLostService{{server={bare}, service={SERVICE}}}"])
         _say(f"{dead} dies")
         await self._crowd.leave(dead)
         self._crowd.lose_server(dead)
-        well = await self._notified([f"PlrServerDown{{server={dead}}}"])
+        well &= await self._notified([f"PlrServerDown{{server={dead}}}"])
         _say("the control plane dies")
         self._plane.kill()
         down = [text for text in await self._heard() if not text.startswith("PlrControlPlaneDown")]
@@ -136,11 +151,11 @@ class _Trial:
         return heard == wanted
 
     async def _heard(self) -> list[str]:
-        """The alerts of all notifications from now on until the slowest rule would have fired."""
-        before = len(self._monitoring.notifications)
+        """The alerts of all notifications since the last call, until the slowest rule would have fired."""
         await asyncio.sleep(LONGEST_FOR_S / self._options.pace + 10.0)
         pending = await asyncio.to_thread(self._monitoring.firing)
-        told = self._monitoring.notifications[before:]
+        told = self._monitoring.notifications[self._heard_before :]
+        self._heard_before += len(told)
         for one in told:
             text = ", ".join(one.firing) or "resolved"
             _say(f"notification to {one.receiver}: {text} {' '.join(one.links)}".rstrip())

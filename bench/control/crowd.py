@@ -92,6 +92,16 @@ class Crowd:
                 self._wake[member.name].set()
         return now
 
+    def hang_server(self, hung: NodeName) -> None:
+        """No robot gets an answer from this server any more, which still takes requests."""
+        for member in self.members.values():
+            member.hung = hung
+
+    def serve(self, name: NodeName, *, up: bool) -> None:
+        """A cloud's ROS node ends, or is there again."""
+        self.members[name].serve(up=up)
+        self._wake[name].set()
+
     async def _keep_connected(self, member: Member) -> None:
         while True:
             delay_s = member.session.retry_at - time.monotonic()

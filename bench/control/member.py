@@ -64,6 +64,8 @@ class Member:
         self.mapped_at = 0.0
         self.dead: NodeName | None = None
         """The server to which no path is up any more."""
+        self.hung: NodeName | None = None
+        """The server that takes requests and answers none."""
         self._servers = servers
         self._interfaces = interfaces
         self._rng = rng
@@ -95,10 +97,9 @@ class Member:
         signature = sign_candidates(self.issued.key, number, 1, candidates)
         self.session.set_candidates(CandidateSet(candidates, (), 1, signature))
         if self.role is Role.ROBOT:
-            services = ServiceSet(uses=(ServiceUse(SERVICE, TYPE, DEADLINE_S, True),))
+            self.session.set_services(ServiceSet(uses=(ServiceUse(SERVICE, TYPE, DEADLINE_S, True),)))
         else:
-            services = ServiceSet(offers=(ServiceOffer(SERVICE, TYPE),))
-        self.session.set_services(services)
+            self.serve(up=True)
 
     def report(self, interval_s: float) -> Report:
         """What a robot measured in this time: ten requests a second over each of its paths in use."""
@@ -115,10 +116,12 @@ class Member:
                 paths.append(PathReport(interface, server, up, rtt, 10 * requests, 0))
                 if up and server in self.mapped:
                     network, processing = Histogram(), Histogram()
-                    network.record_many([self._rng.lognormvariate(-3.0, 0.4) for _ in range(requests)])
-                    processing.record_many([PROCESSING_S] * requests)
+                    missed = requests if server == self.hung else 0
+                    processing.record_lost(missed)
+                    network.record_many([self._rng.lognormvariate(-3.0, 0.4) for _ in range(requests - missed)])
+                    processing.record_many([PROCESSING_S] * (requests - missed))
                     latencies.append(
-                        LatencyReport(interface, server, SERVICE, 1, network, Histogram(), processing, requests, 0)
+                        LatencyReport(interface, server, SERVICE, 1, network, Histogram(), processing, requests, missed)
                     )
         return Report(tuple(latencies), tuple(paths), (OutcomeReport(SERVICE, ok=requests),))
 
@@ -126,6 +129,11 @@ class Member:
         """What a robot tells at once when a server is dead."""
         paths = [PathReport(interface, self.dead, False, Histogram()) for interface in self._interfaces if self.dead]
         return Report(paths=tuple(paths), changes_only=True)
+
+    def serve(self, *, up: bool) -> None:
+        """The ROS node of a cloud that is configured to serve it is there, or not."""
+        offers = (ServiceOffer(SERVICE, TYPE),) if up else ()
+        self.session.set_services(ServiceSet(offers, unmet=() if up else (SERVICE,)))
 
     def takes(self, assignments: tuple[Assignment, ...], now: float) -> None:
         """A mapping is in force."""
