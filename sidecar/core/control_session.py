@@ -163,7 +163,7 @@ class ControlSession:
         self._urgent = False
         """Whether the next whole report is."""
         self._urgent_told_at = -math.inf
-        self._changes_at: float | None = None
+        self._changes_at = math.inf
         """When to tell of changes alone."""
         self._told_whole = False
         """Whether this stream has had a whole report: to a control plane that knows nothing, changes say little."""
@@ -207,7 +207,7 @@ class ControlSession:
         """A stream is being opened: everything is said anew on it."""
         self._clear_outgoing()
         self._taken.clear()
-        self._changes_at, self._told_whole = None, False
+        self._changes_at, self._told_whole = math.inf, False
         self._assembly.begin_stream()
         self.state = ControlState.REGISTERING
         self.stats.attempts += 1
@@ -387,7 +387,7 @@ class ControlSession:
             return None
         if now >= self._report_at:
             return ReportScope.ALL
-        return ReportScope.CHANGES if self._changes_at is not None and now >= self._changes_at else None
+        return ReportScope.CHANGES if now >= self._changes_at else None
 
     def report_at_once(self, now: float, scope: ReportScope) -> None:
         """Something happened that cannot wait for the interval: a path went, or a deadline was missed.
@@ -399,7 +399,7 @@ class ControlSession:
         self._urgent_at = now
         soonest = max(now, self._soonest_report())
         if scope is ReportScope.CHANGES and self._told_whole:
-            self._changes_at = min(self._changes_at or soonest, soonest)
+            self._changes_at = min(self._changes_at, soonest)
         else:
             self._urgent = True
             self._report_at = min(self._report_at, soonest)
@@ -409,7 +409,7 @@ class ControlSession:
 
     def send_report(self, report: Report, now: float) -> None:
         """Send what was measured since the last report; one that holds nothing is left out."""
-        self._reported_at, self._changes_at = now, None
+        self._reported_at, self._changes_at = now, math.inf
         if report.changes_only:
             self._urgent_told_at = now
         else:
@@ -430,7 +430,7 @@ class ControlSession:
             case ControlState.REGISTERING:
                 return self._opened_at + self._patience_s
             case ControlState.ONLINE:
-                return min(self._heartbeat_at, self._report_at, self._changes_at or math.inf)
+                return min(self._heartbeat_at, self._report_at, self._changes_at)
 
     def handle_timer(self, now: float) -> None:
         """Do what is due."""
