@@ -36,7 +36,7 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
     lines += columns([_HEADER, *(_row(status) for status in sidecars)])
     offered = sorted({offer.name for status in sidecars for offer in status.peer.offers})
     for status in sidecars:
-        details = [*_details(status), *_unmet(status, offered), *_unserved(status)]
+        details = [*_details(status), *_unmet(status, offered), *_untyped(status), *_unserved(status)]
         details += _revocations(status.revocations, newest, now_wall)
         if details:
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in details)]
@@ -95,6 +95,12 @@ def _unmet(status: SidecarStatus, offered: Sequence[str]) -> Iterator[str]:
         hint = f"; did you mean {close[0]}?" if close and close[0] != name else ""
         whose = "no server that it knows of" if status.peer.role is Role.ROBOT else "no node there"
         yield f"UNMET {name}: configured, and {whose} offers it{hint}"
+
+
+def _untyped(status: SidecarStatus) -> Iterator[str]:
+    what = "carried" if status.peer.role is Role.ROBOT else "offered"
+    for name in status.untyped:
+        yield f"UNTYPED {name}: not {what}, as its service type is not installed there; plr doctor there names it"
 
 
 def _revocations(held: RevocationSet, newest: Mapping[int, int], now_wall: float) -> Iterator[str]:

@@ -346,6 +346,8 @@ class ServiceSet:
     uses: tuple[ServiceUse, ...] = ()
     unmet: tuple[ServiceName, ...] = ()
     """That its configuration names and nobody serves, at most MAX_UNMET; for the operator."""
+    untyped: tuple[ServiceName, ...] = ()
+    """That it cannot carry or offer, as their type is not installed there, at most MAX_UNMET; for the operator."""
 
 
 @dataclass(frozen=True, slots=True)

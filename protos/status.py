@@ -65,6 +65,8 @@ class SidecarStatus:
     revocations: RevocationSet = NO_REVOCATIONS
     unmet: tuple[ServiceName, ...] = ()
     """Services that its configuration names and nobody serves."""
+    untyped: tuple[ServiceName, ...] = ()
+    """Services that it would carry or offer if their type were installed there."""
     down: tuple[InterfaceName, ...] = ()
     """Interfaces that it would use and that carry nothing now."""
     withdrawn: tuple[ServiceName, ...] = ()

@@ -33,7 +33,7 @@ from sidecar.refusal_log import RefusalLog
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import CandidateSet, RevocationSet, ServiceName, ServiceOffer, ServiceUse
+    from protos.model import CandidateSet, RevocationSet
     from protos.plr.v1 import control_pb2
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
@@ -147,11 +147,9 @@ class ControlClient:
         """Tell the control plane under which addresses we are reached now, and what is known of our interfaces."""
         self._post(lambda: self._session.set_candidates(candidates))
 
-    def set_services(
-        self, offers: tuple[ServiceOffer, ...], uses: tuple[ServiceUse, ...], unmet: tuple[ServiceName, ...] = ()
-    ) -> None:
+    def set_services(self, services: ServiceSet) -> None:
         """Tell the control plane what we offer and carry now."""
-        self._post(lambda: self._session.set_services(ServiceSet(offers, uses, unmet)))
+        self._post(lambda: self._session.set_services(services))
 
     def set_revocations(self, held: RevocationSet) -> None:
         """Tell the control plane which revocation lists we use now."""

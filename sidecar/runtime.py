@@ -23,6 +23,7 @@ from protos.model import (
     ResourceKind,
     Role,
     ServiceName,
+    ServiceSet,
     Version,
 )
 from protos.notifier import Notifier
@@ -167,6 +168,8 @@ class Sidecar:
         self._metrics: MetricsServer | None = None
         self._mapping_origin: MappingOrigin | None = None
         self._local = self._make_local(version)
+        self._untyped: frozenset[ServiceName] = frozenset()
+        """Services whose type was not installed at the last look."""
         self._logged_mappings: dict[ServiceName, tuple[Assignment, ...]] = {}
         self._version = version
 
@@ -207,9 +210,10 @@ class Sidecar:
         """Tell, once, of those that the configuration names and nobody serves."""
         stats = self._bridge.stats
         met = {*stats.carried, *stats.left_alone, *stats.missing_types}
-        before = self._unmet.unmet
+        before = self._unmet.unmet, self._untyped
         news = self._unmet.look(met, time.monotonic())
-        if self._unmet.unmet != before:
+        self._untyped = frozenset(stats.missing_types)
+        if (self._unmet.unmet, self._untyped) != before:
             self._on_services_changed()
         for name in news:
             if self._config.role is Role.ROBOT:
@@ -324,8 +328,10 @@ class Sidecar:
             self._local.on_pong(pong)
 
     def _on_services_changed(self) -> None:
-        unmet = sorted(self._unmet.unmet)[:MAX_UNMET]
-        self._control.set_services(*self._data_plane.services(), tuple(map(ServiceName, unmet)))
+        offers, uses = self._data_plane.services()
+        unmet = map(ServiceName, sorted(self._unmet.unmet)[:MAX_UNMET])
+        untyped = sorted(self._untyped)[:MAX_UNMET]
+        self._control.set_services(ServiceSet(offers, uses, tuple(unmet), tuple(untyped)))
 
     def _on_reach_changed(self) -> None:
         self._control.try_again()

@@ -86,6 +86,10 @@ def find_use(robot: Sidecar, service: ServiceName, offered: Collection[ServiceNa
             f"{robot.name} is configured to carry {service}, and no cloud that it knows of offers it"
             f"{_nearest(service, offered)}"
         )
+    if service in robot.untyped:
+        raise UnknownNameError(
+            f"{robot.name} cannot carry {service}: its service type is not installed there; plr doctor there names it"
+        )
     known = [use.name for use in robot.uses] or offered
     raise UnknownNameError(f"{robot.name} carries no service {service}{_nearest(service, known)}")
 

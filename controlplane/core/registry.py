@@ -133,6 +133,11 @@ class Sidecar:
         return self.services.unmet if self.services is not None else ()
 
     @property
+    def untyped(self) -> tuple[ServiceName, ...]:
+        """Services that it would carry or offer if their type were installed there."""
+        return self.services.untyped if self.services is not None else ()
+
+    @property
     def withdrawn(self) -> frozenset[ServiceName]:
         """Services that it offered since it registered, and does not now."""
         return self.offered.difference(offer.name for offer in self.offers)

@@ -64,6 +64,7 @@ def statuses(
             refused_offers=permits.refused_offers(sidecar),
             revocations=sidecar.revocations,
             unmet=sidecar.unmet,
+            untyped=sidecar.untyped,
             down=tuple(label.interface for label in sidecar.down),
             withdrawn=tuple(sorted(sidecar.withdrawn.difference(sidecar.unmet))),
             unanswered={

@@ -92,6 +92,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
         revocations=revocations_from_proto(message.revocations),
         unmet=service_names(message.unmet, MAX_UNMET, "unmet"),
+        untyped=service_names(message.untyped, MAX_UNMET, "untyped"),
         down=interface_names(message.down, "down"),
         withdrawn=service_names(message.withdrawn, MAX_OFFERS, "withdrawn"),
         unanswered=_unanswered_from_proto(message.unanswered),
@@ -113,6 +114,7 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         refused_offers=status.refused_offers,
         revocations=revocations_to_proto(status.revocations),
         unmet=status.unmet,
+        untyped=status.untyped,
         down=status.down,
         withdrawn=status.withdrawn,
         unanswered=(

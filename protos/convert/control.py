@@ -132,7 +132,8 @@ def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMe
             uses = each(message.services.uses, MAX_USES, "uses", use_from_proto)
             unique((use.name for use in uses), "uses")
             unmet = service_names(message.services.unmet, MAX_UNMET, "unmet")
-            return ServiceSet(offers_from_proto(message.services.offers), uses, unmet)
+            untyped = service_names(message.services.untyped, MAX_UNMET, "untyped")
+            return ServiceSet(offers_from_proto(message.services.offers), uses, unmet, untyped)
         case "report":
             return report_from_proto(message.report)
         case "ack":
@@ -193,9 +194,9 @@ def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessag
             return control_pb2.SidecarMessage(register=_registration_to_proto(value))
         case CandidateSet():
             return control_pb2.SidecarMessage(candidates=_candidate_set_to_proto(value))
-        case ServiceSet(offers=offers, uses=uses, unmet=unmet):
+        case ServiceSet(offers=offers, uses=uses, unmet=unmet, untyped=untyped):
             services = control_pb2.Services(
-                offers=map(offer_to_proto, offers), uses=map(use_to_proto, uses), unmet=unmet
+                offers=map(offer_to_proto, offers), uses=map(use_to_proto, uses), unmet=unmet, untyped=untyped
             )
             return control_pb2.SidecarMessage(services=services)
         case Report():

@@ -311,8 +311,11 @@ def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Fi
     told = state.get("mapping") or {}
     if not told.get("version"):
         carried = bool((state.get("services") or {}).get("carried"))
-        text = "none: this robot chooses by round trips" + ("" if carried else "; no service is offered yet")
-        yield warn("mapping", text, "is the control plane reached: see control")
+        if carried:
+            text, advice = "none: this robot chooses by round trips", "is the control plane reached: see control"
+        else:
+            text, advice = "none: no service is offered yet", "see service"
+        yield warn("mapping", text, advice)
         return
     where = f"version {told['version']} of the control plane, in force for {duration(told.get('age_s') or 0.0)}"
     if told.get("source") == "disk":

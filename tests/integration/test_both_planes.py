@@ -14,6 +14,7 @@ from protos.model import (
     PeerSet,
     Report,
     Role,
+    ServiceSet,
     Welcome,
 )
 from protos.status import SyncState
@@ -79,7 +80,7 @@ def test_a_client_registers_follows_and_outlives_a_restart(tmp_path: Path) -> No
     with ControlPlaneProcess(tmp_path, lease_ms=10_000) as plane:
         client = ControlClient(ControlDialer((plane.address,), session.stats), session, engine)
         client.set_candidates(CandidateSet(interfaces("wlan0", "wwan0")))
-        client.set_services((), (use(),))
+        client.set_services(ServiceSet((), (use(),)))
         client.start()
         try:
             with cloud(plane.address, "cloud-a"), cloud(plane.address, "cloud-b"):

@@ -161,7 +161,7 @@ def test_registers_with_what_it_holds_then_says_everything(server: ScriptedContr
     rig.hooks.expect_connection(True)
     assert rig.client.connected
     assert rig.hooks.welcomes == [WELCOME]
-    rig.client.set_services((OFFER,), ())
+    rig.client.set_services(ServiceSet((OFFER,), ()))
     assert server.expect(ServiceSet) == ServiceSet(offers=(OFFER,))
 
 
@@ -392,7 +392,7 @@ def test_an_unreachable_control_plane_blocks_nobody(target: str, caplog: pytest.
         rig = Rig(target.format(port=free_port()))
         rig.client.start()
         rig.client.set_candidates(CandidateSet((CANDIDATE,)))
-        rig.client.set_services((), ())
+        rig.client.set_services(ServiceSet((), ()))
         wait_for(lambda: rig.client.stats.attempts >= 2)
         wait_for(lambda: "going on without it" in caplog.text)
         rig.client.stop()

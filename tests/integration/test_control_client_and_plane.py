@@ -35,6 +35,7 @@ from protos.model import (
     Role,
     ServiceName,
     ServiceOffer,
+    ServiceSet,
     ServiceUse,
     SessionId,
     Welcome,
@@ -180,8 +181,8 @@ def mesh(port: int) -> Iterator[tuple[Sidecar, Sidecar]]:
     """A robot that uses the service which a cloud offers."""
     robot = Sidecar(port, "robot-1", Role.ROBOT, 1)
     cloud = Sidecar(port, "cloud-a", Role.CLOUD, 2)
-    cloud.client.set_services((ServiceOffer(PLAN, GET_PLAN),), ())
-    robot.client.set_services((), (ServiceUse(PLAN, GET_PLAN, deadline_s=0.1, idempotent=True),))
+    cloud.client.set_services(ServiceSet((ServiceOffer(PLAN, GET_PLAN),), ()))
+    robot.client.set_services(ServiceSet((), (ServiceUse(PLAN, GET_PLAN, deadline_s=0.1, idempotent=True),)))
     robot.report = measured("cloud-a")
     for sidecar in (cloud, robot):
         sidecar.client.start()
@@ -215,7 +216,7 @@ def test_a_refused_mapping_leaves_the_old_version_and_does_not_end_the_stream(tm
         assert robot.session.version(ResourceKind.MAPPING) < refused.version
         robot.refuse = None
         second = Sidecar(control_plane.port, "cloud-b", Role.CLOUD, 3)
-        second.client.set_services((ServiceOffer(PLAN, GET_PLAN),), ())
+        second.client.set_services(ServiceSet((ServiceOffer(PLAN, GET_PLAN),), ()))
         second.client.start()
         try:
             robot.expect_peers(lambda peers: names(peers) == {"cloud-a", "cloud-b"})
@@ -242,7 +243,7 @@ def test_a_killed_control_plane_comes_back_with_larger_versions(
             # A robot that comes back keeps its view; a third sidecar makes the successor push a new one.
             assert robot.connection.get(timeout=WAIT_S)
             third = Sidecar(control_plane.port, "cloud-b", Role.CLOUD, 3)
-            third.client.set_services((ServiceOffer(PLAN, GET_PLAN),), ())
+            third.client.set_services(ServiceSet((ServiceOffer(PLAN, GET_PLAN),), ()))
             third.client.start()
             try:
                 peers = robot.expect_peers(lambda peers: names(peers) >= {"cloud-a", "cloud-b"})

@@ -1,4 +1,4 @@
-"""A configured service that nobody serves is told to the operator, with the name that was meant."""
+"""A configured service that nobody serves, or whose type is missing, is told to the operator by its right name."""
 
 from __future__ import annotations
 
@@ -55,6 +55,21 @@ def test_explain_suggests_the_name_that_was_meant() -> None:
     world.say(robot, ServiceSet((), (), (WRONG,)))
     with pytest.raises(UnknownNameError, match=r"configured to carry /plam.*did you mean /plan\?"):
         world.core.explain(NodeName("robot"), WRONG, world.now)
+
+
+def test_a_type_that_is_not_installed_is_told_and_blames_no_name() -> None:
+    world = World()
+    cloud = world.cloud("a")
+    robot = world.robot()
+    untyped = ServiceName("/mark")
+    world.say(cloud, ServiceSet((offer(), offer("/mark")), untyped=(ServiceName("/arm"),)))
+    world.say(robot, ServiceSet((), (use(),), untyped=(untyped,)))
+    world.run(SETTLED_S)
+    shown = render(world.core.status(world.now))
+    assert "UNTYPED /mark: not carried, as its service type is not installed there" in shown
+    assert "UNTYPED /arm: not offered, as its service type is not installed there" in shown
+    with pytest.raises(UnknownNameError, match=r"^robot cannot carry /mark: its service type is not installed there"):
+        world.core.explain(NodeName("robot"), untyped, world.now)
 
 
 def test_it_is_told_once_and_is_no_news_to_others() -> None:

@@ -275,6 +275,7 @@ class SidecarStatus(_message.Message):
     DOWN_FIELD_NUMBER: _builtins.int
     WITHDRAWN_FIELD_NUMBER: _builtins.int
     UNANSWERED_FIELD_NUMBER: _builtins.int
+    UNTYPED_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
@@ -316,6 +317,10 @@ class SidecarStatus(_message.Message):
     def unanswered(self) -> _containers.RepeatedCompositeFieldContainer[Global___UnansweredService]:
         """Clouds: services whose requests it had and did not answer, since it answered one last."""
 
+    @_builtins.property
+    def untyped(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Services that it would carry or offer if their type were installed there."""
+
     def __init__(
         self,
         *,
@@ -335,10 +340,11 @@ class SidecarStatus(_message.Message):
         down: _abc.Iterable[_builtins.str] | None = ...,
         withdrawn: _abc.Iterable[_builtins.str] | None = ...,
         unanswered: _abc.Iterable[Global___UnansweredService] | None = ...,
+        untyped: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unanswered", b"unanswered", "unmet", b"unmet", "uses", b"uses", "withdrawn", b"withdrawn"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unanswered", b"unanswered", "unmet", b"unmet", "untyped", b"untyped", "uses", b"uses", "withdrawn", b"withdrawn"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -25,17 +25,17 @@ _sym_db = _symbol_database.Default()
 from protos.plr.v1 import types_pb2 as protos_dot_plr_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bprotos/plr/v1/control.proto\x12\x06plr.v1\x1a\x19protos/plr/v1/types.proto\"\xde\x02\n\x0eSidecarMessage\x12$\n\x08register\x18\x01 \x01(\x0b\x32\x10.plr.v1.RegisterH\x00\x12(\n\ncandidates\x18\x02 \x01(\x0b\x32\x12.plr.v1.CandidatesH\x00\x12$\n\x08services\x18\x03 \x01(\x0b\x32\x10.plr.v1.ServicesH\x00\x12 \n\x06report\x18\x04 \x01(\x0b\x32\x0e.plr.v1.ReportH\x00\x12\x1a\n\x03\x61\x63k\x18\x05 \x01(\x0b\x32\x0b.plr.v1.AckH\x00\x12\x1c\n\x04nack\x18\x06 \x01(\x0b\x32\x0c.plr.v1.NackH\x00\x12&\n\theartbeat\x18\x07 \x01(\x0b\x32\x11.plr.v1.HeartbeatH\x00\x12\x1e\n\x05\x64rain\x18\x08 \x01(\x0b\x32\r.plr.v1.DrainH\x00\x12*\n\x0brevocations\x18\t \x01(\x0b\x32\x13.plr.v1.RevocationsH\x00\x42\x06\n\x04kind\"\xa7\x02\n\x08Register\x12\x18\n\x10protocol_version\x18\x01 \x01(\r\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\x1a\n\x04role\x18\x03 \x01(\x0e\x32\x0c.plr.v1.Role\x12\x0f\n\x07session\x18\x04 \x01(\x06\x12\r\n\x05token\x18\x05 \x01(\x0c\x12\x13\n\x0bincarnation\x18\x06 \x01(\x04\x12\x18\n\x10software_version\x18\x07 \x01(\t\x12\x15\n\rpeers_version\x18\x08 \x01(\x04\x12\x17\n\x0fmapping_version\x18\t \x01(\x04\x12\x12\n\ncredential\x18\n \x01(\x0c\x12\x0e\n\x06region\x18\x0b \x01(\t\x12\x13\n\x0bincremental\x18\x0c \x01(\x08\x12\x1f\n\x17newest_protocol_version\x18\x0e \x01(\r\"\xa4\x01\n\nCandidates\x12%\n\ncandidates\x18\x01 \x03(\x0b\x32\x11.plr.v1.Candidate\x12&\n\x06labels\x18\x02 \x03(\x0b\x32\x16.plr.v1.InterfaceLabel\x12\x0e\n\x06serial\x18\x03 \x01(\x04\x12\x11\n\tsignature\x18\x04 \x01(\x0c\x12$\n\x04\x64own\x18\x05 \x03(\x0b\x32\x16.plr.v1.InterfaceLabel\"a\n\x08Services\x12$\n\x06offers\x18\x01 \x03(\x0b\x32\x14.plr.v1.ServiceOffer\x12 \n\x04uses\x18\x02 \x03(\x0b\x32\x12.plr.v1.ServiceUse\x12\r\n\x05unmet\x18\x03 \x03(\t\"\xeb\x01\n\rLatencyReport\x12\x11\n\tinterface\x18\x01 \x01(\t\x12\x0e\n\x06server\x18\x02 \x01(\t\x12\x0f\n\x07service\x18\x03 \x01(\t\x12\x12\n\nsize_class\x18\x04 \x01(\r\x12\"\n\x07network\x18\x05 \x01(\x0b\x32\x11.plr.v1.Histogram\x12%\n\ncalled_off\x18\x06 \x01(\x0b\x32\x11.plr.v1.Histogram\x12%\n\nprocessing\x18\x07 \x01(\x0b\x32\x11.plr.v1.Histogram\x12\x10\n\x08requests\x18\x08 \x01(\x04\x12\x0e\n\x06missed\x18\t \x01(\x04\"\x8c\x01\n\x0bJointReport\x12\x0f\n\x07service\x18\x01 \x01(\t\x12!\n\x05\x66irst\x18\x02 \x01(\x0b\x32\x12.plr.v1.Assignment\x12\"\n\x06second\x18\x03 \x01(\x0b\x32\x12.plr.v1.Assignment\x12\x10\n\x08requests\x18\x04 \x01(\x04\x12\x13\n\x0b\x62oth_missed\x18\x05 \x01(\x04\"\xc3\x01\n\x14InterfaceJointReport\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\r\n\x05\x66irst\x18\x02 \x01(\t\x12\x0e\n\x06second\x18\x03 \x01(\t\x12\x0e\n\x06server\x18\x04 \x01(\t\x12\x10\n\x08requests\x18\x05 \x01(\x04\x12\x13\n\x0b\x62oth_missed\x18\x06 \x01(\x04\x12\r\n\x05races\x18\x07 \x01(\x04\x12\x19\n\x11only_first_missed\x18\x08 \x01(\x04\x12\x1a\n\x12only_second_missed\x18\t \x01(\x04\"\x8b\x01\n\nPathReport\x12\x11\n\tinterface\x18\x01 \x01(\t\x12\x0e\n\x06server\x18\x02 \x01(\t\x12\n\n\x02up\x18\x03 \x01(\x08\x12\x1e\n\x03rtt\x18\x04 \x01(\x0b\x32\x11.plr.v1.Histogram\x12\x16\n\x0e\x64\x61tagrams_sent\x18\x05 \x01(\x04\x12\x16\n\x0e\x64\x61tagrams_lost\x18\x06 \x01(\x04\"U\n\rOutcomeReport\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\n\n\x02ok\x18\x02 \x01(\x04\x12\x17\n\x0f\x64\x65\x61\x64line_missed\x18\x03 \x01(\x04\x12\x0e\n\x06\x66\x61iled\x18\x04 \x01(\x04\"E\n\rPenaltyReport\x12\x0e\n\x06server\x18\x01 \x01(\t\x12\x0f\n\x07left_us\x18\x02 \x01(\x04\x12\x13\n\x0b\x62\x61\x64_answers\x18\x03 \x01(\x04\"\xad\x02\n\x06Report\x12(\n\tlatencies\x18\x01 \x03(\x0b\x32\x15.plr.v1.LatencyReport\x12!\n\x05paths\x18\x02 \x03(\x0b\x32\x12.plr.v1.PathReport\x12\'\n\x08outcomes\x18\x03 \x03(\x0b\x32\x15.plr.v1.OutcomeReport\x12#\n\x06joints\x18\x04 \x03(\x0b\x32\x13.plr.v1.JointReport\x12\x36\n\x10interface_joints\x18\x05 \x03(\x0b\x32\x1c.plr.v1.InterfaceJointReport\x12(\n\tpenalties\x18\x06 \x03(\x0b\x32\x15.plr.v1.PenaltyReport\x12\x10\n\x08goodbyes\x18\x07 \x03(\t\x12\x14\n\x0c\x63hanges_only\x18\x08 \x01(\x08\"M\n\x03\x41\x63k\x12&\n\x08resource\x18\x01 \x01(\x0e\x32\x14.plr.v1.ResourceKind\x12\x0f\n\x07version\x18\x02 \x01(\x04\x12\r\n\x05nonce\x18\x03 \x01(\x04\"]\n\x04Nack\x12&\n\x08resource\x18\x01 \x01(\x0e\x32\x14.plr.v1.ResourceKind\x12\x0f\n\x07version\x18\x02 \x01(\x04\x12\r\n\x05nonce\x18\x03 \x01(\x04\x12\r\n\x05\x65rror\x18\x04 \x01(\t\"\x0b\n\tHeartbeat\"\x07\n\x05\x44rain\";\n\x08HeldList\x12\n\n\x02\x63\x61\x18\x01 \x01(\x06\x12\x0e\n\x06number\x18\x02 \x01(\x04\x12\x13\n\x0bsigned_at_s\x18\x03 \x01(\x04\"?\n\x0bRevocations\x12\x1f\n\x05lists\x18\x01 \x03(\x0b\x32\x10.plr.v1.HeldList\x12\x0f\n\x07too_old\x18\x02 \x01(\r\"\x85\x01\n\x0e\x43ontrolMessage\x12\"\n\x07welcome\x18\x01 \x01(\x0b\x32\x0f.plr.v1.WelcomeH\x00\x12 \n\x05peers\x18\x02 \x01(\x0b\x32\x0f.plr.v1.PeerSetH\x00\x12%\n\x07mapping\x18\x03 \x01(\x0b\x32\x12.plr.v1.MappingSetH\x00\x42\x06\n\x04kind\"t\n\x07Welcome\x12\x10\n\x08lease_us\x18\x01 \x01(\x04\x12\x1a\n\x12report_interval_us\x18\x02 \x01(\x04\x12\x14\n\x0cstun_servers\x18\x03 \x03(\t\x12\x0b\n\x03\x63rl\x18\x04 \x01(\x0c\x12\x18\n\x10reconnect_max_us\x18\x05 \x01(\x04\"B\n\x0bRemovedPeer\x12\x0c\n\x04name\x18\x01 \x01(\t\x12%\n\x06reason\x18\x02 \x01(\x0e\x32\x15.plr.v1.RemovalReason\"\xa0\x01\n\x07PeerSet\x12\x0f\n\x07version\x18\x01 \x01(\x04\x12\r\n\x05nonce\x18\x02 \x01(\x04\x12\x1b\n\x05peers\x18\x03 \x03(\x0b\x32\x0c.plr.v1.Peer\x12$\n\x07removed\x18\x04 \x03(\x0b\x32\x13.plr.v1.RemovedPeer\x12\x0e\n\x06policy\x18\x05 \x01(\x06\x12\x14\n\x0c\x62\x61se_version\x18\x06 \x01(\x04\x12\x0c\n\x04more\x18\x07 \x01(\x08\"/\n\nAssignment\x12\x11\n\tinterface\x18\x01 \x01(\t\x12\x0e\n\x06server\x18\x02 \x01(\t\"\x97\x01\n\x0eServiceMapping\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\'\n\x0b\x61ssignments\x18\x02 \x03(\x0b\x32\x12.plr.v1.Assignment\x12\x16\n\x0epredicted_miss\x18\x03 \x01(\x01\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12#\n\x07\x65xplore\x18\x05 \x01(\x0b\x32\x12.plr.v1.Assignment\"V\n\nMappingSet\x12\x0f\n\x07version\x18\x01 \x01(\x04\x12\r\n\x05nonce\x18\x02 \x01(\x04\x12(\n\x08services\x18\x03 \x03(\x0b\x32\x16.plr.v1.ServiceMapping*a\n\x0cResourceKind\x12\x1d\n\x19RESOURCE_KIND_UNSPECIFIED\x10\x00\x12\x17\n\x13RESOURCE_KIND_PEERS\x10\x01\x12\x19\n\x15RESOURCE_KIND_MAPPING\x10\x02*\xc0\x01\n\rRemovalReason\x12\x1e\n\x1aREMOVAL_REASON_UNSPECIFIED\x10\x00\x12 \n\x1cREMOVAL_REASON_LEASE_EXPIRED\x10\x01\x12\x17\n\x13REMOVAL_REASON_LEFT\x10\x02\x12\x1a\n\x16REMOVAL_REASON_REVOKED\x10\x03\x12\x1c\n\x18REMOVAL_REASON_FORBIDDEN\x10\x04\x12\x1a\n\x16REMOVAL_REASON_EXPIRED\x10\x05\x32M\n\x0c\x43ontrolPlane\x12=\n\x07\x43onnect\x12\x16.plr.v1.SidecarMessage\x1a\x16.plr.v1.ControlMessage(\x01\x30\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bprotos/plr/v1/control.proto\x12\x06plr.v1\x1a\x19protos/plr/v1/types.proto\"\xde\x02\n\x0eSidecarMessage\x12$\n\x08register\x18\x01 \x01(\x0b\x32\x10.plr.v1.RegisterH\x00\x12(\n\ncandidates\x18\x02 \x01(\x0b\x32\x12.plr.v1.CandidatesH\x00\x12$\n\x08services\x18\x03 \x01(\x0b\x32\x10.plr.v1.ServicesH\x00\x12 \n\x06report\x18\x04 \x01(\x0b\x32\x0e.plr.v1.ReportH\x00\x12\x1a\n\x03\x61\x63k\x18\x05 \x01(\x0b\x32\x0b.plr.v1.AckH\x00\x12\x1c\n\x04nack\x18\x06 \x01(\x0b\x32\x0c.plr.v1.NackH\x00\x12&\n\theartbeat\x18\x07 \x01(\x0b\x32\x11.plr.v1.HeartbeatH\x00\x12\x1e\n\x05\x64rain\x18\x08 \x01(\x0b\x32\r.plr.v1.DrainH\x00\x12*\n\x0brevocations\x18\t \x01(\x0b\x32\x13.plr.v1.RevocationsH\x00\x42\x06\n\x04kind\"\xa7\x02\n\x08Register\x12\x18\n\x10protocol_version\x18\x01 \x01(\r\x12\x0c\n\x04name\x18\x02 \x01(\t\x12\x1a\n\x04role\x18\x03 \x01(\x0e\x32\x0c.plr.v1.Role\x12\x0f\n\x07session\x18\x04 \x01(\x06\x12\r\n\x05token\x18\x05 \x01(\x0c\x12\x13\n\x0bincarnation\x18\x06 \x01(\x04\x12\x18\n\x10software_version\x18\x07 \x01(\t\x12\x15\n\rpeers_version\x18\x08 \x01(\x04\x12\x17\n\x0fmapping_version\x18\t \x01(\x04\x12\x12\n\ncredential\x18\n \x01(\x0c\x12\x0e\n\x06region\x18\x0b \x01(\t\x12\x13\n\x0bincremental\x18\x0c \x01(\x08\x12\x1f\n\x17newest_protocol_version\x18\x0e \x01(\r\"\xa4\x01\n\nCandidates\x12%\n\ncandidates\x18\x01 \x03(\x0b\x32\x11.plr.v1.Candidate\x12&\n\x06labels\x18\x02 \x03(\x0b\x32\x16.plr.v1.InterfaceLabel\x12\x0e\n\x06serial\x18\x03 \x01(\x04\x12\x11\n\tsignature\x18\x04 \x01(\x0c\x12$\n\x04\x64own\x18\x05 \x03(\x0b\x32\x16.plr.v1.InterfaceLabel\"r\n\x08Services\x12$\n\x06offers\x18\x01 \x03(\x0b\x32\x14.plr.v1.ServiceOffer\x12 \n\x04uses\x18\x02 \x03(\x0b\x32\x12.plr.v1.ServiceUse\x12\r\n\x05unmet\x18\x03 \x03(\t\x12\x0f\n\x07untyped\x18\x04 \x03(\t\"\xeb\x01\n\rLatencyReport\x12\x11\n\tinterface\x18\x01 \x01(\t\x12\x0e\n\x06server\x18\x02 \x01(\t\x12\x0f\n\x07service\x18\x03 \x01(\t\x12\x12\n\nsize_class\x18\x04 \x01(\r\x12\"\n\x07network\x18\x05 \x01(\x0b\x32\x11.plr.v1.Histogram\x12%\n\ncalled_off\x18\x06 \x01(\x0b\x32\x11.plr.v1.Histogram\x12%\n\nprocessing\x18\x07 \x01(\x0b\x32\x11.plr.v1.Histogram\x12\x10\n\x08requests\x18\x08 \x01(\x04\x12\x0e\n\x06missed\x18\t \x01(\x04\"\x8c\x01\n\x0bJointReport\x12\x0f\n\x07service\x18\x01 \x01(\t\x12!\n\x05\x66irst\x18\x02 \x01(\x0b\x32\x12.plr.v1.Assignment\x12\"\n\x06second\x18\x03 \x01(\x0b\x32\x12.plr.v1.Assignment\x12\x10\n\x08requests\x18\x04 \x01(\x04\x12\x13\n\x0b\x62oth_missed\x18\x05 \x01(\x04\"\xc3\x01\n\x14InterfaceJointReport\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\r\n\x05\x66irst\x18\x02 \x01(\t\x12\x0e\n\x06second\x18\x03 \x01(\t\x12\x0e\n\x06server\x18\x04 \x01(\t\x12\x10\n\x08requests\x18\x05 \x01(\x04\x12\x13\n\x0b\x62oth_missed\x18\x06 \x01(\x04\x12\r\n\x05races\x18\x07 \x01(\x04\x12\x19\n\x11only_first_missed\x18\x08 \x01(\x04\x12\x1a\n\x12only_second_missed\x18\t \x01(\x04\"\x8b\x01\n\nPathReport\x12\x11\n\tinterface\x18\x01 \x01(\t\x12\x0e\n\x06server\x18\x02 \x01(\t\x12\n\n\x02up\x18\x03 \x01(\x08\x12\x1e\n\x03rtt\x18\x04 \x01(\x0b\x32\x11.plr.v1.Histogram\x12\x16\n\x0e\x64\x61tagrams_sent\x18\x05 \x01(\x04\x12\x16\n\x0e\x64\x61tagrams_lost\x18\x06 \x01(\x04\"U\n\rOutcomeReport\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\n\n\x02ok\x18\x02 \x01(\x04\x12\x17\n\x0f\x64\x65\x61\x64line_missed\x18\x03 \x01(\x04\x12\x0e\n\x06\x66\x61iled\x18\x04 \x01(\x04\"E\n\rPenaltyReport\x12\x0e\n\x06server\x18\x01 \x01(\t\x12\x0f\n\x07left_us\x18\x02 \x01(\x04\x12\x13\n\x0b\x62\x61\x64_answers\x18\x03 \x01(\x04\"\xad\x02\n\x06Report\x12(\n\tlatencies\x18\x01 \x03(\x0b\x32\x15.plr.v1.LatencyReport\x12!\n\x05paths\x18\x02 \x03(\x0b\x32\x12.plr.v1.PathReport\x12\'\n\x08outcomes\x18\x03 \x03(\x0b\x32\x15.plr.v1.OutcomeReport\x12#\n\x06joints\x18\x04 \x03(\x0b\x32\x13.plr.v1.JointReport\x12\x36\n\x10interface_joints\x18\x05 \x03(\x0b\x32\x1c.plr.v1.InterfaceJointReport\x12(\n\tpenalties\x18\x06 \x03(\x0b\x32\x15.plr.v1.PenaltyReport\x12\x10\n\x08goodbyes\x18\x07 \x03(\t\x12\x14\n\x0c\x63hanges_only\x18\x08 \x01(\x08\"M\n\x03\x41\x63k\x12&\n\x08resource\x18\x01 \x01(\x0e\x32\x14.plr.v1.ResourceKind\x12\x0f\n\x07version\x18\x02 \x01(\x04\x12\r\n\x05nonce\x18\x03 \x01(\x04\"]\n\x04Nack\x12&\n\x08resource\x18\x01 \x01(\x0e\x32\x14.plr.v1.ResourceKind\x12\x0f\n\x07version\x18\x02 \x01(\x04\x12\r\n\x05nonce\x18\x03 \x01(\x04\x12\r\n\x05\x65rror\x18\x04 \x01(\t\"\x0b\n\tHeartbeat\"\x07\n\x05\x44rain\";\n\x08HeldList\x12\n\n\x02\x63\x61\x18\x01 \x01(\x06\x12\x0e\n\x06number\x18\x02 \x01(\x04\x12\x13\n\x0bsigned_at_s\x18\x03 \x01(\x04\"?\n\x0bRevocations\x12\x1f\n\x05lists\x18\x01 \x03(\x0b\x32\x10.plr.v1.HeldList\x12\x0f\n\x07too_old\x18\x02 \x01(\r\"\x85\x01\n\x0e\x43ontrolMessage\x12\"\n\x07welcome\x18\x01 \x01(\x0b\x32\x0f.plr.v1.WelcomeH\x00\x12 \n\x05peers\x18\x02 \x01(\x0b\x32\x0f.plr.v1.PeerSetH\x00\x12%\n\x07mapping\x18\x03 \x01(\x0b\x32\x12.plr.v1.MappingSetH\x00\x42\x06\n\x04kind\"t\n\x07Welcome\x12\x10\n\x08lease_us\x18\x01 \x01(\x04\x12\x1a\n\x12report_interval_us\x18\x02 \x01(\x04\x12\x14\n\x0cstun_servers\x18\x03 \x03(\t\x12\x0b\n\x03\x63rl\x18\x04 \x01(\x0c\x12\x18\n\x10reconnect_max_us\x18\x05 \x01(\x04\"B\n\x0bRemovedPeer\x12\x0c\n\x04name\x18\x01 \x01(\t\x12%\n\x06reason\x18\x02 \x01(\x0e\x32\x15.plr.v1.RemovalReason\"\xa0\x01\n\x07PeerSet\x12\x0f\n\x07version\x18\x01 \x01(\x04\x12\r\n\x05nonce\x18\x02 \x01(\x04\x12\x1b\n\x05peers\x18\x03 \x03(\x0b\x32\x0c.plr.v1.Peer\x12$\n\x07removed\x18\x04 \x03(\x0b\x32\x13.plr.v1.RemovedPeer\x12\x0e\n\x06policy\x18\x05 \x01(\x06\x12\x14\n\x0c\x62\x61se_version\x18\x06 \x01(\x04\x12\x0c\n\x04more\x18\x07 \x01(\x08\"/\n\nAssignment\x12\x11\n\tinterface\x18\x01 \x01(\t\x12\x0e\n\x06server\x18\x02 \x01(\t\"\x97\x01\n\x0eServiceMapping\x12\x0f\n\x07service\x18\x01 \x01(\t\x12\'\n\x0b\x61ssignments\x18\x02 \x03(\x0b\x32\x12.plr.v1.Assignment\x12\x16\n\x0epredicted_miss\x18\x03 \x01(\x01\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12#\n\x07\x65xplore\x18\x05 \x01(\x0b\x32\x12.plr.v1.Assignment\"V\n\nMappingSet\x12\x0f\n\x07version\x18\x01 \x01(\x04\x12\r\n\x05nonce\x18\x02 \x01(\x04\x12(\n\x08services\x18\x03 \x03(\x0b\x32\x16.plr.v1.ServiceMapping*a\n\x0cResourceKind\x12\x1d\n\x19RESOURCE_KIND_UNSPECIFIED\x10\x00\x12\x17\n\x13RESOURCE_KIND_PEERS\x10\x01\x12\x19\n\x15RESOURCE_KIND_MAPPING\x10\x02*\xc0\x01\n\rRemovalReason\x12\x1e\n\x1aREMOVAL_REASON_UNSPECIFIED\x10\x00\x12 \n\x1cREMOVAL_REASON_LEASE_EXPIRED\x10\x01\x12\x17\n\x13REMOVAL_REASON_LEFT\x10\x02\x12\x1a\n\x16REMOVAL_REASON_REVOKED\x10\x03\x12\x1c\n\x18REMOVAL_REASON_FORBIDDEN\x10\x04\x12\x1a\n\x16REMOVAL_REASON_EXPIRED\x10\x05\x32M\n\x0c\x43ontrolPlane\x12=\n\x07\x43onnect\x12\x16.plr.v1.SidecarMessage\x1a\x16.plr.v1.ControlMessage(\x01\x30\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'protos.plr.v1.control_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_RESOURCEKIND']._serialized_start=3264
-  _globals['_RESOURCEKIND']._serialized_end=3361
-  _globals['_REMOVALREASON']._serialized_start=3364
-  _globals['_REMOVALREASON']._serialized_end=3556
+  _globals['_RESOURCEKIND']._serialized_start=3281
+  _globals['_RESOURCEKIND']._serialized_end=3378
+  _globals['_REMOVALREASON']._serialized_start=3381
+  _globals['_REMOVALREASON']._serialized_end=3573
   _globals['_SIDECARMESSAGE']._serialized_start=67
   _globals['_SIDECARMESSAGE']._serialized_end=417
   _globals['_REGISTER']._serialized_start=420
@@ -43,47 +43,47 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_CANDIDATES']._serialized_start=718
   _globals['_CANDIDATES']._serialized_end=882
   _globals['_SERVICES']._serialized_start=884
-  _globals['_SERVICES']._serialized_end=981
-  _globals['_LATENCYREPORT']._serialized_start=984
-  _globals['_LATENCYREPORT']._serialized_end=1219
-  _globals['_JOINTREPORT']._serialized_start=1222
-  _globals['_JOINTREPORT']._serialized_end=1362
-  _globals['_INTERFACEJOINTREPORT']._serialized_start=1365
-  _globals['_INTERFACEJOINTREPORT']._serialized_end=1560
-  _globals['_PATHREPORT']._serialized_start=1563
-  _globals['_PATHREPORT']._serialized_end=1702
-  _globals['_OUTCOMEREPORT']._serialized_start=1704
-  _globals['_OUTCOMEREPORT']._serialized_end=1789
-  _globals['_PENALTYREPORT']._serialized_start=1791
-  _globals['_PENALTYREPORT']._serialized_end=1860
-  _globals['_REPORT']._serialized_start=1863
-  _globals['_REPORT']._serialized_end=2164
-  _globals['_ACK']._serialized_start=2166
-  _globals['_ACK']._serialized_end=2243
-  _globals['_NACK']._serialized_start=2245
-  _globals['_NACK']._serialized_end=2338
-  _globals['_HEARTBEAT']._serialized_start=2340
-  _globals['_HEARTBEAT']._serialized_end=2351
-  _globals['_DRAIN']._serialized_start=2353
-  _globals['_DRAIN']._serialized_end=2360
-  _globals['_HELDLIST']._serialized_start=2362
-  _globals['_HELDLIST']._serialized_end=2421
-  _globals['_REVOCATIONS']._serialized_start=2423
-  _globals['_REVOCATIONS']._serialized_end=2486
-  _globals['_CONTROLMESSAGE']._serialized_start=2489
-  _globals['_CONTROLMESSAGE']._serialized_end=2622
-  _globals['_WELCOME']._serialized_start=2624
-  _globals['_WELCOME']._serialized_end=2740
-  _globals['_REMOVEDPEER']._serialized_start=2742
-  _globals['_REMOVEDPEER']._serialized_end=2808
-  _globals['_PEERSET']._serialized_start=2811
-  _globals['_PEERSET']._serialized_end=2971
-  _globals['_ASSIGNMENT']._serialized_start=2973
-  _globals['_ASSIGNMENT']._serialized_end=3020
-  _globals['_SERVICEMAPPING']._serialized_start=3023
-  _globals['_SERVICEMAPPING']._serialized_end=3174
-  _globals['_MAPPINGSET']._serialized_start=3176
-  _globals['_MAPPINGSET']._serialized_end=3262
-  _globals['_CONTROLPLANE']._serialized_start=3558
-  _globals['_CONTROLPLANE']._serialized_end=3635
+  _globals['_SERVICES']._serialized_end=998
+  _globals['_LATENCYREPORT']._serialized_start=1001
+  _globals['_LATENCYREPORT']._serialized_end=1236
+  _globals['_JOINTREPORT']._serialized_start=1239
+  _globals['_JOINTREPORT']._serialized_end=1379
+  _globals['_INTERFACEJOINTREPORT']._serialized_start=1382
+  _globals['_INTERFACEJOINTREPORT']._serialized_end=1577
+  _globals['_PATHREPORT']._serialized_start=1580
+  _globals['_PATHREPORT']._serialized_end=1719
+  _globals['_OUTCOMEREPORT']._serialized_start=1721
+  _globals['_OUTCOMEREPORT']._serialized_end=1806
+  _globals['_PENALTYREPORT']._serialized_start=1808
+  _globals['_PENALTYREPORT']._serialized_end=1877
+  _globals['_REPORT']._serialized_start=1880
+  _globals['_REPORT']._serialized_end=2181
+  _globals['_ACK']._serialized_start=2183
+  _globals['_ACK']._serialized_end=2260
+  _globals['_NACK']._serialized_start=2262
+  _globals['_NACK']._serialized_end=2355
+  _globals['_HEARTBEAT']._serialized_start=2357
+  _globals['_HEARTBEAT']._serialized_end=2368
+  _globals['_DRAIN']._serialized_start=2370
+  _globals['_DRAIN']._serialized_end=2377
+  _globals['_HELDLIST']._serialized_start=2379
+  _globals['_HELDLIST']._serialized_end=2438
+  _globals['_REVOCATIONS']._serialized_start=2440
+  _globals['_REVOCATIONS']._serialized_end=2503
+  _globals['_CONTROLMESSAGE']._serialized_start=2506
+  _globals['_CONTROLMESSAGE']._serialized_end=2639
+  _globals['_WELCOME']._serialized_start=2641
+  _globals['_WELCOME']._serialized_end=2757
+  _globals['_REMOVEDPEER']._serialized_start=2759
+  _globals['_REMOVEDPEER']._serialized_end=2825
+  _globals['_PEERSET']._serialized_start=2828
+  _globals['_PEERSET']._serialized_end=2988
+  _globals['_ASSIGNMENT']._serialized_start=2990
+  _globals['_ASSIGNMENT']._serialized_end=3037
+  _globals['_SERVICEMAPPING']._serialized_start=3040
+  _globals['_SERVICEMAPPING']._serialized_end=3191
+  _globals['_MAPPINGSET']._serialized_start=3193
+  _globals['_MAPPINGSET']._serialized_end=3279
+  _globals['_CONTROLPLANE']._serialized_start=3575
+  _globals['_CONTROLPLANE']._serialized_end=3652
 # @@protoc_insertion_point(module_scope)

@@ -292,7 +292,9 @@ revocation_sets = st.builds(
 sidecar_messages: st.SearchStrategy[SidecarMessage] = st.one_of(
     registrations,
     candidate_sets(),
-    st.builds(ServiceSet, _tuples(offers, by="name"), _tuples(uses, by="name"), _tuples(service_names)),
+    st.builds(
+        ServiceSet, _tuples(offers, by="name"), _tuples(uses, by="name"), _tuples(service_names), _tuples(service_names)
+    ),
     reports,
     st.builds(Ack, st.sampled_from(ResourceKind), versions, uint64),
     st.builds(Nack, st.sampled_from(ResourceKind), versions, uint64, texts),

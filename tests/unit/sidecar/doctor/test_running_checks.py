@@ -186,7 +186,10 @@ def test_services() -> None:
 
 def test_the_mapping() -> None:
     none = state(mapping={"version": 0, "source": None, "age_s": None}, mapped=[])
-    assert len(texts(running_checks.mapping(none, lambda _: None), Level.WARN)) == 1
+    assert "this robot chooses by round trips" in texts(running_checks.mapping(none, lambda _: None), Level.WARN)[0]
+    nothing: dict[str, object] = {"carried": {}, "unmet": [], "left_alone": {}, "missing_types": {}}
+    idle = state(mapping={"version": 0, "source": None, "age_s": None}, mapped=[], services=nothing)
+    assert "no service is offered yet" in texts(running_checks.mapping(idle, lambda _: None), Level.WARN)[0]
     disk = state(mapping={"version": 7, "source": "disk", "age_s": 9.0})
     assert "kept on disk" in texts(running_checks.mapping(disk, lambda _: None), Level.WARN)[0]
     assert "more than its target 0.01 %" in texts(running_checks.mapping(state(), lambda _: 1e-4), Level.WARN)[0]
