@@ -491,7 +491,12 @@ class ControlLoop:
 
     def _dropped(self) -> dict[str, int]:
         """What the driver itself left out or put off, by reason."""
-        return {"report_slowed": self.report_shares.slowed, "log_line_left_out": self._lines.left_out}
+        return {
+            "report_slowed": self.report_shares.slowed,
+            "report_share_forgotten": self.report_shares.forgotten,
+            "log_line_left_out": self._lines.left_out,
+            "log_share_forgotten": self._lines.forgotten,
+        }
 
     def close_streams(self) -> None:
         """Tell every stream that the control plane stops."""

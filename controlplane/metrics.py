@@ -39,7 +39,12 @@ SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 
 NO_EVENTS = EventLogState()
 
-NOTHING_DROPPED: Mapping[str, int] = {"report_slowed": 0, "log_line_left_out": 0}
+NOTHING_DROPPED: Mapping[str, int] = {
+    "report_slowed": 0,
+    "report_share_forgotten": 0,
+    "log_line_left_out": 0,
+    "log_share_forgotten": 0,
+}
 
 REFUSAL_REASONS = (
     identity.MALFORMED,

@@ -36,7 +36,7 @@ SETTLE_S = 20.0
 READY_S = 12.0
 """From the start to what counts as empty: the solver's modules are loaded once nobody has come for some seconds."""
 DEAD_S = 2.0
-"""From a kill to the next start."""
+"""From a kill to the next start, at least."""
 STATUS_LOOKS = 3
 LEASES = 'plr_departures_total{reason="lease_expired"}'
 LOOK_EVERY_S = 0.02

@@ -28,6 +28,7 @@ class LineShare:
         """Since the last line on the member, if any was."""
         self.left_out = 0
         """Of all members."""
+        self.forgotten = 0
 
     def take(self, member: str, now: float) -> int | None:
         """How many lines on this member were left out since its last one; None: this one is to be left out too."""
@@ -37,6 +38,7 @@ class LineShare:
             if len(self._shares) > MAX_MEMBERS:
                 forgotten, _ = self._shares.popitem(last=False)
                 self._left_out.pop(forgotten, None)
+                self.forgotten += 1
         self._shares.move_to_end(member)
         if share.take(now):
             return self._left_out.pop(member, 0)

@@ -69,6 +69,7 @@ class ReportShares:
         self._busy = 0.0
         self.slowed = 0
         """Times that a member was not read for a while."""
+        self.forgotten = 0
 
     @property
     def entries_per_s(self) -> float:
@@ -82,6 +83,7 @@ class ReportShares:
             member = self._members[name] = _Member(0.0, 0.0, now)
             if len(self._members) > MAX_MEMBERS:
                 self._members.popitem(last=False)
+                self.forgotten += 1
         self._members.move_to_end(name)
         self._pass(member, now)
         member.debt += entries

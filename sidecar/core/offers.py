@@ -181,6 +181,7 @@ class Offers:
         self._types.move_to_end(name)
         if len(self._types) > MAX_TYPES:
             self._types.popitem(last=False)
+            self._stats.dropped["type_forgotten"] += 1
 
     def set_peer(self, peer: Peer) -> None:
         """Take what a peer offers; `update` tells what comes of it."""

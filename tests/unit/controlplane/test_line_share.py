@@ -27,3 +27,4 @@ def test_the_table_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     lines.take("b", 0.0)
     lines.take("c", 0.0)
     assert lines.take("a", 0.0) == 0, "forgotten, and counted anew"
+    assert lines.forgotten == 2

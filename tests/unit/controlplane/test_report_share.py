@@ -150,4 +150,5 @@ def test_who_connects_again_and_again_has_one_share(monkeypatch: pytest.MonkeyPa
     shares.take(NodeName("d"), 1, 0.5)
     assert shares.wait_s(ROBOT, 0.5) == pytest.approx(0.5), "who reported longest ago is forgotten"
     assert shares.wait_s(NodeName("b"), 0.5) == 0.0
+    assert shares.forgotten == 1
     assert LEAST_BURST < ENTRIES_BURST

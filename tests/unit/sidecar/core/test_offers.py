@@ -184,6 +184,7 @@ def test_types_of_names_that_peers_invent_are_forgotten(monkeypatch: pytest.Monk
     for name in names:
         robot.offers.remember_type(name, TYPE)
     assert [robot.offers.knows_type(name) for name in names] == [False, True, True]
+    assert robot.stats.dropped["type_forgotten"] == 1
 
 
 def test_when_the_type_changes_the_old_offer_goes_and_the_new_one_comes() -> None:
