@@ -14,15 +14,23 @@ import pytest
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
+from controlplane.ca import key_file, passphrase
+from controlplane.ca.authority import DEFAULT_DAYS
+from controlplane.ca.request import MAX_REQUEST_BYTES
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.control import ControlCore
 from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics
+from protos.convert.fields import MAX_CRL_BYTES
 from protos.histogram import Histogram
-from protos.identity import Identity, IdentityRole, RevocationList
+from protos.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
 from protos.model import InterfaceName, NodeName, ServiceName
+from protos.tls_files import MAX_FILE_BYTES
 from sidecar.config import SidecarConfig
+from sidecar.control_client import JUDGE_AGAIN_S
 from sidecar.core.control_session import ControlStats
+from sidecar.core.messages import RevocationsHeld, encode_message
+from sidecar.core.revocation_exchange import ASK_AGAIN_S, ASK_NEXT_AFTER_S
 from sidecar.core.stats import EngineStats, LinkStats
 from sidecar.metrics import MetricSources, SidecarCollector
 from sidecar.revocations import RevocationState
@@ -268,6 +276,24 @@ UNITS = {"B": 1, "kB": 1000, "KiB": 1024, "MiB": 1 << 20, "s": 1, "ms": 1e-3}
 def test_limits_have_the_documented_value(path: str, name: str, shown: str) -> None:
     number, _, unit = shown.partition(" ")
     assert _constants(ROOT / path)[name] == float(number) * UNITS.get(unit, 1)
+
+
+def test_the_page_of_certificates_has_the_numbers_of_the_code() -> None:
+    page = " ".join(read("certificates.md").split())
+    for said in (
+        f"a passphrase of {passphrase.MIN_BYTES} to {passphrase.MAX_BYTES} bytes",
+        f"N = 2^{key_file.SCRYPT_N.bit_length() - 1}, r = {key_file.SCRYPT_R}, p = {key_file.SCRYPT_P}",
+        f"a certificate for {DEFAULT_DAYS:.0f} days",
+        f"the CAs to believe, {MAX_CA_CERTIFICATES} at most",
+        f"a file of more than {MAX_FILE_BYTES >> 20} MiB",
+        f"one of more than {MAX_REQUEST_BYTES >> 10} KiB",
+        f"Lists of more than {MAX_CRL_BYTES >> 20} MiB in all",
+        f"its number, {encode_message(RevocationsHeld({1: 1})).size} bytes for one CA",
+        f"one question in {ASK_NEXT_AFTER_S:.0f} s at most",
+        f"is asked after {ASK_AGAIN_S:.0f} s, {2 * ASK_AGAIN_S:.0f} s",
+        f"It judges them again every {JUDGE_AGAIN_S:.0f} s",
+    ):
+        assert said in page, said
 
 
 # -- links --------------------------------------------------------------------------------------------------------

@@ -38,13 +38,27 @@ from protos.model import (
     ServiceName,
 )
 from protos.pair_token import pair_token
-from sidecar.core import fec, frame, introduction, key_exchange, messages, path_address, session
+from sidecar.core import (
+    copies,
+    fec,
+    fragments,
+    frame,
+    introduction,
+    key_exchange,
+    messages,
+    outbox,
+    path_address,
+    path_table,
+    session,
+)
 from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.frame import Header
 from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.key_schedule import pair_keys
-from sidecar.core.path_keys import MAX_FAILED, PathKeys, make_path_keys
+from sidecar.core.path_keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
+from sidecar.core.peers import RESTART_GAP_S
 from sidecar.core.priority import Priority
+from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
 from tests.sessions import seal
 
 if TYPE_CHECKING:
@@ -449,8 +463,29 @@ def test_the_numbers_on_the_page_are_those_of_the_code() -> None:
         f"after 2^{MAX_FAILED.bit_length() - 1} the path",
         f"{key_exchange.EXCHANGES_AT_ONCE:.0f} exchanges at once and {key_exchange.EXCHANGES_PER_S:.0f} a second",
         f"most {path_address.AMPLIFICATION} times",
+        f"first datagram that opens, {LATE_S:.0f} s after the change",
+        f"late, {key_exchange.WAITS_S:.0f} s at most",
+        f"at most {LOOKS_PER_S:.0f} a second are judged",
+        f"{ALL_LOOKS_AT_ONCE:.0f} at once, and {ALL_LOOKS_PER_S:.0f} a second",
+        f"At most {path_table.MAX_INTRODUCTIONS} introductions over a path",
+        f"at most {path_table.NEW_PATHS} paths at once in this way, and {path_table.NEW_PATHS_PER_S:.0f} a second",
+        f"It has at most {path_table.MAX_PATHS_OF_A_PEER} there",
+        f"go {path_table.UNPROVEN_BYTES} bytes in all and {path_table.UNPROVEN_BYTES_PER_S:.0f} bytes a second",
+        f"up to {fragments.MAX_PEER_BYTES >> 20} MiB of one peer's half messages",
+        f"up to {fragments.MAX_PEER_MESSAGES} of them",
+        f"no symbol for {fragments.MAX_AGE_S:.0f} s",
+        f"under a new number, up to {outbox.MAX_GENERATIONS} times",
+        f"last byte is divisible by {copies.OBSERVED_ONE_IN}",
     ):
-        assert said in PAGE.replace("\n", " "), said
+        assert said in " ".join(PAGE.split()), said
+    assert RESTART_GAP_S == 1.0  # "one restart a second"
+
+
+def test_the_counters_on_the_page_are_those_of_the_metrics() -> None:
+    metrics = (DOCS / "metrics.md").read_text(encoding="utf-8")
+    named = [name for row in table("## What is dropped, and its counter") for name in re.findall(r"`(\w+)`", row[1])]
+    assert len(named) > 20
+    assert [name for name in named if f"`{name}`" not in metrics] == []
 
 
 def test_the_tests_that_the_page_names_exist() -> None:

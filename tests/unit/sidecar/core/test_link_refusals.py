@@ -57,6 +57,7 @@ BAD = {
     "wrong interface": (good(receiver=InterfaceId(4)), "wrong_interface"),
     "unknown interface of the peer": (good(interface=InterfaceId(8)), "unknown_path"),
     "unknown session": (good(session=OTHER_SESSION), "unknown_session"),
+    "unknown session, no room for a frame": (good(session=OTHER_SESSION)[:36], "unknown_session"),
     "a stranger's introduction": (Bench().introduction(token=bytes(16), session=OTHER_SESSION), "unknown_introducer"),
     "an introduction cut short": (Bench().introduction()[:60], "unauthentic"),
     "an introduction of nearly nothing": (Bench().introduction()[:37], "unauthentic"),
