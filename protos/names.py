@@ -50,7 +50,9 @@ def _name(value: str, field: str, pattern: re.Pattern[str], expected: str) -> st
 
 def node_name(value: str, field: str) -> NodeName:
     """Check the name of a sidecar."""
-    return NodeName(_name(value, field, _NODE_NAME, "a name of 1 to 63 letters, digits, '_', '.' and '-'"))
+    return NodeName(
+        _name(value, field, _NODE_NAME, "a name of 1 to 63 letters, digits, '_', '.' and '-', a letter or digit first")
+    )
 
 
 def interface_name(value: str, field: str) -> InterfaceName:
@@ -60,7 +62,12 @@ def interface_name(value: str, field: str) -> InterfaceName:
 
 def domain_label(value: str, field: str) -> str:
     """Check the name of a region or a carrier; an empty one means that it is not known."""
-    return value and _name(value, field, _DOMAIN_LABEL, "a name of 1 to 63 letters, digits, '_', '.', '-', '&' and '+'")
+    return value and _name(
+        value,
+        field,
+        _DOMAIN_LABEL,
+        "a name of 1 to 63 letters, digits, '_', '.', '-', '&' and '+', a letter or digit first",
+    )
 
 
 def service_name(value: str, field: str) -> ServiceName:

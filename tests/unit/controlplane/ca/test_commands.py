@@ -134,6 +134,7 @@ def test_a_folder_that_can_not_be_written_is_one_line(shell: Shell, tmp_path: Pa
         (["issue", "robot-1", "--role", "admin"], "invalid choice"),
         (["issue", "robot 1", "--role", "robot"], "is not a name of 1 to 63"),
         (["issue", "../x", "--role", "robot"], "is not a name of 1 to 63"),
+        (["issue", ".robot", "--role", "robot"], "a letter or digit first"),
         (["issue", "robot-1", "--role", "robot", "--days", "0"], "a number of days"),
         (["issue", "robot-1", "--role", "robot", "--days", "nan"], "a number of days"),
         (["revoke", "robot-1", "--reason", "because"], "invalid choice"),
