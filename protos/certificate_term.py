@@ -17,7 +17,7 @@ SOON_S = 7 * 86_400.0
 _REMEDIES = {
     EXPIRED: "renew it beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem to the node",
     NOT_YET_VALID: "set this host's clock if it is wrong, or wait",
-    REVOKED: "issue another beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem to the node",
+    REVOKED: "let it in again beside the CA, with: plr ca issue {name} --role ..., and copy the files to the node",
 }
 
 
@@ -41,10 +41,15 @@ def term_problem(files: TlsFiles, now_wall: float) -> TermProblem | None:
     left_s = files.identity.not_after - now_wall
     if left_s >= SOON_S:
         return None
-    remedy = _REMEDIES[EXPIRED].format(name=name)
-    return TermProblem(in_force=True, text=f"{path}: {in_words(left_s)} until it ends; {remedy}")
+    what_to_do = _REMEDIES[EXPIRED].format(name=name)
+    return TermProblem(in_force=True, text=f"{path}: {in_words(left_s)} until it ends; {what_to_do}")
 
 
 def with_remedy(refusal: CertificateError, name: str) -> str:
     """Return why a node's certificate is refused and what to do about it, in one line."""
-    return f"{refusal}; {_REMEDIES.get(refusal.reason, 'see docs/certificates.md').format(name=name)}"
+    return f"{refusal}; {remedy(refusal, name)}"
+
+
+def remedy(refusal: CertificateError, name: str) -> str:
+    """Return what to do about it."""
+    return _REMEDIES.get(refusal.reason, "see docs/certificates.md").format(name=name)

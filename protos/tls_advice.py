@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from protos.certificate_term import remedy
 from protos.identity import CONTROL_PLANE_DNS, CertificateError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def explain(details: str, files: TlsFiles | None, now_wall: float) -> str | None
     try:
         files.trust.check(files.certificate_der, now_wall)
     except CertificateError as error:
-        return f"{error}: the control plane does not let it in; do: plr ca renew {files.identity.name}"
+        return f"{error}: the control plane does not let it in; {remedy(error, files.identity.name)}"
     return (
         "the control plane cut the connection during the TLS handshake: it may not know our CA, its clock may differ, "
         f"or it is insecure; {_SEE_LOG}"

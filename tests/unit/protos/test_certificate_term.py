@@ -10,7 +10,9 @@ import pytest
 
 from controlplane.__main__ import main as control_plane
 from controlplane.ca import Authority
+from controlplane.ca.authority import AuthorityError
 from controlplane.ca.certificates import Validity
+from protos import tls_advice
 from protos.certificate_term import SOON_S, term_problem
 from protos.identity import IdentityRole
 from protos.tls_files import load_tls_files
@@ -58,10 +60,18 @@ def test_a_revoked_one_is_told_so(tmp_path: Path, ca: Authority) -> None:
     ca.write_tls_dir(tmp_path / "tls", "robot-1", IdentityRole.ROBOT)
     ca.revoke("robot-1")
     (tmp_path / "tls" / "crl.pem").write_bytes(ca.crl_pem())
-    problem = term_problem(load_tls_files(tmp_path / "tls"), time.time())
+    files, now = load_tls_files(tmp_path / "tls"), time.time()
+    problem = term_problem(files, now)
     assert problem is not None
     assert not problem.in_force
-    assert "robot-1 is revoked; issue another" in problem.text
+    refused = tls_advice.explain("Socket closed", files, now) or ""
+    for text in (problem.text, refused):
+        assert "robot-1 is revoked" in text
+        assert "; let it in again beside the CA, with: plr ca issue robot-1 --role" in text
+    # That is what the CA takes then.
+    with pytest.raises(AuthorityError):
+        ca.renew("robot-1")
+    ca.issue("robot-1", IdentityRole.ROBOT)
 
 
 @pytest.mark.audit("ops-3")
