@@ -57,6 +57,7 @@ class _StrictLoader(yaml.SafeLoader):
 
     def whole_number(self, node: yaml.ScalarNode) -> int:
         _refuse_long(node)
+        _refuse_ambiguous(node)
         value = self.construct_yaml_int(node)
         if abs(value) > _MAX_WHOLE:
             raise _refused("no number may have more than 64 bits", node)
@@ -64,6 +65,7 @@ class _StrictLoader(yaml.SafeLoader):
 
     def number(self, node: yaml.ScalarNode) -> float:
         _refuse_long(node)
+        _refuse_ambiguous(node)
         return self.construct_yaml_float(node)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -110,6 +112,13 @@ def _refuse_long(node: yaml.ScalarNode) -> None:
     # A long one takes long: PyYAML multiplies the parts of 1:59:59 one by one, and Python refuses to print it.
     if len(node.value) > _MAX_NUMBER_CHARACTERS:
         raise _refused("no number may have more than 64 bits", node)
+
+
+def _refuse_ambiguous(node: yaml.ScalarNode) -> None:
+    """Refuse what YAML 1.1 reads in base 8 or 60, and its reader in base 10: 0123 is 83, 1:30 is 90."""
+    digits = node.value.lstrip("+-").replace("_", "")
+    if ":" in digits or (digits[:1] == "0" and digits[1:2].isdigit()):
+        raise _refused(f"write {node.value} without leading zeros or colons, or, if it is text, in quotes", node)
 
 
 def _refused(rule: str, node: yaml.Node) -> yaml.constructor.ConstructorError:

@@ -25,6 +25,9 @@ def bomb(levels: int) -> str:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
+        ("port: 024700", "write 024700 without leading zeros or colons"),
+        ("port: 1:30", "write 1:30 without leading zeros or colons"),
+        ("port: 01.5", "write 01.5 without leading zeros or colons"),
         (f"port: 0x{'f' * 5000}", "no number may have more than 64 bits"),
         (f"port: 0b{'1' * 65}", "no number may have more than 64 bits"),
         (f"? 0x{'f' * 64}\n: 1", "no number may have more than 64 bits"),
