@@ -26,8 +26,9 @@ deployed "" "$@"
 deployed -sidecar --extra sidecar "$@"
 deployed -ros --extra sidecar --extra ros "$@"
 deployed -controlplane --extra controlplane "$@"
-# What builds the packages that have no wheel, and ours.
-echo setuptools | compile --constraint requirements/dev.txt - --output-file requirements/build.txt "$@"
+# What builds the packages that have no wheel, and ours. setuptools brings a packaging of its own, but prefers one that it
+# finds: Ubuntu 24.04's, in an environment that sees the system's packages, is too old for it.
+printf '%s\n' packaging setuptools | compile --constraint requirements/dev.txt - --output-file requirements/build.txt "$@"
 # The same with the installer of a checkout, for pip to fetch.
 {
   grep '^uv==' requirements/constraints.txt
