@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import re
 import tomllib
 from pathlib import Path
@@ -67,6 +68,17 @@ def test_a_robot_installs_no_solver_and_beside_a_ros_of_its_own_nothing_of_ros()
     own = pins("runtime-sidecar.txt")
     assert "numpy" not in own, "it would hide the one that apt's ROS was built with"
     assert not any(package.startswith("ros-") for package in own)
+
+
+@pytest.mark.audit("ops-8")
+def test_a_build_that_sees_the_system_s_packages_finds_a_packaging_that_setuptools_takes() -> None:
+    asked = [
+        str(requirement)
+        for requirement in map(Requirement, importlib.metadata.requires("setuptools") or [])
+        if requirement.name == "packaging" and "core" in str(requirement.marker)
+    ]
+    assert asked and not unmet(asked, pins("build.txt")), "run: make lock"
+    assert unmet(asked, {"packaging": {Version("24.0")}}), "Ubuntu 24.04's would do: lock none"
 
 
 def test_what_is_not_locked_is_noticed() -> None:
