@@ -7,8 +7,10 @@ tried in another process where it could come to that.
 
 from __future__ import annotations
 
+import importlib.machinery
 import importlib.util
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -25,6 +27,7 @@ TRY_TIMEOUT_S = 60.0
 """Loading rclpy takes half a second on an idle machine."""
 
 _TRY = "import rclpy; rclpy.init(args=['--ros-args', '--disable-external-lib-logs']); rclpy.shutdown()"
+_C_PART = "_rclpy_pybind11"
 _MAX_SAID_CHARACTERS = 300
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
@@ -37,11 +40,18 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
     domain = environment.get("ROS_DOMAIN_ID", "")
     if domain and not (_NUMBER.fullmatch(domain) and int(domain) <= MAX_DOMAIN_ID):
         return f"ROS_DOMAIN_ID: expected a number from 0 to {MAX_DOMAIN_ID}, got {domain[:_MAX_SAID_CHARACTERS]!r}"
-    if importlib.util.find_spec("rclpy") is None:
+    rclpy = importlib.util.find_spec("rclpy")
+    if rclpy is None:
         return (
             f"ROS 2's rclpy is not there for {sys.executable}: with ROS from apt, source /opt/ros/jazzy/setup.bash "
-            "before (for the unit: /etc/plr/sidecar.env, deploy/README.md); without, in the checkout: pip install "
-            "'.[ros]'"
+            f"before (for the unit: /etc/plr/sidecar.env, deploy/README.md); without, {_without_apt(platform.machine())}"
+        )
+    folders = list(rclpy.submodule_search_locations or ())
+    if importlib.machinery.PathFinder.find_spec(_C_PART, folders) is None:
+        return (
+            f"ROS 2's rclpy in {' '.join(folders)} was not built for {sys.executable}, which is Python "
+            f"{sys.version_info.major}.{sys.version_info.minor}: make the environment with ROS's own Python; for ROS "
+            "from apt: /usr/bin/python3 -m venv --system-site-packages (docs/install.md, ROS from apt)"
         )
     rmw = environment.get("RMW_IMPLEMENTATION", "")
     if not thorough and rmw in ("", DEFAULT_RMW):
@@ -55,6 +65,13 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
             "with ROS from apt: ros-jazzy-" + rmw.replace("_", "-")
         )
     return f"ROS 2 does not start here: {said}"
+
+
+def _without_apt(machine: str) -> str:
+    """Return what to do on a `machine`, as uname names it, that has no ROS from apt yet."""
+    if machine == "x86_64":
+        return "in the checkout: pip install '.[ros]'"
+    return f"install it: no wheel of it is for {machine} (docs/install.md, ROS from apt)"
 
 
 def _try(environment: Mapping[str, str]) -> str | None:

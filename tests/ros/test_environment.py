@@ -51,6 +51,36 @@ def test_without_rclpy_it_says_where_to_get_it(monkeypatch: pytest.MonkeyPatch) 
     )
 
 
+@pytest.mark.audit("ops-8")
+@pytest.mark.parametrize(
+    ("machine", "told"),
+    [
+        ("x86_64", "without, in the checkout: pip install '.[ros]'"),
+        ("aarch64", "without, install it: no wheel of it is for aarch64 (docs/install.md, ROS from apt)"),
+    ],
+)
+def test_wheels_of_ros_are_offered_only_where_there_are_some(
+    monkeypatch: pytest.MonkeyPatch, machine: str, told: str
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    assert (environment.problem() or "").endswith(told)
+
+
+@pytest.mark.audit("ops-8")
+def test_an_rclpy_of_another_python_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "rclpy"
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+    (folder / "_rclpy_pybind11.cpython-399-aarch64-linux-gnu.so").touch()
+    monkeypatch.delitem(sys.modules, "rclpy", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    told = environment.problem({})
+    assert told is not None
+    assert told.startswith(f"ROS 2's rclpy in {folder} was not built for {sys.executable}, which is Python 3.")
+    assert "/usr/bin/python3 -m venv --system-site-packages" in told
+
+
 @pytest.mark.parametrize("check", [True, False])
 def test_the_program_ends_with_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], check: bool
