@@ -44,7 +44,8 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
     if rclpy is None:
         return (
             f"ROS 2's rclpy is not there for {sys.executable}: with ROS from apt, source /opt/ros/jazzy/setup.bash "
-            f"before (for the unit: /etc/plr/sidecar.env, deploy/README.md); without, {_without_apt(platform.machine())}"
+            "before (for the unit: /etc/plr/sidecar.env, deploy/README.md); without, "
+            + _without_apt(platform.machine())
         )
     folders = list(rclpy.submodule_search_locations or ())
     if importlib.machinery.PathFinder.find_spec(_C_PART, folders) is None:
