@@ -141,6 +141,8 @@ class ControlSession:
         self._taken: dict[ResourceKind, Version] = {}
         """The newest version that was acknowledged on this stream."""
         self._backoff = Backoff(rng, first_s=RETRY_FIRST_S, max_s=RETRY_MAX_S)
+        self._registered_with = b""
+        """The credential that this stream's registration named."""
         self._candidates = CandidateSet()
         self._services = ServiceSet()
         self._revocations = NO_REVOCATIONS
@@ -191,7 +193,11 @@ class ControlSession:
         return self._in_force[resource]
 
     def set_credential(self, credential: bytes) -> None:
-        """What the next registration says of us: the session's credential, signed anew."""
+        """What the next registration says of us: the session's credential, signed anew.
+
+        The driver ends the present stream for it. That one is sent no more addresses: they are signed with the new
+        certificate now, and the control plane would relay them beside the old credential, as a forger does.
+        """
         self._registration = replace(self._registration, credential=credential)
 
     def not_restored(self, held: Apply) -> None:
@@ -448,11 +454,12 @@ class ControlSession:
         messages: list[SidecarMessage] = []
         if self._register_due:
             messages.append(self._current_registration())
+            self._registered_with = self._registration.credential
             self._register_due = False
         if self.state is ControlState.REGISTERING and not self._draining:
             # The rest waits for the Welcome: a write that meets a refusal can hide its reason (gRPC says INTERNAL).
             return messages
-        if self._candidates_due:
+        if self._candidates_due and self._registered_with == self._registration.credential:
             messages.append(self._candidates)
         if self._services_due:
             messages.append(self._services)

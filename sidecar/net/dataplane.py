@@ -239,6 +239,7 @@ class ThreadedDataPlane:
             conflicts = self._engine.offer_conflicts
             refused = list(self._engine.peers.refused.values())
             ignored = dict(self._engine.peers.ignored_candidates)
+            used_again = [name for name in self._logged_candidates.keys() - ignored if name in self._engine.peers]
         for refusal in refused:
             if self._logged_refusals.get(refusal.peer.name) != refusal.cause:
                 name, why = refusal.peer.name, refusal.why
@@ -247,6 +248,8 @@ class ThreadedDataPlane:
         for name, why in ignored.items():
             if self._logged_candidates.get(name) != why:
                 log.warning("%s: what the control plane tells of its addresses is not used: %s", name, why)
+        for name in used_again:
+            log.info("%s: what the control plane tells of its addresses is used again", name)
         self._logged_candidates = ignored
         for service, server, kind in sorted(conflicts - self._logged_conflicts):
             log.warning(

@@ -13,11 +13,14 @@ import pytest
 
 from controlplane.ca import Authority, Validity
 from controlplane.ca.files import write_atomically
+from protos.candidate_signature import verify_candidates
+from protos.credential import decode_credential
 from protos.identity import CertificateError, IdentityRole
-from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, Welcome
+from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, ServiceSet, Welcome
 from protos.revocation_views import revocation_set
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar import control_client
+from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
@@ -31,7 +34,7 @@ from tests.integration.control_plane_process import (
     with_own_session,
 )
 from tests.integration.secured_control_plane import HOUR_S, SecuredControlPlane
-from tests.unit.controlplane.samples import registration
+from tests.unit.controlplane.samples import interfaces, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -56,6 +59,8 @@ class Robot:
         self.tls = TlsWatch(load_tls_files(folder)) if folder is not None else None
         if self.tls is not None:
             self.claim(self.tls.current)
+        self.announcer: Announcer | None = None
+        """Signs what it announces of itself, if it does."""
         self.client = ControlClient(ControlDialer((address,), self.session.stats), self.session, self, self.tls)
         self.welcomes: queue.Queue[Welcome] = queue.Queue()
         self.peers: queue.Queue[PeerSet] = queue.Queue()
@@ -92,6 +97,8 @@ class Robot:
 
     def certificate_changed(self, files: TlsFiles) -> None:
         self.claim(files)
+        if self.announcer is not None:
+            self.client.set_candidates(self.announcer.again())
         self.files.put(files)
 
     def __enter__(self) -> Robot:
@@ -120,6 +127,44 @@ def test_a_renewed_certificate_is_shown_on_a_new_stream(
             assert robot.connection.get(timeout=PATIENCE_S) == (False, "new certificate files")
             assert robot.connection.get(timeout=PATIENCE_S) == (True, "registered")
             assert robot.session.version(ResourceKind.PEERS) >= first.version
+
+
+@pytest.mark.audit("ops-3")
+def test_a_renewal_is_never_relayed_as_what_a_forger_says(
+    plane: SecuredControlPlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Addresses signed with the one certificate beside the credential of the other: each peer logged a warning."""
+    monkeypatch.setattr(control_client, "LOOK_INTERVAL_S", 0.05)
+    folder = tmp_path / "tls"
+    plane.authority.write_tls_dir(folder, "robot-11", IdentityRole.ROBOT)
+    robot = Robot(plane.address, folder, "robot-11")
+    tls = robot.tls
+    assert tls is not None
+    robot.announcer = Announcer(robot.said.session, lambda: tls.current, lambda _: ())
+    robot.client.set_candidates(robot.announcer.announce(interfaces("wlan0")))
+    robot.client.set_services(ServiceSet((), (use(),)))
+    with cloud(plane.address, "cloud-a", plane.member("cloud-a", IdentityRole.CLOUD)) as server, robot:
+        certificates = [tls.current.certificate_der]
+        told_signed(server, certificates[-1])
+        for _ in range(3):
+            renewed = plane.authority.renew("robot-11")
+            replace_files(folder, renewed.key_pem, renewed.certificate_pem)
+            told_signed(server, renewed.certificate_der)
+
+
+def told_signed(server: Sidecar, certificate: bytes) -> None:
+    """Wait until the robot's addresses are told, signed with this certificate; none is told that did not sign them."""
+    while True:
+        found = server.expect(PeerSet)
+        server.ack(found)
+        for peer in found.peers:
+            if not peer.candidates_signature:
+                assert not peer.candidates
+                continue
+            by = decode_credential(peer.credential).certificate
+            verify_candidates(by, peer.session, peer.candidates_serial, peer.candidates, peer.candidates_signature)
+            if by == certificate:
+                return
 
 
 @pytest.mark.audit("sec-12")

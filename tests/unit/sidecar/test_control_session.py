@@ -3,6 +3,7 @@ from __future__ import annotations
 import itertools
 import random
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -132,6 +133,26 @@ def test_a_changed_set_is_sent_once_and_an_equal_one_not_at_all() -> None:
     session.set_candidates(CANDIDATES)
     assert session.messages_to_send(0.0) == [CANDIDATES]
     assert session.messages_to_send(0.0) == []
+
+
+@pytest.mark.audit("ops-3")
+def test_addresses_signed_with_a_renewed_certificate_wait_for_the_stream_that_names_it() -> None:
+    """Beside the old credential they look like a forgery, to every peer that the control plane relays them to."""
+    session = online(make_session())
+    session.set_candidates(CANDIDATES)
+    assert session.messages_to_send(0.0) == [CANDIDATES]
+    session.set_credential(b"renewed")
+    signed_anew = replace(CANDIDATES, serial=2, signature=b"with the new key")
+    session.set_candidates(signed_anew)
+    session.set_services(SERVICES)
+    assert session.messages_to_send(0.0) == [SERVICES]
+    session.closed(1.0)
+    session.opened(1.0)
+    registration = answer(session)
+    assert isinstance(registration, Registration)
+    assert registration.credential == b"renewed"
+    session.receive(WELCOME, 1.0)
+    assert session.messages_to_send(1.0) == [signed_anew, SERVICES]
 
 
 @pytest.mark.parametrize("content", [peers(9, nonce=5), mapping(9, nonce=5)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 import math
 import queue
 import random
@@ -316,6 +317,34 @@ def test_a_peer_of_a_ca_that_is_copied_late_is_talked_to_from_then_on(nodes: tup
     assert cloud.name in robot.plane._engine.peers
     submit(robot, 1, b"again")
     robot.wait_for(ResponseArrived)
+
+
+@pytest.mark.audit("ops-3")
+def test_forged_addresses_are_logged_once_and_so_is_their_end(
+    nodes: tuple[Node, Node], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Who reads the warning has to know whether it still holds."""
+    caplog.set_level(logging.INFO)
+    robot, cloud = nodes
+    versions = itertools.count(2)
+
+    def tell(serial: int) -> list[str]:
+        caplog.clear()
+        told = replace(cloud.told_to(robot), candidates_serial=serial)
+        assert robot.plane.apply_peers(PeerSet(Version(next(versions)), 1, (told,))) is None
+        return [line.split(": ", 1)[1] for line in caplog.messages if line.startswith("cloud: ")]
+
+    def refuse(_: Peer) -> bool:
+        raise DecodeError("the signature of its addresses is wrong")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(robot.own, "check_candidates", refuse)
+        assert tell(1) == [
+            "what the control plane tells of its addresses is not used: the signature of its addresses is wrong"
+        ]
+        assert tell(2) == []
+    assert tell(3) == ["what the control plane tells of its addresses is used again"]
+    assert tell(4) == []
 
 
 def test_tells_when_interfaces_or_peers_are_others(nodes: tuple[Node, Node], monkeypatch: pytest.MonkeyPatch) -> None:
