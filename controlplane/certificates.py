@@ -51,6 +51,8 @@ class CertificateKeeper:
         self._gate = gate
         self._loop = loop
         self._metrics = metrics
+        self._unfit = False
+        """The folder's files are whole, but no control plane's or none that TLS takes."""
         self._unjudged: dict[NodeName, None] = {}
         """In the order in which they will be."""
         self._something_to_judge = asyncio.Event()
@@ -65,6 +67,7 @@ class CertificateKeeper:
                 files = self._watch.poll()
                 if files is not None:
                     self._take(files)
+                self._metrics.files_refused = self._unfit or self._watch.refused is not None
                 trust = self._watch.current.trust
                 self._clock.note_lists(trust)
                 self._clock.note(self._watch.current.identity.not_before)
@@ -74,6 +77,7 @@ class CertificateKeeper:
         raise AssertionError("it ends by being cancelled")
 
     def _take(self, files: TlsFiles) -> None:
+        self._unfit = True
         if files.identity.role is not IdentityRole.CONTROL_PLANE:
             log.error("the new certificate is a %s's: the old one stays in use", files.identity.role.value)
             return
@@ -83,6 +87,7 @@ class CertificateKeeper:
         except ssl.SSLError as error:
             log.error("the new certificate is not used, the old one stays: %s", error)
         else:
+            self._unfit = False
             self._metrics.own_certificate(files.identity, files.trust.lists())
             log.info("took new certificate files from %s", files.directory)
         everybody = [*self._loop.serials(), *self._gate.serials()]

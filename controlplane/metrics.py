@@ -112,6 +112,8 @@ class Metrics:
         for reason in REFUSAL_REASONS:
             self._refused_connections.labels(reason)
         self._own: tuple[Identity, Mapping[int, RevocationList | None]] | None = None
+        self.files_refused = False
+        """Whether the TLS files on the disk are not taken."""
         self.policy_reloads = prometheus_client.Counter(
             "plr_policy_reloads_total",
             "Times the access policy was read again, by what came of it.",
@@ -152,7 +154,7 @@ class Metrics:
             *_drops(core, superseded, dropped, events),
             *_events(events),
             *_stun(stun_servers),
-            *_certificate(self._own),
+            *_certificate(self._own, self.files_refused),
             _loop(),
         )
 
@@ -307,7 +309,9 @@ def _events(events: EventLogState) -> Iterable[Metric]:
     )
 
 
-def _certificate(known: tuple[Identity, Mapping[int, RevocationList | None]] | None) -> Iterable[Metric]:
+def _certificate(
+    known: tuple[Identity, Mapping[int, RevocationList | None]] | None, files_refused: bool
+) -> Iterable[Metric]:
     if known is None:
         return
     own, lists = known
@@ -317,6 +321,12 @@ def _certificate(known: tuple[Identity, Mapping[int, RevocationList | None]] | N
         "When the certificate in use ends, in seconds since 1970.",
         [],
         {(): own.not_after},
+    )
+    yield _gauge(
+        "plr_tls_files_refused",
+        "1 while the certificate files on the disk are not taken, and those read before stay in use.",
+        [],
+        {(): float(files_refused)},
     )
     for name, text, by_ca in revocation_gauges(lists, now_wall):
         yield _gauge(name, text, ["ca"], by_ca)

@@ -67,6 +67,16 @@ class TlsFiles:
     trust: Trust = field(repr=False, compare=False)
 
 
+@dataclass(frozen=True, slots=True)
+class RefusedFiles:
+    """What a folder holds now, and a program that runs does not take."""
+
+    why: str
+    """One line: the file, what is wrong, what to do."""
+    start: bool
+    """Whether a program starts with them: the list in use is not known to it then."""
+
+
 def load_tls_files(directory: Path) -> TlsFiles:
     """Return the node's identity; raises ConfigError with one line that tells what to do."""
     try:
@@ -201,6 +211,8 @@ class TlsWatch:
         self._relayed = b""
         self._seen: _Fingerprint | None = None
         self._broken: _Fingerprint | None = None
+        self.refused: RefusedFiles | None = None
+        """Of the folder as it is now, once they did not fit at two looks. Any thread may read it."""
 
     def poll(self) -> TlsFiles | None:
         """Look once; return the new files if they have changed and are good, else None."""
@@ -209,19 +221,27 @@ class TlsWatch:
             return None
         try:
             files = self._with_relayed(load_tls_files(self.current.directory))
-            if files.trust.forgets(self.current.trust):
-                path = str(self.current.directory / CRL_FILE)
-                raise ConfigError(path, "", "missing or older than the one in use; copy the newest there")
         except ConfigError as error:
-            if fingerprint == self._broken:
-                _log.error("new TLS files are not used, the old ones stay: %s", error)
-                self._seen = fingerprint
-            self._broken = fingerprint
+            self._refuse(fingerprint, RefusedFiles(str(error), start=False))
             return None
-        self._seen, self._broken = fingerprint, None
+        if files.trust.forgets(self.current.trust):
+            path = str(self.current.directory / CRL_FILE)
+            older = ConfigError(path, "", "missing or older than the one in use; copy the newest there")
+            self._refuse(fingerprint, RefusedFiles(str(older), start=True))
+            return None
+        if self.refused is not None:
+            _log.info("the TLS files in %s are good again", self.current.directory)
+        self._seen, self._broken, self.refused = fingerprint, None, None
         changed = files != self.current
         self.current = files
         return files if changed else None
+
+    def _refuse(self, fingerprint: _Fingerprint, refused: RefusedFiles) -> None:
+        if fingerprint == self._broken:
+            after = "" if refused.start else ", and the next start fails"
+            _log.error("new TLS files are not used, the old ones stay%s: %s", after, refused.why)
+            self._seen, self.refused = fingerprint, refused
+        self._broken = fingerprint
 
     def take_revocations(self, crl_pem: bytes) -> bool:
         """Believe these lists too, which somebody relayed; whether they say anything new.
@@ -248,15 +268,25 @@ class TlsWatch:
         return dataclasses.replace(files, trust=trust)
 
 
-_Fingerprint = tuple[tuple[int, int, int, int] | None, ...]
-"""What tells each file from a later one of the same name; None for one that is not there."""
+_Fingerprint = tuple[tuple[int, ...] | None, ...]
+"""What tells the folder, and each file from a later one of the same name; None for one that is not there."""
 
 
 def _fingerprint(directory: Path) -> _Fingerprint:
-    return tuple(_file_fingerprint(directory / name) for name in (CERTIFICATE_FILE, KEY_FILE, CA_FILE, CRL_FILE))
+    files = (_file_fingerprint(directory / name) for name in (CERTIFICATE_FILE, KEY_FILE, CA_FILE, CRL_FILE))
+    return (_folder_fingerprint(directory), *files)
 
 
-def _file_fingerprint(path: Path) -> tuple[int, int, int, int] | None:
+def _folder_fingerprint(path: Path) -> tuple[int, ...] | None:
+    """Who may do what with it; not its times, which any other file in it changes."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return (status.st_ino, status.st_mode, status.st_uid, status.st_gid)
+
+
+def _file_fingerprint(path: Path) -> tuple[int, ...] | None:
     try:
         status = path.stat()
     except OSError:

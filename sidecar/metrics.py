@@ -61,6 +61,8 @@ class MetricSources:
     """Files of the state folder that could not be read or written, by what failed."""
     certificate: Callable[[], Identity | None]
     """Whose certificate is in use; None in insecure mode."""
+    files_refused: Callable[[], bool]
+    """Whether the TLS files on the disk are not taken."""
     revocations: Callable[[], RevocationState | None]
     """The revocation lists in use; None in insecure mode."""
     local_refused: Callable[[], Mapping[str, int]]
@@ -96,7 +98,7 @@ class SidecarCollector(Collector):
             ("service",),
             {(name,): 1.0 for name in sources.unmet()},
         )
-        yield from _certificate(sources.certificate())
+        yield from _certificate(sources.certificate(), sources.files_refused())
         yield from _revocations(sources.revocations(), sources.engine())
         yield counter(
             "plr_local_refused",
@@ -121,7 +123,7 @@ def serve_metrics(listen: str, sources: MetricSources) -> MetricsServer:
     return MetricsServer(host, port, registry)
 
 
-def _certificate(own: Identity | None) -> Iterator[Metric]:
+def _certificate(own: Identity | None, files_refused: bool) -> Iterator[Metric]:
     if own is None:
         return
     yield gauge(
@@ -129,6 +131,12 @@ def _certificate(own: Identity | None) -> Iterator[Metric]:
         "When the certificate in use ends, in seconds since 1970.",
         (),
         {(): own.not_after},
+    )
+    yield gauge(
+        "plr_tls_files_refused",
+        "1 while the certificate files on the disk are not taken, and those read before stay in use.",
+        (),
+        {(): float(files_refused)},
     )
 
 

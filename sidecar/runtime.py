@@ -290,6 +290,7 @@ class Sidecar:
             unmet=lambda: self._unmet.unmet,
             state_failures=lambda: self._store.failures,
             certificate=lambda: self._tls.current.identity if self._tls is not None else None,
+            files_refused=lambda: self._tls is not None and self._tls.refused is not None,
             revocations=lambda: None if self._revocations is None else self._revocations.state,
             local_refused=lambda: {} if self._local is None else self._local.refused,
         )

@@ -207,16 +207,21 @@ def _certificate_and_clock(
 ) -> Iterator[Finding]:
     used = None if state is None else state.get("certificate")
     files: TlsFiles | None = None
+    broken: str | None = None
     if config is not None and config.tls_dir is not None:
         try:
             files = load_tls_files(config.tls_dir)
         except ConfigError as error:
             if used is None:
                 yield fail("certificate", str(error), "plr ca issue, or read it as root")
+            elif not _is_for_others(error):
+                broken = str(error)
     if files is not None:
-        yield from node_checks.certificate(files, now_wall, used)
+        yield from node_checks.certificate(files, now_wall)
     elif used is not None:
         yield from node_checks.certificate_in_use(used, now_wall)
+    if used is not None:
+        yield from node_checks.files_on_disk(files, broken, used)
     floors = [float(((state or {}).get("clock") or {}).get("floor") or 0.0)]
     if config is not None:
         floors.append(_read_state(config.state_dir / CLOCK_FILE, decode_clock_floor) or 0.0)
@@ -225,6 +230,14 @@ def _certificate_and_clock(
         floors.append(files.identity.not_before)
         floors += [one.signed_at for one in files.trust.lists().values() if one is not None]
     yield from node_checks.clock(now_wall, max(floors), host.clock_state())
+
+
+def _is_for_others(error: ConfigError) -> bool:
+    """Whether a file is not for this user to read; the sidecar's user may."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, PermissionError):
+        cause = cause.__cause__
+    return cause is not None
 
 
 def _read_state(path: Path, decode: Callable[[bytes], T]) -> T | None:

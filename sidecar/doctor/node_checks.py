@@ -22,8 +22,8 @@ STRICT = 1
 SEE_ROUTES = "see docs/install.md, More than one interface"
 
 
-def certificate(files: TlsFiles, now_wall: float, used: Mapping[str, Any] | None = None) -> Iterator[Finding]:
-    """Judge a node's certificate files at `now_wall` (s since 1970); `used`: what the running sidecar tells of its."""
+def certificate(files: TlsFiles, now_wall: float) -> Iterator[Finding]:
+    """Judge a node's certificate files at `now_wall` (s since 1970)."""
     identity = files.identity
     problem = term_problem(files, now_wall)
     if problem is not None:
@@ -34,12 +34,30 @@ def certificate(files: TlsFiles, now_wall: float, used: Mapping[str, Any] | None
         held = ", ".join(f"number {one.number}, signed {duration(now_wall - one.signed_at)} ago" for one in lists)
         revoked = f"not revoked by the list held ({held})" if lists else "no revocation list is held"
         yield ok("certificate", f"{_who(identity)}, {_left(identity, now_wall)}, {revoked}")
-    serial = f"{identity.serial:x}"
-    if used is not None and used.get("serial") not in (None, serial):
+
+
+def files_on_disk(files: TlsFiles | None, broken: str | None, used: Mapping[str, Any]) -> Iterator[Finding]:
+    """Judge whether the files on the disk are those that a running sidecar tells of in `used`.
+
+    `broken`: why they cannot be had. Both None: they are not for this user, and the sidecar's word counts.
+    """
+    refused = used.get("refused")
+    if broken is None and refused:
+        # Perhaps only it: they may be for others than its user.
+        text, _, remedy = str(refused.get("text")).partition("; ")
+        if refused.get("start"):
+            yield warn("certificate", f"{text}; the sidecar goes on with what it has", remedy)
+            return
+        broken = str(refused.get("text"))
+    if broken is not None:
+        text, _, remedy = broken.partition("; ")
+        after = "the sidecar goes on with the files that it read before, and its next start fails"
+        yield fail("certificate", f"{text}; {after}", remedy or "copy what plr ca issue or plr ca renew wrote there")
+    elif files is not None and used.get("serial") not in (None, f"{files.identity.serial:x}"):
         yield warn(
             "certificate",
             f"{files.directory} holds another certificate than the one that the sidecar uses",
-            "look in its log for why it does not take it: journalctl -u plr-sidecar",
+            "it looks each second: try again; if it stays so, its log says why: journalctl -u plr-sidecar",
         )
 
 

@@ -63,6 +63,11 @@ class _TermProblem(_Entry):
     text: Text
 
 
+class _RefusedFiles(_Entry):
+    start: bool
+    text: Text
+
+
 class _RevocationList(_Entry):
     number: Whole
     signed_at: float
@@ -77,6 +82,7 @@ class _Certificate(_Entry):
     not_before: float = 0.0
     judged_at: float = 0.0
     problem: _TermProblem | None = None
+    refused: _RefusedFiles | None = None
     revocation_lists: list[_RevocationList] = []
 
 

@@ -129,7 +129,7 @@ class LocalState:
     def _certificate(self) -> dict[str, Any]:
         assert self.tls is not None
         files, judged_at = self.tls.current, self.clock.now()
-        problem = term_problem(files, judged_at)
+        problem, refused = term_problem(files, judged_at), self.tls.refused
         lists = [one for one in files.trust.lists().values() if one is not None]
         return {
             "directory": str(files.directory),
@@ -140,6 +140,7 @@ class LocalState:
             "not_after": files.identity.not_after,
             "judged_at": judged_at,
             "problem": None if problem is None else {"in_force": problem.in_force, "text": problem.text},
+            "refused": None if refused is None else {"start": refused.start, "text": refused.why},
             "revocation_lists": [{"number": min(one.number, 1 << 53), "signed_at": one.signed_at} for one in lists],
         }
 

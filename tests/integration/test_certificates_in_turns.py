@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane import certificates, turns
+from controlplane import metrics as metrics_module
 from controlplane.certificates import CertificateKeeper
 from controlplane.config import ControlPlaneConfig
 from controlplane.event_log import EventLog
@@ -32,7 +33,7 @@ MEMBERS = [f"robot-{number}" for number in range(8)]
 
 
 @contextlib.asynccontextmanager
-async def watched(gate: Gate) -> AsyncIterator[list[NodeName]]:
+async def watched(gate: Gate, metrics: Metrics | None = None) -> AsyncIterator[list[NodeName]]:
     """A keeper at work; whom it has judged so far, in order."""
     judged: list[NodeName] = []
     review = gate.gate.review
@@ -42,7 +43,7 @@ async def watched(gate: Gate) -> AsyncIterator[list[NodeName]]:
         review(name)
 
     gate.gate.review = noting  # type: ignore[method-assign]  # a spy
-    metrics = Metrics()
+    metrics = metrics or Metrics()
     loop = ControlLoop(ControlPlaneConfig(insecure=True, listen="127.0.0.1:0"), metrics, EventLog(None))
     files = load_tls_files(gate.fleet.tls_dir("control"))
     keeper = CertificateKeeper(files, gate.gate, loop, metrics, ClockFloor(time.time))
@@ -106,5 +107,34 @@ def test_a_change_amid_the_turns_of_another_loses_nothing(tmp_path: Path) -> Non
             await until(lambda: [str(name) for name in judged].count(already) == 2)
             await until(lambda: all(name in judged for name in MEMBERS))
             await until(lambda: gate.refused == {"revoked": 2})
+
+    asyncio.run(run())
+
+
+@pytest.mark.audit("ops-12")
+def test_files_that_are_not_taken_are_told_of_until_they_are_mended(tmp_path: Path) -> None:
+    """The control plane goes on with those of before: only its next start would show it."""
+    metrics = Metrics()
+
+    def mend(folder: Path, content: dict[str, bytes]) -> None:
+        for name, data in content.items():
+            (folder / name).write_bytes(data)
+
+    async def run() -> None:
+        async with opened(tmp_path) as gate, watched(gate, metrics):
+            folder = gate.fleet.tls_dir("control")
+            good = {path.name: path.read_bytes() for path in folder.iterdir()}
+            robot = {path.name: path.read_bytes() for path in gate.fleet.tls_dir("robot-1").iterdir()}
+            # Broken; then whole, but not a control plane's.
+            for bad in ({"ca.pem": b""}, robot):
+                assert refused() == 0.0
+                mend(folder, bad)
+                await until(lambda: refused() == 1.0)
+                mend(folder, good)
+                await until(lambda: refused() == 0.0)
+
+    def refused() -> float | None:
+        families = metrics_module._certificate(metrics._own, metrics.files_refused)
+        return {family.name: family.samples[0].value for family in families}["plr_tls_files_refused"]
 
     asyncio.run(run())

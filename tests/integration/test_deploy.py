@@ -98,6 +98,7 @@ BEYOND_CONTRACT: dict[str, set[str]] = {
     "plr_sidecar_gone_timestamp_seconds": {"sidecar", "role"},
     "plr_sidecar_up": {"sidecar", "role"},
     "plr_target_miss_probability": {"robot", "service"},
+    "plr_tls_files_refused": set(),
 }
 """Further metrics of the programs that the rules and dashboards use."""
 
@@ -440,6 +441,7 @@ def exported_metrics() -> dict[str, set[str]]:
             bridge=None,
             state_failures=dict,
             certificate=lambda: identity,
+            files_refused=lambda: False,
             revocations=lambda: RevocationState(LISTS, frozenset(), 86_400.0),
             local_refused=lambda: {},
         )

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tarfile
 import time
+import urllib.request
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -178,6 +179,37 @@ def test_a_bugreport_holds_no_secret_and_the_socket_is_private(tmp_path: Path) -
     ]  # fmt: skip
     for name, data in parts.items():
         assert [secret for secret in forbidden if secret in data] == [], name
+
+
+def test_broken_certificate_files_are_a_failure_while_the_sidecar_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only the next start would have shown it, with exit code 2."""
+    tls = tmp_path / "tls"
+    Authority.create().write_tls_dir(tls, "robot-1", IdentityRole.ROBOT)
+    metrics = f"127.0.0.1:{free_port()}"
+    program = Program(tmp_path, insecure=False, tls_dir=str(tls), metrics_listen=metrics)
+
+    def is_refused() -> bool:
+        with urllib.request.urlopen(f"http://{metrics}/metrics", timeout=STARTS_S) as answer:
+            (value,) = (line for line in answer.read().decode().splitlines() if line.startswith("plr_tls_files_ref"))
+        return float(value.split()[1]) == 1.0
+
+    program.start()
+    try:
+        wait_for_log(program, "going on without it")
+        assert not is_refused()
+        (tls / "ca.pem").write_bytes(b"")
+        wait_for_log(program, "the next start fails")
+        assert is_refused()
+        assert command.main(["--json", "--no-ping", "--config", str(program.path)]) == 1
+        seen = json.loads(capsys.readouterr().out)
+        failed = [found for found in seen["findings"] if found["level"] == "fail" and found["check"] == "certificate"]
+        assert [found["text"].partition(": ")[0] for found in failed] == [str(tls / "ca.pem")]
+        assert seen["sidecar"]["certificate"]["refused"]["start"] is False
+    finally:
+        program.process.kill()
+        program.process.wait()
 
 
 def _read(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:

@@ -138,6 +138,7 @@ def _sidecar_metrics() -> Iterator[Metric]:
         bridge=lambda: BridgeStats(unanswered=Counter({(ServiceName("/s"), "failed"): 1})),
         state_failures=dict,
         certificate=lambda: Identity(NodeName("robot"), IdentityRole.ROBOT, 1, 0.0, 1.0),
+        files_refused=lambda: False,
         revocations=lambda: RevocationState(LISTS, frozenset(), 86_400.0),
         local_refused=lambda: {},
     )

@@ -14,7 +14,7 @@ from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.errors import ConfigError
 from protos.identity import CertificateError, IdentityRole
-from protos.tls_files import MAX_FILE_BYTES, TlsWatch, load_tls_files
+from protos.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -170,10 +170,47 @@ def test_broken_files_keep_the_old_ones_and_are_logged_once(
         assert [watch.poll() for _ in range(5)] == [None] * 5
     assert len(caplog.records) == 1
     assert "expected the key of cert.pem" in caplog.text
+    assert "and the next start fails" in caplog.text
     assert watch.current is files
+    assert watch.refused is not None
+    assert (str(folder / "key.pem") in watch.refused.why, watch.refused.start) == (True, False)
 
     (folder / "key.pem").write_bytes(issued.key_pem)
     assert watch.poll() is not None
+    assert refused_by(watch) is None
+
+
+def refused_by(watch: TlsWatch) -> RefusedFiles | None:
+    """What it refuses by now."""
+    return watch.refused
+
+
+@pytest.mark.audit("ops-14")
+def test_the_same_files_put_back_are_refused_no_more(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    watch = TlsWatch(load_tls_files(folder))
+    content = (folder / "ca.pem").read_bytes()
+    (folder / "ca.pem").write_bytes(b"")
+    assert (watch.poll(), refused_by(watch)) == (None, None), "they may be on their way"
+    assert watch.poll() is None
+    assert refused_by(watch) is not None
+    with caplog.at_level(logging.INFO):
+        (folder / "ca.pem").write_bytes(content)
+        assert watch.poll() is None
+    assert refused_by(watch) is None
+    assert "are good again" in caplog.text
+
+
+@pytest.mark.audit("ops-14")
+def test_a_folder_that_everybody_may_write_is_noticed_and_so_is_its_mending(folder: Path) -> None:
+    watch = TlsWatch(load_tls_files(folder))
+    watch.poll()
+    mode = folder.stat().st_mode
+    folder.chmod(0o777)
+    assert [watch.poll(), watch.poll()] == [None, None]
+    assert refused_by(watch) is not None
+    folder.chmod(mode)
+    watch.poll()
+    assert refused_by(watch) is None
 
 
 def test_files_replaced_one_by_one_are_not_logged(
@@ -237,8 +274,12 @@ def test_an_old_or_missing_revocation_list_does_not_replace_a_newer_one(
     assert [record.message.partition("crl.pem: ")[2][:20] for record in caplog.records] == [
         "missing or older than"[:20]
     ] * 2
+    refused = refused_by(watch)
+    assert refused is not None
+    assert refused.start, "only who runs has seen the newer one"
     path.write_bytes(ca.crl_pem())
     assert watch.poll() is None, "what is in use already"
+    assert refused_by(watch) is None
     assert len(caplog.records) == 2
     ca.issue("robot-3", IdentityRole.ROBOT)
     ca.revoke("robot-3")

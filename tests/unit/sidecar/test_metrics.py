@@ -65,6 +65,7 @@ class Counters:
             bridge=lambda: self.bridge,
             state_failures=lambda: self.state_failures,
             certificate=lambda: None,
+            files_refused=lambda: False,
             revocations=lambda: None,
             local_refused=lambda: {},
         )

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 import yaml
 
+from controlplane.ca import Authority
+from protos import tls_files
 from protos.errors import ConfigError
+from protos.identity import IdentityRole
+from protos.tls_files import load_tls_files
 from sidecar.doctor import examination
-from sidecar.doctor.examination import RUNTIME_SOCKET, Where, _judged, _wrong, connect, sockets
+from sidecar.doctor.examination import RUNTIME_SOCKET, Where, _certificate_and_clock, _judged, _wrong, connect, sockets
 from sidecar.doctor.finding import Level
 from sidecar.doctor.running_checks import paths
 from sidecar.local.client import LocalError, LocalRefusedError
 from tests.unit.sidecar.configs import ROBOT, parse
 
 if TYPE_CHECKING:
-    from typing import Any
+    from typing import Any, NoReturn
+
+    from sidecar.config import SidecarConfig
 
 pytestmark = pytest.mark.audit("ops-14")
 
@@ -84,3 +92,62 @@ def test_what_another_version_tells_is_a_warning() -> None:
 def test_a_file_that_is_not_for_this_user_is_no_failure() -> None:
     assert _wrong(ConfigError("x.yaml", "", f"cannot be read: {os.strerror(13)}")).level is Level.WARN
     assert _wrong(ConfigError("x.yaml", "deadline", "unknown key")).level is Level.FAIL
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> tuple[Path, SidecarConfig, dict[str, Any]]:
+    """The TLS folder of a robot, its configuration, and what its sidecar tells of the certificate."""
+    folder = tmp_path / "tls"
+    Authority.create().write_tls_dir(folder, "robot-1", IdentityRole.ROBOT)
+    identity = load_tls_files(folder).identity
+    used = {
+        "name": "robot-1",
+        "role": "robot",
+        "serial": f"{identity.serial:x}",
+        "not_after": identity.not_after,
+        "problem": None,
+        "refused": None,
+        "revocation_lists": [],
+    }
+    config = parse(ROBOT, state_dir=str(tmp_path)).model_copy(update={"tls_dir": folder})
+    return folder, config, {"certificate": used, "clock": {"floor": 0.0}}
+
+
+@pytest.mark.parametrize("broken", ["ca.pem", "cert.pem", "key.pem", "crl.pem", "."])
+def test_broken_files_fail_while_the_sidecar_runs_on_with_the_old_ones(
+    node: tuple[Path, SidecarConfig, dict[str, Any]], broken: str
+) -> None:
+    """Doctor said ok, and the next reboot ended with exit code 2."""
+    folder, config, state = node
+    levels = [one.level for one in _certificate_and_clock(config, state, time.time()) if one.check == "certificate"]
+    assert levels == [Level.OK]
+    if broken == ".":
+        folder.rename(folder.with_name("elsewhere"))
+    else:
+        (folder / broken).write_bytes(b"")
+    with pytest.raises(ConfigError):
+        load_tls_files(folder)
+    in_use, found = (one for one in _certificate_and_clock(config, state, time.time()) if one.check == "certificate")
+    assert (in_use.level, found.level) == (Level.OK, Level.FAIL)
+    assert found.text.startswith(f"{(folder / broken)}: ")
+    assert "its next start fails" in found.text
+    assert found.remedy
+
+
+def test_files_that_only_others_may_read_are_judged_by_the_sidecars_word(
+    node: tuple[Path, SidecarConfig, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Root opens them all the same, so the system's answer is made up."""
+    folder, config, state = node
+
+    def denied(path: Path) -> NoReturn:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(tls_files, "open_regular", denied)
+
+    def levels() -> list[Level]:
+        return [one.level for one in _certificate_and_clock(config, state, time.time()) if one.check == "certificate"]
+
+    assert levels() == [Level.OK]
+    state["certificate"]["refused"] = {"start": False, "text": f"{folder}/key.pem: expected a private key in PEM"}
+    assert levels() == [Level.OK, Level.FAIL]

@@ -79,8 +79,26 @@ def test_a_revoked_one_fails(tls: tuple[Authority, Path]) -> None:
 def test_another_one_in_use_than_on_disk_is_warned_of(tls: tuple[Authority, Path]) -> None:
     files = load_tls_files(tls[1])
     same = {"serial": f"{files.identity.serial:x}"}
-    assert levels(node_checks.certificate(files, now(), same)) == [Level.OK]
-    assert levels(node_checks.certificate(files, now(), {"serial": "abc"})) == [Level.OK, Level.WARN]
+    assert levels(node_checks.files_on_disk(files, None, same)) == []
+    assert levels(node_checks.files_on_disk(files, None, {"serial": "abc"})) == [Level.WARN]
+    assert levels(node_checks.files_on_disk(None, None, {"serial": "abc"})) == [], "not for this user"
+
+
+@pytest.mark.audit("ops-14")
+def test_files_that_the_sidecar_does_not_take() -> None:
+    def judged(broken: str | None, **refused: object) -> Finding:
+        return one(node_checks.files_on_disk(None, broken, {"serial": "abc", "refused": refused or None}))
+
+    seen = judged("ca.pem: malformed; copy it")
+    assert (seen.level, seen.remedy) == (Level.FAIL, "copy it")
+    assert seen.text.startswith("ca.pem: malformed; ")
+    assert "its next start fails" in seen.text
+    told = judged(None, start=False, text="key.pem: cannot be read: Permission denied; chown plr")
+    assert (told.level, told.remedy) == (Level.FAIL, "chown plr")
+    assert "its next start fails" in told.text
+    older = judged(None, start=True, text="crl.pem: older; copy the newest there")
+    assert (older.level, older.remedy) == (Level.WARN, "copy the newest there")
+    assert "fails" not in older.text
 
 
 def test_the_certificate_that_a_sidecar_tells_of() -> None:
