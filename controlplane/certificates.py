@@ -79,7 +79,12 @@ class CertificateKeeper:
     def _take(self, files: TlsFiles) -> None:
         self._unfit = True
         if files.identity.role is not IdentityRole.CONTROL_PLANE:
-            log.error("the new certificate is a %s's: the old one stays in use", files.identity.role.value)
+            log.error(
+                "the new certificate is a %s's: the old one stays in use, and the next start fails; copy the control "
+                "plane's own files to %s",
+                files.identity.role.value,
+                files.directory,
+            )
             return
         self._relay_revocations(files)
         try:

@@ -52,7 +52,11 @@ def files_on_disk(files: TlsFiles | None, broken: str | None, used: Mapping[str,
     if broken is not None:
         text, _, remedy = broken.partition("; ")
         after = "the sidecar goes on with the files that it read before, and its next start fails"
-        yield fail("certificate", f"{text}; {after}", remedy or "copy what plr ca issue or plr ca renew wrote there")
+        yield fail(
+            "certificate",
+            f"{text}; {after}",
+            remedy.removeprefix("do: ").removeprefix("see: ") or "copy what plr ca issue or plr ca renew wrote there",
+        )
     elif files is not None and used.get("serial") not in (None, f"{files.identity.serial:x}"):
         yield warn(
             "certificate",

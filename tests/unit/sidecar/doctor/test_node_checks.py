@@ -93,6 +93,7 @@ def test_files_that_the_sidecar_does_not_take() -> None:
     assert (seen.level, seen.remedy) == (Level.FAIL, "copy it")
     assert seen.text.startswith("ca.pem: malformed; ")
     assert "its next start fails" in seen.text
+    assert judged("key.pem: others may read it; do: chmod 600 key.pem").remedy == "chmod 600 key.pem"
     told = judged(None, start=False, text="key.pem: cannot be read: Permission denied; chown plr")
     assert (told.level, told.remedy) == (Level.FAIL, "chown plr")
     assert "its next start fails" in told.text
