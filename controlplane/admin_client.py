@@ -95,12 +95,21 @@ def ask(arguments: argparse.Namespace, call: Callable[[admin_pb2_grpc.AdminStub,
         code = getattr(error, "code", lambda: None)()
         if code is grpc.StatusCode.NOT_FOUND:
             raise AskError(detail, EXIT_FAILED) from error
+        if code is grpc.StatusCode.DEADLINE_EXCEEDED:
+            raise AskError(f"{address}: {_late(arguments.timeout_s)}", EXIT_FAILED) from error
         advice = _advice(detail, files) if code is grpc.StatusCode.UNAVAILABLE else None
         raise AskError(f"{address}: {advice or detail}", EXIT_FAILED) from error
     except ConfigError as error:
         raise AskError(str(error), EXIT_USAGE) from error
     except DecodeError as error:
         raise AskError(f"{address}: answers what it must not: {error}", EXIT_FAILED) from error
+
+
+def _late(timeout_s: float) -> str:
+    return (
+        f"no answer within {timeout_s:g} s: see whether the control plane's host is up and a firewall lets TCP through, "
+        "or give it more time: --timeout-s"
+    )
 
 
 def _advice(detail: str, files: TlsFiles | None) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 
 
@@ -14,9 +15,19 @@ def end_by_ctrl_c() -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+def let_the_system_find_names() -> None:
+    """From now on gRPC, which looks at this when it is imported, looks names up as other programs of the host do.
+
+    Its own resolver asks a name server for the IPv6 address of what stands in /etc/hosts with an IPv4 one, and waits where
+    that server is silent.
+    """
+    os.environ["GRPC_DNS_RESOLVER"] = "native"
+
+
 def plr() -> int:
     """Run `plr`; returns its exit code."""
     end_by_ctrl_c()
+    let_the_system_find_names()
     from protos.command_line import main
 
     return main()
