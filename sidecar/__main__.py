@@ -180,7 +180,12 @@ def _run(config: SidecarConfig) -> int:
                 log.log(logging.WARNING if problem.in_force else logging.ERROR, "%s", problem.text)
             # Late: it takes a second to import, several on a busy machine; a wrong configuration has been told by now,
             # and a signal is heeded meanwhile.
-            from sidecar.runtime import run
+            try:
+                from sidecar.runtime import run
+            except ImportError:
+                # What no look at the environment shows: rclpy is there, and a library of its is not.
+                _check_ros(thorough=True)
+                raise
 
             code = run(config, commit.version(), stop)
         except ConfigError:

@@ -30,6 +30,8 @@ _TRY = "import rclpy; rclpy.init(args=['--ros-args', '--disable-external-lib-log
 _C_PART = "_rclpy_pybind11"
 _MAX_SAID_CHARACTERS = 300
 _NUMBER = re.compile(r"[0-9]{1,9}")
+_EXCEPTION = re.compile(r"[\w.]*Error: ")
+_LACKS_A_LIBRARY = "cannot open shared object file"
 
 
 def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = False) -> str | None:
@@ -65,6 +67,11 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
             f"RMW_IMPLEMENTATION: {rmw!r} is not installed here; unset it, which means {DEFAULT_RMW}, or install it "
             "with ROS from apt: ros-jazzy-" + rmw.replace("_", "-")
         )
+    if _LACKS_A_LIBRARY in said:
+        said += (
+            "; with ROS from apt, source /opt/ros/jazzy/setup.bash before (for the unit: LD_LIBRARY_PATH in "
+            "/etc/plr/sidecar.env, deploy/README.md)"
+        )
     return f"ROS 2 does not start here: {said}"
 
 
@@ -76,7 +83,7 @@ def _without_apt(machine: str) -> str:
 
 
 def _try(environment: Mapping[str, str]) -> str | None:
-    """Return the first line of what rclpy says when it does not start."""
+    """Return the one line that tells most of what rclpy says when it does not start."""
     argv = [sys.executable, "-c", _TRY]
     try:
         done = subprocess.run(  # noqa: S603  (our own interpreter and text)
@@ -89,6 +96,6 @@ def _try(environment: Mapping[str, str]) -> str | None:
     if done.returncode == 0:
         return None
     lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [f"it ends with {done.returncode}"]
-    # Of a traceback the last line says what is wrong; rcl's own message is the only one.
-    said = lines[-1]
+    # Of a traceback the last exception's first line says what is wrong; rcl's own message is the only one.
+    said = next((line for line in reversed(lines) if _EXCEPTION.match(line)), lines[-1])
     return "".join(char for char in said if char.isprintable())[:_MAX_SAID_CHARACTERS]

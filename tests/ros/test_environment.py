@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from typing import TYPE_CHECKING
 
@@ -94,3 +95,26 @@ def test_the_program_ends_with_one_line(
     assert main(["--config", str(config), *(["--check-config"] if check else [])]) == 2
     shown = capsys.readouterr()
     assert shown.err == "plr-sidecar: ROS_DOMAIN_ID: expected a number from 0 to 232, got 'abc'\n"
+
+
+@pytest.mark.parametrize("check", [True, False])
+def test_a_library_that_rclpy_does_not_find_is_named_in_one_line(tmp_path: Path, check: bool) -> None:
+    """As with ROS from apt and no LD_LIBRARY_PATH."""
+    config = tmp_path / "sidecar.yaml"
+    config.write_text(
+        "name: robot-1\nrole: robot\ninsecure: true\ncontrol_plane: 127.0.0.1:1\ninterfaces: [lo]\n"
+        f"state_dir: {tmp_path}\nservices: [{{name: /plan, deadline_ms: 100}}]\n"
+    )
+    (tmp_path / "rclpy").mkdir()
+    (tmp_path / "rclpy" / "__init__.py").write_text(
+        "raise ImportError('librcl.so: cannot open shared object file: No such file or directory\\nsee elsewhere')\n"
+    )
+    argv = [sys.executable, "-m", "sidecar", "--config", str(config), *(["--check-config"] if check else [])]
+    environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(argv, env=environ, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "plr-sidecar: ROS 2 does not start here: ImportError: librcl.so: cannot open shared object file: No such file "
+        "or directory; with ROS from apt, source /opt/ros/jazzy/setup.bash before (for the unit: LD_LIBRARY_PATH in "
+        "/etc/plr/sidecar.env, deploy/README.md)\n"
+    )
