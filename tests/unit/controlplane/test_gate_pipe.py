@@ -71,3 +71,40 @@ def test_whether_something_is_unread_can_be_asked_while_the_connection_is_lost(t
         return seen
 
     assert asyncio.run(lose_some()) > 0
+
+
+@pytest.mark.audit("ops-3")
+def test_who_is_closed_twice_and_does_not_go_can_still_be_aborted(tmp_path: Path) -> None:
+    """As whoever is refused: gRPC ends its side, and the gate has no patience with the other."""
+    server, client = contexts(tmp_path)
+    connected_ends: asyncio.Queue[PipeEnd] = asyncio.Queue()
+
+    class Watched(PipeEnd):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            super().connection_made(transport)
+            connected_ends.put_nowait(self)
+
+    async def close_twice() -> None:
+        loop = asyncio.get_running_loop()
+        listening = await loop.create_server(Watched, "127.0.0.1", 0, ssl=server, ssl_shutdown_timeout=3600.0)
+        port = listening.sockets[0].getsockname()[1]
+
+        def connect() -> ssl.SSLSocket:
+            return client.wrap_socket(socket.create_connection(("127.0.0.1", port)))
+
+        connected = await loop.run_in_executor(None, connect)
+        end = await connected_ends.get()
+        end.close()
+        end.close()
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert not end.lost, "the other side has not answered"
+        end.abort()
+        async with asyncio.timeout(30.0):
+            while not end.lost:
+                await asyncio.sleep(0.01)
+        end.abort()
+        connected.close()
+        listening.close()
+
+    asyncio.run(close_twice())
