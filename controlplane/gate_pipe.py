@@ -22,7 +22,6 @@ class PipeEnd(asyncio.Protocol):
         self._other: PipeEnd | None = None
         self._early = bytearray()
         self._on_lost = on_lost
-        self._closing = False
         self.lost = False
         self.received_at = -math.inf
         """When it passed something on last, in monotonic seconds."""
@@ -50,11 +49,9 @@ class PipeEnd(asyncio.Protocol):
 
     def close(self) -> None:
         """End the connection once what was written to it is out."""
-        if self._transport is None or self._closing:
-            # Closed twice, asyncio's TLS transport forgets its connection: `abort` does nothing any more, or raises.
-            return
-        self._closing = True
-        self._transport.close()
+        # Closed once it is closing, asyncio's TLS transport forgets its connection: `abort` does nothing, or raises.
+        if self._transport is not None and not self._transport.is_closing():
+            self._transport.close()
 
     def abort(self) -> None:
         """End the connection now."""

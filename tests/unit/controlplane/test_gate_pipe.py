@@ -103,6 +103,8 @@ def test_who_is_closed_twice_and_does_not_go_can_still_be_aborted(tmp_path: Path
         async with asyncio.timeout(30.0):
             while not end.lost:
                 await asyncio.sleep(0.01)
+        # As by a timer that was set when it was refused.
+        end.close()
         end.abort()
         connected.close()
         listening.close()
