@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -10,6 +11,8 @@ if TYPE_CHECKING:
 
 REPEATED_FAILURE_LOG_S = 60.0
 """An outage is logged when it starts or its reason changes, and this often while it lasts."""
+_AGE = re.compile(r"[0-9]+ (?=seconds|minutes|hours|days)")
+"""That a certificate has been expired for a second longer is no other reason."""
 
 
 class OutageLog:
@@ -20,18 +23,19 @@ class OutageLog:
         self._target = target
         self._attempts = 0
         self._logged_at = -math.inf
-        self._reason = ""
+        self._kind = ""
 
     def failed(self, reason: str, delay_s: float, now: float, *, was_connected: bool) -> None:
         """An attempt failed or a stream ended at `now`; the next attempt comes in `delay_s`."""
         self._attempts = 1 if was_connected else self._attempts + 1
         quiet = now - self._logged_at < REPEATED_FAILURE_LOG_S and self._attempts > 1
-        if quiet and reason == self._reason:
+        kind = _AGE.sub("", reason)
+        if quiet and kind == self._kind:
             write = self._log.debug
         else:
             write = self._log.warning
             self._logged_at = now
-            self._reason = reason
+            self._kind = kind
         what = "lost" if was_connected else "not reached"
         write(
             "control plane %s %s: %s; going on without it, attempt %d in %.1f s",
@@ -46,4 +50,4 @@ class OutageLog:
         """The control plane answered there."""
         self._log.info("registered with the control plane %s", where)
         self._attempts = 0
-        self._reason = ""
+        self._kind = ""

@@ -1,12 +1,10 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+
+import pytest
 
 from sidecar.outage_log import REPEATED_FAILURE_LOG_S, OutageLog
-
-if TYPE_CHECKING:
-    import pytest
 
 LOG = logging.getLogger("outage")
 
@@ -40,3 +38,14 @@ def test_a_new_outage_is_told_at_once(caplog: pytest.LogCaptureFixture) -> None:
         outage.over("plr:1 over wlan0")
         outage.failed("reset", 0.1, now, was_connected=True)
         assert len(warnings(caplog)) == 1
+
+
+@pytest.mark.audit("ops-3")
+def test_a_certificate_that_grows_older_is_no_new_reason(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    outage = OutageLog(LOG, "plr:1")
+    for second in range(int(REPEATED_FAILURE_LOG_S)):
+        outage.failed(f"it expired {second} seconds ago", 0.2, float(second), was_connected=False)
+    assert len(warnings(caplog)) == 1
+    outage.failed("it was revoked 3 seconds ago", 0.2, 30.0, was_connected=False)
+    assert len(warnings(caplog)) == 1
