@@ -107,8 +107,8 @@ def ask(arguments: argparse.Namespace, call: Callable[[admin_pb2_grpc.AdminStub,
 
 def _late(timeout_s: float) -> str:
     return (
-        f"no answer within {timeout_s:g} s: see whether the control plane's host is up and a firewall lets TCP through, "
-        "or give it more time: --timeout-s"
+        f"no answer within {timeout_s:g} s: see whether the control plane's host is up and a firewall lets TCP "
+        "through, or give it more time: --timeout-s"
     )
 
 

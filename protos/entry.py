@@ -18,8 +18,8 @@ def end_by_ctrl_c() -> None:
 def let_the_system_find_names() -> None:
     """From now on gRPC, which looks at this when it is imported, looks names up as other programs of the host do.
 
-    Its own resolver asks a name server for the IPv6 address of what stands in /etc/hosts with an IPv4 one, and waits where
-    that server is silent.
+    Its own resolver asks a name server for the IPv6 address of what stands in /etc/hosts with an IPv4 one, and waits
+    where that server is silent.
     """
     os.environ["GRPC_DNS_RESOLVER"] = "native"
 
