@@ -42,6 +42,8 @@ class UnmetServices:
 def told(name: str, offered: Iterable[str], whose: str) -> str:
     """Return a line about a name that is not served; `offered` are the names that are, `whose` says by whom."""
     names = sorted(set(offered))
+    if name in names:
+        return f"service {name} is configured and offered, and no server of it is reached: plr doctor says more"
     close = difflib.get_close_matches(name, names, n=1)
     if close:
         return f"service {name} is configured, and {whose} offers it; did you mean {close[0]}?"

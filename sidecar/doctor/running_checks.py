@@ -291,9 +291,10 @@ def services(state: State) -> Iterator[Finding]:
     """Judge what is carried."""
     told = state.get("services") or {}
     robot = (state.get("node") or {}).get("role") == "robot"
-    who = "a server that this robot knows of" if robot else "a node of this host's ROS domain"
+    who = "a server that this robot reaches" if robot else "a node of this host's ROS domain"
     for name in told.get("unmet") or ():
-        yield warn("service", f"{name}: configured, and not offered by {who}", "compare the names: plr status")
+        do = "see path above, then compare the names: plr status"
+        yield warn("service", f"{name}: configured, and not offered by {who}", do)
     for name, nodes in sorted((told.get("left_alone") or {}).items()):
         text = f"{name}: served by {', '.join(nodes)} on this robot, so that it is left alone"
         yield warn("service", text, "stop that node, or rename its service")

@@ -38,3 +38,10 @@ def test_the_line_names_what_was_probably_meant_or_what_there_is() -> None:
     assert told(WHERE, ["/b", "/a", "/a"], whose) == f"{start}; offered: /a /b"
     many = [f"/s{number:02}" for number in range(MAX_NAMES_SHOWN + 3)]
     assert told(WHERE, many, whose).endswith("/s08 /s09 and 3 more")
+
+
+def test_a_name_that_is_offered_is_not_called_wrong() -> None:
+    """As on a robot with an expired certificate, which knows its servers from the disk."""
+    assert told(WHERE, ["/plan", WHERE], "no server that this robot knows of") == (
+        f"service {WHERE} is configured and offered, and no server of it is reached: plr doctor says more"
+    )
