@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING
 
 import yaml
 
+from protos import commit
 from protos.config_file import parse_yaml, read_text
 from protos.errors import ConfigError
 from protos.host_port import split_host_port
@@ -150,6 +151,8 @@ def _versions() -> str:
         lines += [f"system {platform.freedesktop_os_release().get('PRETTY_NAME', 'unknown')}"]
     except OSError:
         lines += ["system unknown"]
+    # By itself: as part of the version it may be long enough to be taken for a key.
+    lines += [f"commit {commit.commit() or 'not known'}"]
     for package in PACKAGES:
         try:
             lines.append(f"{package} {version(package)}")

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from controlplane.ca import Authority
+from protos import commit
 from protos.identity import IdentityRole
 from sidecar.doctor import command, ping_command
 from sidecar.local.client import LocalClient
@@ -169,6 +170,7 @@ def test_a_bugreport_holds_no_secret_and_the_socket_is_private(tmp_path: Path) -
     with tarfile.open(report) as tar:
         parts = {member.name.rpartition("/")[2]: _read(tar, member) for member in tar.getmembers()}
     assert parts.keys() >= {"doctor.json", "doctor.txt", "configuration.yaml", "versions.txt", "ip-route.txt"}
+    assert f"\ncommit {commit.commit()}\n".encode() in parts["versions.txt"]
     assert b"plr_mapping_version" in parts["metrics.txt"]
     assert json.loads(parts["doctor.json"])["sidecar"]["node"]["name"] == "robot-1"
     assert b"tls_dir" in parts["configuration.yaml"]
