@@ -85,8 +85,11 @@ def test_who_is_closed_twice_and_does_not_go_can_still_be_aborted(tmp_path: Path
             connected_ends.put_nowait(self)
 
     async def close_twice() -> None:
+        gone = asyncio.Event()
         loop = asyncio.get_running_loop()
-        listening = await loop.create_server(Watched, "127.0.0.1", 0, ssl=server, ssl_shutdown_timeout=3600.0)
+        listening = await loop.create_server(
+            lambda: Watched(gone.set), "127.0.0.1", 0, ssl=server, ssl_shutdown_timeout=3600.0
+        )
         port = listening.sockets[0].getsockname()[1]
 
         def connect() -> ssl.SSLSocket:
@@ -98,11 +101,10 @@ def test_who_is_closed_twice_and_does_not_go_can_still_be_aborted(tmp_path: Path
         end.close()
         for _ in range(10):
             await asyncio.sleep(0)
-        assert not end.lost, "the other side has not answered"
+        assert not gone.is_set(), "the other side has not answered"
         end.abort()
         async with asyncio.timeout(30.0):
-            while not end.lost:
-                await asyncio.sleep(0.01)
+            await gone.wait()
         # As by a timer that was set when it was refused.
         end.close()
         end.abort()
