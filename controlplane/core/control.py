@@ -50,7 +50,7 @@ from controlplane.core.report_filter import believable
 from controlplane.core.restlessness import Restlessness
 from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
-from controlplane.core.status import is_met, statuses
+from controlplane.core.status import is_met, is_offered, statuses
 from controlplane.core.unanswered import Unanswered
 from controlplane.core.urgency import Urgency
 from protos.errors import DecodeError
@@ -686,7 +686,7 @@ class ControlCore:
             self.reached,
             self.unanswered,
             is_there=lambda server: is_met(name, server, self.registry, self.permits),
-            is_offered=self.registry.is_offered,
+            is_offered=lambda service: is_offered(name, service, self.registry, self.permits),
             may_offer=lambda service: self.permits.may_offer(name, service),
             seen_at=self.registry.heard_at(name, now),
             now=now,

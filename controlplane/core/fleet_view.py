@@ -122,7 +122,8 @@ def view_of(
     now: float,
 ) -> MemberView:
     """Look at one; some 40 us for a robot with 15 paths. `is_there` tells which servers the robot has to
-    do with, `is_offered` which services anybody offers, `may_offer` which ones the policy lets a cloud offer."""
+    do with, `is_offered` which services a cloud that it may call offers, `may_offer` which ones the policy lets a cloud
+    offer."""
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
         served = _served(sidecar, unanswered, may_offer)
@@ -178,7 +179,7 @@ def _paths_of_services(
     sidecar: Sidecar, sent: tuple[ServiceMapping, ...] | None, is_offered: Callable[[ServiceName], bool]
 ) -> tuple[tuple[ServiceName, int], ...]:
     """What the robot carries, as told last, if it was told; and what it wants and nobody serves: by what it says, or
-    since it carried that until nobody offered it."""
+    since it carried that until no cloud that it may call offered it."""
     told = {mapping.service: len(mapping.assignments) for mapping in sent or ()}
     carries = [use.name for use in sidecar.uses]
     found = {name: told[name] for name in carries[:MAX_VIEWED] if name in told}

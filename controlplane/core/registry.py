@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 import heapq
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
@@ -198,8 +198,8 @@ class Registry:
         self._sidecars: dict[NodeName, Sidecar] = {}
         self._sessions: dict[SessionId, NodeName] = {}
         self._shares = RegistrationShare()
-        self._offers: Counter[ServiceName] = Counter()
-        """By how many each is offered."""
+        self._offering: dict[ServiceName, set[NodeName]] = {}
+        """The clouds that offer each."""
         self._removals: OrderedDict[NodeName, tuple[RemovalReason, float]] = OrderedDict()
         """Why, and when each was heard last."""
         # One entry a name, at most as late as its lease ends: renewing a lease does not touch it.
@@ -321,20 +321,24 @@ class Registry:
         if len(carried) > MAX_OFFERED:
             carried = now_carried
         before = known.services
-        self._offers.update(now_offered)
         self._offers_no_more(known)
+        if known.role is Role.CLOUD:
+            for service in now_offered:
+                self._offering.setdefault(service, set()).add(name)
         self._sidecars[name] = replace(known, services=services, offered=offered, carried=carried)
         return before is None or (services.offers, services.uses) != (before.offers, before.uses)
 
     def _offers_no_more(self, sidecar: Sidecar) -> None:
-        for service in {offer.name for offer in sidecar.offers}:
-            self._offers[service] -= 1
-            if not self._offers[service]:
-                del self._offers[service]
+        for offer in sidecar.offers:
+            clouds = self._offering.get(offer.name)
+            if clouds is not None:
+                clouds.discard(sidecar.name)
+                if not clouds:
+                    del self._offering[offer.name]
 
-    def is_offered(self, service: ServiceName) -> bool:
-        """Whether anybody who is registered offers it."""
-        return service in self._offers
+    def offering(self, service: ServiceName) -> Iterator[Sidecar]:
+        """The registered clouds that offer it, whether or not they may."""
+        return (self._sidecars[name] for name in self._offering.get(service, ()))
 
     def set_revocations(self, name: NodeName, held: RevocationSet) -> None:
         """Note which revocation lists it uses."""

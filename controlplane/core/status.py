@@ -16,13 +16,19 @@ if TYPE_CHECKING:
     from controlplane.core.publisher import Publisher
     from controlplane.core.registry import Registry
     from controlplane.core.unanswered import Unanswered
-    from protos.model import NodeName
+    from protos.model import NodeName, ServiceName
 
 
 def is_met(robot: NodeName, server: NodeName, registry: Registry, permits: Permits) -> bool:
     """Whether a server is registered and the robot may talk to it: of others it may have told what is over."""
     cloud = registry.get(server)
     return cloud is not None and permits.may_meet(robot, cloud)
+
+
+def is_offered(robot: NodeName, service: ServiceName, registry: Registry, permits: Permits) -> bool:
+    """Whether a cloud that is registered offers a service and the robot may call it there."""
+    group = permits.group(robot)
+    return any(service in permits.of(group, cloud) for cloud in registry.offering(service))
 
 
 def statuses(

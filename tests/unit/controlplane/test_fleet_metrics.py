@@ -68,39 +68,13 @@ from tests.unit.controlplane.samples import (
     registration,
     use,
 )
+from tests.unit.controlplane.scrapes import fleet_of, series, value
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from prometheus_client import Metric
 
 pytestmark = pytest.mark.audit("ops-13")
-
-Series = dict[tuple[str, tuple[tuple[str, str], ...]], float]
-
-
-def series(metrics: Iterable[Metric]) -> Series:
-    return {
-        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
-        for metric in metrics
-        for sample in metric.samples
-    }
-
-
-def value(found: Series, name: str, **labels: str) -> float | None:
-    return found.get((name, tuple(sorted(labels.items()))))
-
-
-def fleet_of(world: World) -> Fleet:
-    views = (world.core.view(sidecar.name, world.now) for sidecar in world.core.registry)
-    return Fleet(
-        members=[view for view in views if view is not None],
-        gone=world.core.departed.told(world.now, MAX_GONE),
-        certificates_end={NodeName("robot"): 1.8e9},
-        now=world.now,
-        now_wall=1.7e9,
-    )
-
 
 def test_what_is_known_of_a_robot_is_exported() -> None:
     world = World(Settings(warm_up_s=0.0))
