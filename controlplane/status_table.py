@@ -26,10 +26,9 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
 
     `own`: the revocation lists of the control plane; `now_wall`: seconds since 1970.
     """
-    newest: dict[int, int] = {}
-    for one in (*own.lists, *(one for status in sidecars for one in status.revocations.lists)):
-        newest[one.ca] = max(one.number, newest.get(one.ca, 0))
-    about_own = _revocations(own, newest, now_wall)
+    # What others say that they have is no proof of a newer list.
+    of_own = {one.ca: one.number for one in own.lists}
+    about_own = _revocations(own, of_own, now_wall)
     lines = [f"control plane: {line}" for line in about_own]
     if not sidecars:
         return "\n".join([*lines, "no sidecars"])
@@ -37,7 +36,7 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
     offered = sorted({offer.name for status in sidecars for offer in status.peer.offers})
     for status in sidecars:
         details = [*_details(status), *_unmet(status, offered), *_untyped(status), *_unserved(status)]
-        details += _revocations(status.revocations, newest, now_wall)
+        details += _revocations(status.revocations, of_own, now_wall)
         if details:
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in details)]
     abridged = sum(status.abridged for status in sidecars)
@@ -103,13 +102,17 @@ def _untyped(status: SidecarStatus) -> Iterator[str]:
         yield f"UNTYPED {name}: not {what}, as its service type is not installed there; plr doctor there names it"
 
 
-def _revocations(held: RevocationSet, newest: Mapping[int, int], now_wall: float) -> Iterator[str]:
-    """`newest`: the largest number that anybody has, by CA."""
+def _revocations(held: RevocationSet, of_own: Mapping[int, int], now_wall: float) -> Iterator[str]:
+    """`of_own`: the number of the control plane's own list, by CA."""
     for one in held.lists:
         age_s = now_wall - one.signed_at_s
         age = f"{age_s / _DAY_S:.1f} days ago" if age_s >= 0.0 else f"{-age_s:.0f} s FROM NOW: a clock is wrong"
-        behind = f": OLDER than {newest[one.ca]}, which others have" if one.number < newest[one.ca] else ""
-        yield f"revocation list {one.number}, signed {age}{behind}"
+        own = of_own.get(one.ca)
+        if own is None or one.number > own:
+            yield f"claims revocation list {one.number}, which the control plane has not, signed {age}"
+            continue
+        older = f": OLDER than the control plane's {own}" if one.number < own else ""
+        yield f"revocation list {one.number}, signed {age}{older}"
     if held.too_old:
         yield f"REVOCATION LIST TOO OLD of {held.too_old} CAs: talks to none of their nodes; do: plr ca publish"
 

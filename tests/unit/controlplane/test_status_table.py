@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from controlplane.status_table import render
 from protos.model import (
     Assignment,
@@ -95,6 +97,22 @@ def test_who_lacks_a_revocation_is_seen() -> None:
     status = SidecarStatus(peer, True, 1.0, "", revocations=held)
     text = render([status], RevocationSet((HeldList(5, 12, 87_400),)), 87_400.0 + 8640.0)
     assert text.splitlines()[0] == "control plane: revocation list 12, signed 0.1 days ago"
-    assert "revocation list 11, signed 1.1 days ago: OLDER than 12, which others have" in text
+    assert "revocation list 11, signed 1.1 days ago: OLDER than the control plane's 12" in text
     assert "REVOCATION LIST TOO OLD of 1 CAs: talks to none of their nodes; do: plr ca publish" in text
     assert "signed 1000 s FROM NOW: a clock is wrong" in render([status], now_wall=0.0)
+
+
+@pytest.mark.audit("ops-12")
+def test_what_one_member_claims_of_revocation_lists_is_told_of_that_member_alone() -> None:
+    def holds(name: str, number: int, ca: int = 5) -> SidecarStatus:
+        peer = Peer(NodeName(name), Role.ROBOT, SessionId(1), b"", 1)
+        return SidecarStatus(peer, True, 1.0, "", revocations=RevocationSet((HeldList(ca, number, 1000),)))
+
+    own = RevocationSet((HeldList(5, 12, 1000),))
+    claims = [holds("evil", 2**64 - 1), holds("strange", 1, ca=6)]
+    text = render([holds("honest", 12), *claims], own, 1000.0)
+    assert "OLDER" not in text
+    assert text.count("which the control plane has not") == 2
+    told = text.split("\n\n")
+    assert told[1] == "honest:\n  revocation list 12, signed 0.0 days ago"
+    assert told[2].startswith(f"evil:\n  claims revocation list {2**64 - 1}, which the control plane has not")
