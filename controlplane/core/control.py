@@ -257,7 +257,7 @@ class ControlCore:
         for path in report.paths:
             if path.up:
                 self.reached.note(name, path.server)
-        self.unanswered.note(report.latencies)
+        self.unanswered.note(name, report.latencies, now)
         surprised = self._drawing.reported(name, report)
         change = Change.MISSES if surprised else Change.REPORT
         if self.estimator.merge(name, report, now):
@@ -500,6 +500,7 @@ class ControlCore:
             self.unanswered.begin(name, sidecar.offered)
 
     def _forget_paths(self, name: NodeName) -> None:
+        self.unanswered.forget(name)
         self.estimator.forget_paths(name)
         self._drawing.robot_changed(name)
 

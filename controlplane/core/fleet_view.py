@@ -77,7 +77,7 @@ class ServedView:
     up: bool
     """Whether a node beside its sidecar serves it now, or else is missed."""
     unanswered: int
-    """Requests in a row, of those that robots measure, that it had and did not answer."""
+    """Requests, of those that robots measure, that it had since its last answer and did not answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ def view_of(
     offer."""
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
-        served = _served(sidecar, unanswered, may_offer)
+        served = _served(sidecar, lambda service: unanswered.row(sidecar.name, service, now), may_offer)
         return MemberView(sidecar.name, sidecar.role, connected, seen_at, served=served)
     mapping, peers = snapshots.mapping, snapshots.peers.sent
     # Whatever a robot reports: it makes no series of interfaces that it has not announced, nor of servers that are
@@ -165,13 +165,16 @@ def view_of(
     )
 
 
-def _served(cloud: Sidecar, unanswered: Unanswered, may_offer: Callable[[ServiceName], bool]) -> tuple[ServedView, ...]:
+def _served(
+    cloud: Sidecar, unanswered: Callable[[ServiceName], int], may_offer: Callable[[ServiceName], bool]
+) -> tuple[ServedView, ...]:
     if cloud.draining:
         return ()
-    missed = sorted({*cloud.unmet, *cloud.withdrawn})
-    found = [ServedView(name, False, 0) for name in missed if may_offer(name)]
-    offered = (offer.name for offer in cloud.offers if may_offer(offer.name))
-    found += (ServedView(name, True, unanswered.row(cloud.name, name)) for name in offered)
+    offered = [offer.name for offer in cloud.offers]
+    # Of what it says that it offers and lacks, one series is made.
+    missed = {*cloud.unmet, *cloud.withdrawn}.difference(offered)
+    found = [ServedView(name, False, 0) for name in sorted(missed) if may_offer(name)]
+    found += (ServedView(name, True, unanswered(name)) for name in offered if may_offer(name))
     return tuple(found[:MAX_VIEWED])
 
 

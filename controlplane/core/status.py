@@ -74,7 +74,7 @@ def statuses(
             down=tuple(label.interface for label in sidecar.down),
             withdrawn=tuple(sorted(sidecar.withdrawn.difference(sidecar.unmet))),
             unanswered={
-                offer.name: row for offer in sidecar.offers if (row := unanswered.row(sidecar.name, offer.name))
+                offer.name: row for offer in sidecar.offers if (row := unanswered.row(sidecar.name, offer.name, now))
             },
             abridged=shorter,
         )

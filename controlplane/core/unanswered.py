@@ -1,12 +1,17 @@
 """Servers that take requests and answer none: their sidecar is there, and the ROS node behind it hangs.
 
-A robot says of each copy that it measures whether its server had the whole request and yet gave no answer. One answer,
-to whichever robot, ends the row: then the server answers somebody.
+A robot says of each copy that it measures whether its server had the whole request and yet gave no answer. One answer
+ends what that robot said before; answers to two robots end what all of them said before.
+
+One robot may be hacked, or merely odd. So a robot's word counts for no more than those of all others who say the same,
+and against one who says that it got an answer it takes two who did not. Alone a robot is believed if nobody else got an
+answer lately. Times are monotonic seconds.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from protos.histogram import MAX_COUNT
@@ -16,40 +21,125 @@ if TYPE_CHECKING:
 
     from protos.model import LatencyReport, NodeName, ServiceName
 
-MAX_ROWS = 8192
-"""Pairs of server and service with a row; the one that was reported on longest ago goes."""
+    Pair = tuple[NodeName, ServiceName]
+
+MAX_WORDS_OF_ROBOT = 64
+"""Pairs of server and service of which one robot's word is kept; the one that it spoke of longest ago goes."""
+
+MAX_ANSWERED = 4
+"""Robots kept that got an answer last, for each pair: two are needed, and nobody can take the places of all."""
+
+LATELY_S = 120.0
+"""For so long an answer to another robot speaks against one that alone gets none: one request of eight is measured."""
+
+REMEMBERED_S = 600.0
+"""After so long a robot's word that it gets no answer does not count any more."""
+
+
+@dataclass(slots=True)
+class _Lost:
+    """A robot's requests without an answer since its last answer."""
+
+    count: int
+    since: float
+    heard_at: float
+
+
+@dataclass(slots=True)
+class _Row:
+    """What robots said last of one pair; each stands in one of the two."""
+
+    lost: dict[NodeName, _Lost] = field(default_factory=dict)
+    answered: dict[NodeName, float] = field(default_factory=dict)
+    """When it said that it got an answer, the earliest first."""
 
 
 class Unanswered:
-    """How many requests in a row each server left unanswered, by service."""
+    """How many requests each server left unanswered, by service. Bounded by the robots that are there."""
 
     def __init__(self) -> None:
-        self._rows: OrderedDict[tuple[NodeName, ServiceName], int] = OrderedDict()
+        self._rows: dict[Pair, _Row] = {}
+        self._words: dict[NodeName, OrderedDict[Pair, None]] = {}
+        """In which rows each robot stands."""
         self.forgotten = 0
+        """Words of robots who spoke of more pairs than are kept."""
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def note(self, latencies: Collection[LatencyReport]) -> None:
+    def note(self, robot: NodeName, latencies: Collection[LatencyReport], now: float) -> None:
         """A robot reports what servers' shares of its requests were: lost are those without an answer. What came first
         is not told: an answer counts for all of the report."""
         answered = {(one.server, one.service) for one in latencies if one.processing.answered}
         for pair in answered:
-            self._rows.pop(pair, None)
+            self._note_answer(robot, pair, now)
+        lost: Counter[Pair] = Counter()
         for one in latencies:
-            pair = (one.server, one.service)
-            if one.processing.lost and pair not in answered:
-                self._rows[pair] = min(self._rows.get(pair, 0) + one.processing.lost, MAX_COUNT)
-                self._rows.move_to_end(pair)
-                if len(self._rows) > MAX_ROWS:
-                    self._rows.popitem(last=False)
-                    self.forgotten += 1
+            if one.processing.lost and (one.server, one.service) not in answered:
+                lost[one.server, one.service] += one.processing.lost
+        for pair, count in lost.items():
+            row = self._row_with(robot, pair)
+            row.answered.pop(robot, None)
+            before = row.lost.get(robot) or _Lost(0, now, now)
+            row.lost[robot] = _Lost(min(before.count + count, MAX_COUNT), before.since, now)
+
+    def _note_answer(self, robot: NodeName, pair: Pair, now: float) -> None:
+        row = self._row_with(robot, pair)
+        row.lost.pop(robot, None)
+        row.answered.pop(robot, None)
+        if row.lost and row.answered:
+            # An answer from before the server hung tells nothing.
+            last = max(row.answered.values())
+            for other in [name for name, lost in row.lost.items() if lost.since <= last]:
+                self._take_back(other, pair)
+        row.answered[robot] = now
+        if len(row.answered) > MAX_ANSWERED:
+            self._take_back(next(iter(row.answered)), pair)
+
+    def _row_with(self, robot: NodeName, pair: Pair) -> _Row:
+        """The row of a pair, in which the robot is about to stand."""
+        words = self._words.setdefault(robot, OrderedDict())
+        words[pair] = None
+        words.move_to_end(pair)
+        if len(words) > MAX_WORDS_OF_ROBOT:
+            self._take_back(robot, next(iter(words)))
+            self.forgotten += 1
+        return self._rows.setdefault(pair, _Row())
+
+    def _take_back(self, robot: NodeName, pair: Pair) -> None:
+        """The robot's word on a pair does not count any more."""
+        words = self._words[robot]
+        del words[pair]
+        if not words:
+            del self._words[robot]
+        row = self._rows[pair]
+        row.lost.pop(robot, None)
+        row.answered.pop(robot, None)
+        if not (row.lost or row.answered):
+            del self._rows[pair]
 
     def begin(self, server: NodeName, services: Iterable[ServiceName]) -> None:
         """Nothing is known of what serves these there: it is another process, or none."""
         for service in services:
-            self._rows.pop((server, service), None)
+            pair = (server, service)
+            row = self._rows.get(pair)
+            if row is not None:
+                for robot in (*row.lost, *row.answered):
+                    self._take_back(robot, pair)
 
-    def row(self, server: NodeName, service: ServiceName) -> int:
-        """Requests that the server had since its last answer, and has not answered."""
-        return self._rows.get((server, service), 0)
+    def forget(self, robot: NodeName) -> None:
+        """The robot is gone, or was started anew: it bears witness to nothing."""
+        for pair in list(self._words.get(robot, ())):
+            self._take_back(robot, pair)
+
+    def row(self, server: NodeName, service: ServiceName, now: float) -> int:
+        """Requests that the server had since its last answer, and has not answered, as far as that is believed."""
+        row = self._rows.get((server, service))
+        if row is None or not row.lost:
+            return 0
+        counts = [lost.count for lost in row.lost.values() if now - lost.heard_at <= REMEMBERED_S]
+        if len(counts) > 1:
+            total = sum(counts)
+            return min(total, 2 * (total - max(counts)), MAX_COUNT)
+        contradicted = any(now - at <= LATELY_S for at in row.answered.values())
+        return 0 if contradicted else sum(counts)
