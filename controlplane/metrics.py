@@ -184,9 +184,9 @@ def _members(core: ControlCore) -> Iterable[Metric]:
     yield _gauge("plr_registered_sidecars", "Sidecars whose lease has not ended.", ["role"], registered)
     yield _counter(
         "plr_leases_postponed_total",
-        "Times that a lease was not ended yet, as something of its sidecar was still to be read.",
+        "Times that a lease was not ended yet, as its sidecar has unread bytes; of each a few at most.",
         [],
-        {(): counters.postponed},
+        {(): core.registry.postponed.counted},
     )
     yield _counter(
         "plr_registrations_refused_total",

@@ -12,6 +12,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
+from controlplane.core.postponed import Postponed
 from controlplane.core.registration_share import RegistrationShare
 from protos.model import (
     NO_REVOCATIONS,
@@ -173,8 +174,6 @@ class RegistryCounters:
     refused: dict[Refusal, int] = field(default_factory=lambda: dict.fromkeys(Refusal, 0))
     departed: dict[RemovalReason, int] = field(default_factory=lambda: dict.fromkeys(DEPARTURES, 0))
     removals_forgotten: int = 0
-    postponed: int = 0
-    """Leases not ended yet, as something of their sidecars was still to be read."""
 
 
 @dataclass(slots=True)
@@ -205,6 +204,7 @@ class Registry:
         # One entry a name, at most as late as its lease ends: renewing a lease does not touch it.
         self._ends: list[tuple[float, NodeName]] = []
         self._awaited: set[NodeName] = set()
+        self.postponed = Postponed()
         self.counters = RegistryCounters()
 
     def __iter__(self) -> Iterator[Sidecar]:
@@ -405,7 +405,7 @@ class Registry:
             if name in unread and lease.postponed < MAX_POSTPONED:
                 lease.postponed += 1
                 lease.end = now + POSTPONE_S
-                self.counters.postponed += 1
+                self.postponed.note(name, now)
                 self._await_end(name)
                 continue
             gone.append(self._sidecars[name])

@@ -7,12 +7,15 @@ from dataclasses import replace
 import pytest
 
 from controlplane.core import registry as registry_module
+from controlplane.core.postponed import COUNTED_BURST
 from controlplane.core.registry import MAX_POSTPONED, POSTPONE_S, Admission, Refusal, Registry
 from protos.model import CandidateSet, NodeName, RemovalReason, Role, ServiceSet
 from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 
 ROBOT = NodeName("robot")
 LEASE_S = 5.0
+ALERT_AT = 10
+"""Of PlrControlPlaneOverloaded, in five minutes."""
 
 
 @pytest.fixture
@@ -199,7 +202,7 @@ def test_who_has_unread_bytes_is_judged_later_but_not_for_ever(registry: Registr
     for count in range(1, MAX_POSTPONED):
         assert registry.due(late + (count - 0.1) * POSTPONE_S) == []
         assert registry.expire(late + count * POSTPONE_S, {ROBOT}) == []
-    assert registry.counters.postponed == MAX_POSTPONED
+    assert registry.postponed.counted == COUNTED_BURST
     assert [gone.name for gone in registry.expire(late + MAX_POSTPONED * POSTPONE_S, {ROBOT})] == [ROBOT]
 
 
@@ -223,3 +226,23 @@ def test_looking_at_what_is_due_changes_nothing(registry: Registry) -> None:
     assert registry.due(2.0 + LEASE_S) == registry.due(2.0 + LEASE_S) == [ROBOT]
     assert [gone.name for gone in registry.expire(2.0 + LEASE_S)] == [ROBOT]
     assert registry.due(100.0) == []
+
+
+@pytest.mark.audit("ops-12")
+def test_one_that_sends_bytes_and_says_nothing_does_not_look_like_an_overload(registry: Registry) -> None:
+    """It registers again whenever its lease has ended, for an hour; the alert looks at five minutes."""
+    counts = []
+    for second in range(3600):
+        now = float(second)
+        if registry.get(ROBOT) is None:
+            registry.register(registration("robot"), stream(second + 1), now)
+        registry.expire(now, {ROBOT})
+        counts.append(registry.postponed.counted)
+    assert registry.counters.departed[RemovalReason.LEASE_EXPIRED] > 100
+    assert max(late - early for early, late in zip(counts, counts[300:], strict=False)) <= ALERT_AT / 2
+    for number in range(8):
+        registry.register(registration(f"other-{number}"), stream(9000 + number), 3600.0)
+    before = registry.postponed.counted
+    for second in range(10):
+        registry.expire(3606.0 + second, [NodeName(f"other-{number}") for number in range(8)])
+    assert registry.postponed.counted > before + ALERT_AT, "eight that are read late do"
