@@ -64,8 +64,11 @@ log = logging.getLogger(__name__)
 MAX_SERVICES_LOGGED = 8
 """Services named in one log line."""
 
-ENDED_LINES_PER_S, ENDED_LINES_BURST = 1.0, 20.0
-"""Log lines on streams that were ended for breaking the rules."""
+ENDED_LINES_BURST = 20.0
+"""Log lines at once on streams that were ended for breaking the rules, and on messages left out, of all members."""
+
+ENDED_LINES_PER_S = 1.0
+"""After that."""
 
 METRICS_INTERVAL_S = 1.0
 """How old what is scraped may be: Prometheus scrapes every few seconds at most."""
@@ -329,9 +332,9 @@ class ControlLoop:
                     self.events.record(EventKind.REJOINED if lifted else EventKind.CUT_OFF, name, role=role)
         self._wake.set()
 
-    def _say(self, level: int, member: str, text: str, *values: object) -> None:
-        """Log a line that a member causes, as often as it wants, within its share of lines."""
-        left_out = self._lines.take(member, self._loop.time())
+    def _say(self, level: int, member: str, text: str, *values: object, of_all: TokenBucket | None = None) -> None:
+        """Log a line that a member causes, as often as it wants, within its share of lines, and that of all."""
+        left_out = self._lines.take(member, self._loop.time(), of_all)
         if left_out:
             text, values = f"{text} (%d lines on it were left out before)", (*values, left_out)
         if left_out is not None:
@@ -386,22 +389,22 @@ class ControlLoop:
     def unknown_message(self, who: str, problem: str, *, again: bool) -> None:
         """Count a message that was left out; `again`: not the first of its stream, whose line stands in the log."""
         self._metrics.unknown_messages.inc()
-        if not again and self._ended_lines.take(self._loop.time()):
-            self._say(logging.INFO, who, "stream of %s: left out %s", who, problem)
+        if not again:
+            self._say(logging.INFO, who, "stream of %s: left out %s", who, problem, of_all=self._ended_lines)
 
     def stream_ended(self, who: str, address: str, code: str, details: str) -> None:
         """A stream was ended by us; `who` is the member, if that is known, and `address` where it came from."""
         self._metrics.streams_ended.labels(code).inc()
         # A member that breaks the rules as often as it can must not fill the disk; the counter tells how often.
-        if self._ended_lines.take(self._loop.time()):
-            self._say(
-                logging.WARNING,
-                who,
-                "stream of %s ended: %s: %s",
-                address if who == address else f"{who} at {address}",
-                code,
-                details,
-            )
+        self._say(
+            logging.WARNING,
+            who,
+            "stream of %s ended: %s: %s",
+            address if who == address else f"{who} at {address}",
+            code,
+            details,
+            of_all=self._ended_lines,
+        )
 
     # ── the loop ──
 

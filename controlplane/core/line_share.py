@@ -30,8 +30,11 @@ class LineShare:
         """Of all members."""
         self.forgotten = 0
 
-    def take(self, member: str, now: float) -> int | None:
-        """How many lines on this member were left out since its last one; None: this one is to be left out too."""
+    def take(self, member: str, now: float, of_all: TokenBucket | None = None) -> int | None:
+        """How many lines on this member were left out since its last one; None: this one is to be left out too.
+
+        `of_all`: a share of all members together, in lines of some kind; one beyond its own share takes nothing of it.
+        """
         share = self._shares.get(member)
         if share is None:
             share = self._shares[member] = TokenBucket(rate=LINES_PER_S, burst=LINES_BURST, now=now)
@@ -40,7 +43,7 @@ class LineShare:
                 self._left_out.pop(forgotten, None)
                 self.forgotten += 1
         self._shares.move_to_end(member)
-        if share.take(now):
+        if share.take(now) and (of_all is None or of_all.take(now)):
             return self._left_out.pop(member, 0)
         self._left_out[member] = self._left_out.get(member, 0) + 1
         self.left_out += 1

@@ -4,6 +4,7 @@ import pytest
 
 from controlplane.core import line_share
 from controlplane.core.line_share import LINES_BURST, LINES_PER_S, LineShare
+from protos.token_bucket import TokenBucket
 
 
 @pytest.mark.audit("ops-16")
@@ -28,3 +29,16 @@ def test_the_table_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     lines.take("c", 0.0)
     assert lines.take("a", 0.0) == 0, "forgotten, and counted anew"
     assert lines.forgotten == 2
+
+
+@pytest.mark.audit("ops-16")
+def test_what_one_leaves_of_the_lines_of_all_is_for_the_others_and_what_all_lack_is_counted() -> None:
+    lines = LineShare()
+    of_all = TokenBucket(rate=1.0, burst=LINES_BURST + 1.0, now=0.0)
+    for _ in range(200):
+        lines.take("evil", 0.0, of_all)
+    assert lines.left_out == 200 - LINES_BURST
+    assert lines.take("robot", 0.0, of_all) == 0
+    assert lines.take("robot", 0.0, of_all) is None, "there are too many of all"
+    assert lines.left_out == 201 - LINES_BURST
+    assert lines.take("robot", 1.0, of_all) == 1, "it says how many"
