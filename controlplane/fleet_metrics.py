@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 MAX_SERIES = 100_000
 """Of all members."""
 
-SERIES_OF_MEMBER = 6
+SERIES_OF_MEMBER = 7
 """Of each at most, there or gone, beside a robot's own and a server's by service: a server's."""
 
 MAX_SERIES_OF_SERVICES = 20_000
@@ -41,6 +41,10 @@ MAX_SERIES_OF_SERVICES = 20_000
 
 MAX_GONE = 1024
 """Members that are gone and still have series, those that went last."""
+
+TOGETHER_S = 60.0
+"""Who reached a server last within so long before the last of them did has lost it together with that one: robots
+report every ten seconds at least."""
 
 REUSED_S = 1.0
 """Scrapes within this time share their values."""
@@ -217,19 +221,31 @@ def _members(fleet: Fleet) -> Iterator[Metric]:
 def _servers(fleet: Fleet) -> Metric:
     def reach() -> Iterator[tuple[Labels, float]]:
         counts: Counter[tuple[NodeName, str]] = Counter()
+        doubted: Counter[NodeName] = Counter()
+        lost_at: dict[NodeName, list[float]] = {}
         for robot in fleet.members:
             reaches = {path.server for path in robot.paths if path.up}
             # Who reaches nobody has a trouble of its own.
             if reaches:
                 counts.update((server, "up") for server in reaches)
-                counts.update((server, "lost") for server in robot.lost)
                 counts.update((server, "never") for server in robot.unproven)
+                doubted.update(robot.doubted)
+                for server, at in robot.lost.items():
+                    lost_at.setdefault(server, []).append(at)
+        # That one says that it did proves nothing against two.
+        counts.update({(server, "never"): count for server, count in doubted.items() if count > 1})
+        for server, times in lost_at.items():
+            counts[server, "lost"] = len(times)
+            counts[server, "lost_together"] = sum(at >= max(times) - TOGETHER_S for at in times)
         for member in fleet.members:
             if member.role is Role.CLOUD:
-                for path in ("up", "lost", "never"):
+                for path in ("up", "lost", "lost_together", "never"):
                     yield (member.name, path), float(counts[member.name, path])
 
-    text = "Robots that reach the server (up), or only others: those that reached it before (lost), or all (never)."
+    text = (
+        "Robots that reach the server (up), or only others: those that reached it before (lost), those that lost it "
+        "when the last one did (lost_together), or all (never)."
+    )
     return _gauge("plr_server_robots", text, ("server", "path"), reach)
 
 

@@ -60,6 +60,7 @@ CAPPED = {
     "history._histories": MAX_HISTORIES,
     "reached._pairs": MAX_PAIRS,
     "reached._robots_of": MAX_PAIRS,
+    "reached._servers_of": MAX_PAIRS,
     "history._histories[].changes": MAX_HISTORIES * MAX_CHANGES,
     "restlessness._shares": MAX_MEMBERS,
     "registry._shares._shares": MAX_MEMBERS,

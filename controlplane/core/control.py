@@ -256,7 +256,7 @@ class ControlCore:
         self.counters.report_entries_forbidden += left_out
         for path in report.paths:
             if path.up:
-                self.reached.note(name, path.server)
+                self.reached.note(name, path.server, now)
         self.unanswered.note(name, report.latencies, now)
         surprised = self._drawing.reported(name, report)
         change = Change.MISSES if surprised else Change.REPORT
@@ -480,6 +480,8 @@ class ControlCore:
 
     def _forget(self, sidecar: Sidecar, reason: RemovalReason, now: float) -> None:
         name = sidecar.name
+        if reason is RemovalReason.REVOKED:
+            self.reached.forget(name)
         gone = self._departure(sidecar, why_removed(sidecar, reason), "", now)
         last = None
         if sidecar.role is Role.ROBOT:

@@ -4,7 +4,7 @@ another thread while the core goes on. Times are monotonic seconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from protos.model import Role
 from protos.status import SyncState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.picture import Picture
@@ -94,10 +94,12 @@ class MemberView:
     interfaces: tuple[InterfaceView, ...] = ()
     paths_of_services: tuple[tuple[ServiceName, int], ...] = ()
     """Over how many paths requests go, of each service that it was told of or cannot have."""
-    lost: frozenset[NodeName] = frozenset()
-    """Servers that it does not reach, and did."""
+    lost: Mapping[NodeName, float] = field(default_factory=dict)
+    """Servers that it does not reach, and did, and when it did last."""
     unproven: frozenset[NodeName] = frozenset()
     """Servers that it does not reach, and nobody ever has."""
+    doubted: frozenset[NodeName] = frozenset()
+    """Servers that it has never reached, and one other robot alone says that it did."""
     follows: bool = True
     """Whether it has confirmed the mapping that it was sent last, if there is one."""
     servers: int = 0
@@ -158,8 +160,13 @@ def view_of(
         misses=tuple(_misses(sidecar.name, use, plan, picture, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
         interfaces=tuple(interfaces[:MAX_VIEWED]),
         paths_of_services=_paths_of_services(sidecar, mapping.sent, is_offered),
-        lost=frozenset(server for server in unreached if reached.by(sidecar.name, server)),
-        unproven=frozenset(server for server in unreached if not reached.by_anyone(server)),
+        lost={server: at for server in unreached if (at := reached.by(sidecar.name, server)) is not None},
+        unproven=frozenset(server for server in unreached if not reached.witnesses(server)),
+        doubted=frozenset(
+            server
+            for server in unreached
+            if reached.witnesses(server) == 1 and reached.by(sidecar.name, server) is None
+        ),
         follows=mapping.state not in (SyncState.STALE, SyncState.REJECTED),
         servers=len(peers.peers) if peers is not None else 0,
     )

@@ -1,7 +1,8 @@
 """Which robots have reached which servers: whose silence tells something of a server.
 
 A robot may be told of servers that no network leads it to (another site's). That it does not reach these says nothing;
-that it does not reach one that it did reach does.
+that it does not reach one that it did reach does. One robot may be hacked: that it reaches a server, or did, proves
+nothing against two that do not.
 """
 
 from __future__ import annotations
@@ -18,35 +19,51 @@ MAX_PAIRS = 131_072
 
 
 class Reached:
-    """Remembers it since the start."""
+    """Remembers it since the start. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        self._pairs: OrderedDict[tuple[NodeName, NodeName], None] = OrderedDict()
+        self._pairs: OrderedDict[tuple[NodeName, NodeName], float] = OrderedDict()
+        """When it did last, the longest ago first."""
+        self._servers_of: dict[NodeName, set[NodeName]] = {}
         self._robots_of: Counter[NodeName] = Counter()
         self.forgotten = 0
 
     def __len__(self) -> int:
         return len(self._pairs)
 
-    def note(self, robot: NodeName, server: NodeName) -> None:
+    def note(self, robot: NodeName, server: NodeName, now: float) -> None:
         """The robot reaches the server now."""
         pair = (robot, server)
-        if pair in self._pairs:
+        known = pair in self._pairs
+        self._pairs[pair] = now
+        if known:
             self._pairs.move_to_end(pair)
             return
-        self._pairs[pair] = None
+        self._servers_of.setdefault(robot, set()).add(server)
         self._robots_of[server] += 1
         if len(self._pairs) > MAX_PAIRS:
-            (_, other), _ = self._pairs.popitem(last=False)
-            self._robots_of[other] -= 1
-            if not self._robots_of[other]:
-                del self._robots_of[other]
+            self._drop(*next(iter(self._pairs)))
             self.forgotten += 1
 
-    def by(self, robot: NodeName, server: NodeName) -> bool:
-        """Whether this robot has ever reached the server."""
-        return (robot, server) in self._pairs
+    def _drop(self, robot: NodeName, server: NodeName) -> None:
+        del self._pairs[robot, server]
+        servers = self._servers_of[robot]
+        servers.remove(server)
+        if not servers:
+            del self._servers_of[robot]
+        self._robots_of[server] -= 1
+        if not self._robots_of[server]:
+            del self._robots_of[server]
 
-    def by_anyone(self, server: NodeName) -> bool:
-        """Whether any robot, there or gone, has."""
-        return server in self._robots_of
+    def forget(self, robot: NodeName) -> None:
+        """This robot's word counts for nothing any more."""
+        for server in list(self._servers_of.get(robot, ())):
+            self._drop(robot, server)
+
+    def by(self, robot: NodeName, server: NodeName) -> float | None:
+        """When this robot reached the server last; None: never."""
+        return self._pairs.get((robot, server))
+
+    def witnesses(self, server: NodeName) -> int:
+        """How many robots, there or gone, have."""
+        return self._robots_of[server]

@@ -6,9 +6,9 @@ import pytest
 
 from controlplane.core.control_events import Settings
 from controlplane.core.policy import CallRule, OfferRule, Policy
-from controlplane.fleet_metrics import families
-from protos.model import Report, Role, ServiceSet
-from tests.sim.control_world import SETTLED_S, World
+from controlplane.fleet_metrics import TOGETHER_S, families
+from protos.model import NodeName, RemovalReason, Report, Role, ServiceSet
+from tests.sim.control_world import SETTLED_S, SimSidecar, World
 from tests.unit.controlplane.samples import PLAN, offer, path, registration
 from tests.unit.controlplane.scrapes import fleet_of, series, value
 
@@ -42,3 +42,41 @@ def test_what_a_robot_may_not_call_does_not_serve_it(policy: Policy | None) -> N
         assert paths() == 0.0, "one that may not offer it does, and one that the robot may not call"
     world.say(server, ServiceSet((offer(),)))
     assert paths() is None, "it is served: the robot has another reason"
+
+
+def test_one_that_claims_to_reach_a_server_hides_nothing_that_two_see() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    for name in ("fine", "dead", "new"):
+        world.cloud(name)
+    honest = [world.robot(f"robot-{number}") for number in range(3)]
+    liar = world.robot("liar")
+
+    def says(robot: SimSidecar, *up: str) -> None:
+        world.say(robot, Report(paths=tuple(path("wlan0", name, up=name in up) for name in ("fine", "dead", "new"))))
+
+    def told(server: str, *paths: str) -> list[float | None]:
+        found = series(families(fleet_of(world)))
+        return [value(found, "plr_server_robots", server=server, path=path) for path in paths]
+
+    says(honest[0], "fine", "dead")
+    world.run(2 * TOGETHER_S)
+    says(honest[0], "fine")
+    assert told("dead", "up", "lost", "lost_together") == [0, 1, 1]
+    says(honest[1], "fine", "dead")
+    world.run(1.0)
+    says(honest[1], "fine")
+    says(liar, "fine", "dead", "new")
+    assert told("dead", "up", "lost", "lost_together") == [1, 2, 1], "one roamed elsewhere long ago"
+    says(honest[2], "fine", "dead")
+    world.run(1.0)
+    says(honest[2], "fine")
+    assert told("dead", "up", "lost", "lost_together") == [1, 3, 2]
+    assert told("new", "up", "never") == [1, 3]
+    world.leave(liar)
+    assert told("new", "up", "never") == [0, 3]
+    world.leave(honest[0])
+    world.leave(honest[1])
+    assert told("new", "never") == [0], "a word against a word"
+    world.robot("liar")
+    world.core.part_with(NodeName("liar"), RemovalReason.REVOKED, world.now)
+    assert told("new", "never") == [1]
