@@ -289,6 +289,7 @@ def _drops(core: ControlCore, superseded: int, dropped: Mapping[str, int], event
             ("stale_answer",): core.counters.stale_answers,
             ("old_stream",): core.counters.old_stream_messages,
             ("report_of_cloud",): core.counters.reports_ignored,
+            ("offer_of_robot",): core.counters.robot_offers_ignored,
             ("report_forbidden",): core.counters.report_entries_forbidden,
             ("announced_too_often",): core.restlessness.held,
             ("urgent_too_often",): core.urgency.held,

@@ -167,6 +167,7 @@ class ControlCore:
     def register(self, registration: Registration, now: float) -> StreamId | Refusal:
         """A stream begins with this registration; returns its number, or why it may not."""
         stream = StreamId(self._last_stream + 1)
+        before = self.registry.get(registration.name)
         result = self.registry.register(registration, stream, now)
         if not isinstance(result, Admission):
             return result
@@ -182,6 +183,7 @@ class ControlCore:
         if result.new_run:
             self._forget_paths(name)
             self._begin_serving(name)
+        self._tell_anew(name, before, now)
         self._publisher.begin_stream(registration)
         self._welcome(name, stream)
         self._came_or_went(name, registration.role, now)
@@ -201,8 +203,9 @@ class ControlCore:
             case Registration():
                 raise DecodeError("a second registration on one stream")
             case CandidateSet() | ServiceSet():
-                if self.restlessness.admits(name, stream, message, now):
-                    self._announced(name, message, now)
+                told = self._sayable(name, message)
+                if self.restlessness.admits(name, stream, told, self._told_bytes(name, (told,)), now):
+                    self._announced(name, told, now)
             case Report():
                 self._receive_report(name, message, now)
             case Ack():
@@ -212,6 +215,7 @@ class ControlCore:
             case Drain():
                 sidecar = self.registry.get(name)
                 if sidecar is not None and self.registry.set_draining(name):
+                    self.restlessness.tell(name, sidecar.told_bytes, now)
                     self._publisher.changed(name, sidecar.role)
                     self._came_or_went(name, sidecar.role, now)
             case RevocationSet():
@@ -220,6 +224,34 @@ class ControlCore:
                 pass
             case _:
                 assert_never(message)
+
+    def _sayable(self, name: NodeName, told: CandidateSet | ServiceSet) -> CandidateSet | ServiceSet:
+        """What a member announces, without what a robot says that it offers: nobody calls robots."""
+        sidecar = self.registry.get(name)
+        if isinstance(told, ServiceSet) and told.offers and sidecar is not None and sidecar.role is Role.ROBOT:
+            self.counters.robot_offers_ignored += len(told.offers)
+            return replace(told, offers=())
+        return told
+
+    def _told_bytes(self, name: NodeName, told: Iterable[CandidateSet | ServiceSet]) -> int:
+        """How many bytes each who is told of a member is told if it announces this; 0 if it is no news to them."""
+        known = self.registry.get(name)
+        if known is None:
+            return 0
+        after = known
+        for one in told:
+            after = after.having_said(one)
+        return 0 if known.ready and after.as_peer() == known.as_peer() else after.told_bytes
+
+    def _tell_anew(self, name: NodeName, before: Sidecar | None, now: float) -> None:
+        """A member has registered: others are told what it has said before, if that is within its share."""
+        sidecar = self.registry.get(name)
+        if sidecar is None or before is None or sidecar.as_peer() == before.as_peer():
+            return
+        if self.restlessness.may_tell(name, sidecar.told_bytes, now):
+            self.restlessness.tell(name, sidecar.told_bytes, now)
+        else:
+            self.registry.unsay(name)
 
     def _announced(self, name: NodeName, told: CandidateSet | ServiceSet, now: float) -> None:
         if isinstance(told, CandidateSet):
@@ -450,7 +482,7 @@ class ControlCore:
         for gone in self._returning.missing(now, self._could_say):
             self.departed.note(gone)
             self._events.append(DepartureNotice(gone.name, gone))
-        for name, stream, waited in self.restlessness.due(now):
+        for name, stream, waited in self.restlessness.due(now, self._told_bytes):
             if self._streams.get(stream) == name and self.registry.get(name) is not None:
                 for told in waited:
                     self._announced(name, told, now)

@@ -69,6 +69,8 @@ class Counters:
     reports: int = 0
     reports_ignored: int = 0
     """Reports of clouds, which measure nothing."""
+    robot_offers_ignored: int = 0
+    """Services that robots say to serve: nobody calls robots."""
     report_entries_forbidden: int = 0
     """Of robots about servers or services that they may not use."""
     interfaces_left_out: int = 0

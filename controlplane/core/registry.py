@@ -16,6 +16,7 @@ from controlplane.core.postponed import Postponed
 from controlplane.core.registration_share import RegistrationShare
 from protos.model import (
     NO_REVOCATIONS,
+    CandidateSet,
     NodeName,
     Peer,
     Registration,
@@ -27,7 +28,7 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from protos.model import Candidate, CandidateSet, ServiceName, ServiceOffer, ServiceSet, ServiceUse, SessionId
+    from protos.model import Candidate, ServiceName, ServiceOffer, ServiceSet, ServiceUse, SessionId
     from protos.preferences import InterfaceLabel
 
 StreamId = NewType("StreamId", int)
@@ -42,6 +43,9 @@ MAX_OFFERED = 1024
 MAX_REMEMBERED_REMOVALS = 4096
 """Reasons of removals kept for notices; beyond that the oldest goes, and its notice says "lease expired"."""
 
+
+_PEER_BYTES, _CANDIDATE_BYTES, _OFFER_BYTES = 80, 24, 16
+"""What a peer, an address and an offer take in a message beside their names."""
 
 POSTPONE_S = 1.0
 """From one judgement of a lease to the next, for a member whose bytes have arrived and are not read yet: a second's
@@ -142,6 +146,38 @@ class Sidecar:
     def withdrawn(self) -> frozenset[ServiceName]:
         """Services that it offered since it registered, and does not now."""
         return self.offered.difference(offer.name for offer in self.offers)
+
+    def having_said(self, told: CandidateSet | ServiceSet) -> Sidecar:
+        """The same with other addresses, and what it says of its interfaces, or with other services."""
+        if isinstance(told, CandidateSet):
+            return replace(
+                self,
+                candidates=told.candidates,
+                labels=told.labels,
+                down=told.down,
+                candidates_serial=told.serial,
+                candidates_signature=told.signature,
+                signed_under=self.registration.credential if told.signature else b"",
+            )
+        now_offered = frozenset(offer.name for offer in told.offers)
+        offered = self.offered | now_offered
+        now_carried = frozenset(use.name for use in told.uses)
+        carried = self.carried | now_carried
+        return replace(
+            self,
+            services=told,
+            offered=offered if len(offered) <= MAX_OFFERED else now_offered,
+            carried=carried if len(carried) <= MAX_OFFERED else now_carried,
+        )
+
+    @property
+    def told_bytes(self) -> int:
+        """How much its peers are told whenever anything that they are told of it changes, roughly."""
+        if not self.ready:
+            return 0
+        size = _PEER_BYTES + len(self.registration.credential) + len(self.candidates_signature)
+        size += sum(_CANDIDATE_BYTES + len(one.interface) for one in self.candidates or ())
+        return size + sum(_OFFER_BYTES + len(offer.name) + len(offer.type) for offer in self.offers)
 
     def as_peer(self) -> Peer:
         """What its peers are told of it, but with its own token; each is told the one made for it (`ToldPeers`)."""
@@ -297,36 +333,25 @@ class Registry:
         """Replace its addresses and what it says of its interfaces; True if they changed for others: which ones carry
         nothing is the operator's business."""
         known = self._sidecars[name]
-        changed = replace(
-            known,
-            candidates=told.candidates,
-            labels=told.labels,
-            down=told.down,
-            candidates_serial=told.serial,
-            candidates_signature=told.signature,
-            signed_under=known.registration.credential if told.signature else b"",
-        )
-        self._sidecars[name] = changed
+        changed = self._sidecars[name] = known.having_said(told)
         return changed != replace(known, down=told.down)
 
     def set_services(self, name: NodeName, services: ServiceSet) -> bool:
         """Replace its services; True if they changed for others: which ones are unmet is the operator's business."""
         known = self._sidecars[name]
-        now_offered = frozenset(offer.name for offer in services.offers)
-        offered = known.offered | now_offered
-        if len(offered) > MAX_OFFERED:
-            offered = now_offered
-        now_carried = frozenset(use.name for use in services.uses)
-        carried = known.carried | now_carried
-        if len(carried) > MAX_OFFERED:
-            carried = now_carried
         before = known.services
         self._offers_no_more(known)
+        self._sidecars[name] = known.having_said(services)
         if known.role is Role.CLOUD:
-            for service in now_offered:
-                self._offering.setdefault(service, set()).add(name)
-        self._sidecars[name] = replace(known, services=services, offered=offered, carried=carried)
+            for offer in services.offers:
+                self._offering.setdefault(offer.name, set()).add(name)
         return before is None or (services.offers, services.uses) != (before.offers, before.uses)
+
+    def unsay(self, name: NodeName) -> None:
+        """What it has said of its addresses and services does not hold any more, until it says it anew."""
+        known = self._sidecars[name]
+        self._offers_no_more(known)
+        self._sidecars[name] = replace(known, candidates=None, services=None)
 
     def _offers_no_more(self, sidecar: Sidecar) -> None:
         for offer in sidecar.offers:

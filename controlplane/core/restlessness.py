@@ -1,16 +1,20 @@
 """Members that change what they announce all the time: every change is told to all others, so each has its share.
 
-A change within the share counts at once. One beyond it waits, and only the last of its kind does.
+A change within the share counts at once. One beyond it waits, and only the last of its kind does. With each change all
+that others know of the member is told again: if that is much, it has a share of bytes, too.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
     from controlplane.core.registry import StreamId
     from protos.model import CandidateSet, NodeName, ServiceSet
 
@@ -22,15 +26,46 @@ CHANGES_BURST = 30.0
 CHANGES_PER_S = 0.2
 """After that: everybody is told of all peers with each, some 20 kB in a fleet of 20 servers."""
 
+LIGHT_BYTES = 5000
+"""What is told in so few bytes waits for no share of bytes: that of changes keeps it to 1 kB a second."""
+
+BYTES_BURST = 1_000_000.0
+"""Bytes told of one member at once, to each who is told of it: those of a server whose 150 services come up one by one,
+the last ones with 10 kB each."""
+
+BYTES_PER_S = 1000.0
+"""After that: what a robot's control stream takes anyway, on a link that is billed."""
+
 MAX_MEMBERS = 8192
 """Members whose changes are counted, the one that changed longest ago goes: twice those that can be registered."""
+
+
+@dataclass(slots=True)
+class _Share:
+    changes: TokenBucket
+    told_bytes: float
+    """Told, and not paid for by time yet."""
+    at: float
+
+    def is_spent(self, now: float) -> bool:
+        """Whether no more than light changes are told of this member for a while."""
+        self._pass(now)
+        return self.told_bytes > BYTES_BURST
+
+    def tell(self, size: int, now: float) -> None:
+        self._pass(now)
+        self.told_bytes += size
+
+    def _pass(self, now: float) -> None:
+        self.told_bytes = max(0.0, self.told_bytes - BYTES_PER_S * max(0.0, now - self.at))
+        self.at = max(self.at, now)
 
 
 class Restlessness:
     """Counts the changes of each member, and keeps those that wait. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        self._shares: OrderedDict[NodeName, TokenBucket] = OrderedDict()
+        self._shares: OrderedDict[NodeName, _Share] = OrderedDict()
         self._waiting: dict[NodeName, tuple[StreamId, dict[type[Announcement], Announcement]]] = {}
         self._look_at: float | None = None
         self.held = 0
@@ -40,14 +75,18 @@ class Restlessness:
         """When to look for what has `due`; None while nothing waits."""
         return self._look_at
 
-    def admits(self, name: NodeName, stream: StreamId, told: Announcement, now: float) -> bool:
-        """Whether this counts now; else it waits, in place of what waited before."""
+    def admits(self, name: NodeName, stream: StreamId, told: Announcement, size: int, now: float) -> bool:
+        """Whether this counts now; else it waits, in place of what waited before.
+
+        `size`: the bytes that each other one is told then.
+        """
         waiting_stream, waiting = self._waiting.get(name, (stream, {}))
         if waiting_stream == stream and waiting:
             waiting[type(told)] = told
             self.held += 1
             return False
-        if self.take(name, now):
+        if self.may_tell(name, size, now) and self.take(name, now):
+            self.tell(name, size, now)
             return True
         self._waiting[name] = (stream, {type(told): told})
         self.held += 1
@@ -57,25 +96,44 @@ class Restlessness:
 
     def take(self, name: NodeName, now: float) -> bool:
         """Count a change of this member; False if that is more than its share."""
+        return self._share(name, now).changes.take(now)
+
+    def may_tell(self, name: NodeName, size: int, now: float) -> bool:
+        """Whether so many bytes are within this member's share."""
+        return size <= LIGHT_BYTES or not self._share(name, now).is_spent(now)
+
+    def tell(self, name: NodeName, size: int, now: float) -> None:
+        """So many bytes are told of this member, whether or not it may."""
+        self._share(name, now).tell(size, now)
+
+    def _share(self, name: NodeName, now: float) -> _Share:
         share = self._shares.get(name)
         if share is None:
-            share = self._shares[name] = TokenBucket(rate=CHANGES_PER_S, burst=CHANGES_BURST, now=now)
+            changes = TokenBucket(rate=CHANGES_PER_S, burst=CHANGES_BURST, now=now)
+            share = self._shares[name] = _Share(changes, 0.0, now)
             if len(self._shares) > MAX_MEMBERS:
                 self._shares.popitem(last=False)
         self._shares.move_to_end(name)
-        return share.take(now)
+        return share
 
     def forget(self, name: NodeName) -> None:
         """A stream of this member begins or ends: it says anew what it has to say. Its share stays what it is."""
         self._waiting.pop(name, None)
 
-    def due(self, now: float) -> list[tuple[NodeName, StreamId, list[Announcement]]]:
-        """What has waited for long enough."""
+    def due(
+        self, now: float, size_of: Callable[[NodeName, Collection[Announcement]], int]
+    ) -> list[tuple[NodeName, StreamId, list[Announcement]]]:
+        """What has waited for long enough; `size_of` tells how many bytes each other one is told then."""
         if self._look_at is None or self._look_at > now:
             return []
-        found = [(name, stream, list(told.values())) for name, (stream, told) in self._waiting.items()]
-        for name in self._waiting:
-            self.take(name, now)
-        self._waiting.clear()
-        self._look_at = None
+        found = []
+        for name, (stream, waiting) in list(self._waiting.items()):
+            told = list(waiting.values())
+            size = size_of(name, told)
+            if self.may_tell(name, size, now):
+                self.take(name, now)
+                self.tell(name, size, now)
+                found.append((name, stream, told))
+                del self._waiting[name]
+        self._look_at = now + 1.0 / CHANGES_PER_S if self._waiting else None
         return found

@@ -6,8 +6,9 @@ import pytest
 
 from controlplane.core.control_events import Settings
 from controlplane.core.registry import Refusal
+from controlplane.core.restlessness import BYTES_BURST, BYTES_PER_S
 from protos.model import CandidateSet, Drain, NodeName, PeerSet, Role, ServiceSet
-from tests.sim.control_world import World
+from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import candidate, interfaces, offer, registration
 
 pytestmark = pytest.mark.audit("sec-5")
@@ -54,3 +55,81 @@ def test_who_registers_again_and_again_is_told_of_once_a_second() -> None:
         world.run(0.05)
     told = sum(isinstance(message, PeerSet) for message in robot.received) - before
     assert told <= 30 + 3 * 20
+
+
+def many_offers(change: int) -> ServiceSet:
+    """As much as may be offered: half a megabyte, of which one number changes."""
+    return ServiceSet(tuple(offer(f"/s{number:04}{'x' * 240}", capacity=1 + change) for number in range(1024)))
+
+
+def told_of(robot: SimSidecar, name: str) -> int:
+    """How many bytes of names it was told of a member's offers."""
+    sets = [message for message in robot.received if isinstance(message, PeerSet)]
+    return sum(
+        len(one.name) + len(one.type)
+        for told in sets
+        for peer in told.peers
+        if peer.name == name
+        for one in peer.offers
+    )
+
+
+def budget(seconds: float) -> float:
+    """When there is something left a whole list may be told, and once more that it is about to go."""
+    return BYTES_BURST + 600_000 + BYTES_PER_S * seconds
+
+
+def test_who_changes_a_long_list_all_the_time_costs_the_others_little_and_is_told_of_as_it_is_at_last() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    rogue = world.join(registration("rogue", Role.CLOUD))
+    world.say(rogue, CandidateSet(interfaces("eth0")))
+    robot = world.robot("robot", "wlan0")
+    for change in range(60):
+        world.say(rogue, many_offers(change))
+        world.run(1.0)
+    assert told_of(robot, "rogue") <= budget(60.0)
+    honest = world.cloud("honest")
+    world.run(0.5)
+    world.say(honest, CandidateSet((candidate("eth0", port=4444),)))
+    world.run(0.5)
+    ports = {peer.name: peer.candidates[0].address[1] for peer in robot.peers}
+    assert ports[NodeName("honest")] == 4444, "others wait for nothing"
+    world.say(rogue, ServiceSet((offer(),)))
+    world.run(6.0)
+    assert [len(peer.offers) for peer in robot.peers if peer.name == "rogue"] == [1], "nor does little of it"
+    world.say(rogue, many_offers(99))
+    world.run(500.0)
+    assert [peer.offers[0].capacity for peer in robot.peers if peer.name == "rogue"] == [100]
+
+
+def test_who_comes_and_goes_with_a_long_list_costs_the_others_no_more() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    robot = world.robot("robot", "wlan0")
+    rogue = world.join(registration("rogue", Role.CLOUD))
+    world.say(rogue, CandidateSet(interfaces("eth0")))
+    world.say(rogue, many_offers(0))
+    for turn in range(300):
+        world.run(3.0)
+        run = registration("rogue", Role.CLOUD, incarnation=2 + turn // 6, token=rogue.registration.token)
+        result = world.core.register(run, world.now)
+        if isinstance(result, Refusal):
+            continue
+        rogue.stream = result
+        world.say(rogue, CandidateSet(interfaces("eth0")))
+        world.say(rogue, many_offers(0))
+        if turn % 3 == 0:
+            world.run(0.1)
+            world.say(rogue, Drain())
+    assert told_of(robot, "rogue") <= budget(930.0)
+
+
+def test_what_a_robot_says_that_it_serves_is_told_to_nobody() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    cloud = world.cloud("cloud")
+    robot = world.robot("robot", "wlan0")
+    world.say(robot, many_offers(0))
+    world.run(1.0)
+    assert [peer.offers for peer in cloud.peers] == [()]
+    (status,) = world.core.status(world.now, [NodeName("robot")])
+    assert status.peer.offers == ()
+    assert world.core.counters.robot_offers_ignored == 1024
