@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from controlplane.text_table import columns
+from controlplane.text_table import columns, listed
 from protos.fleet_events import EventLogState, Why
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def departed(gone: Sequence[DepartedSidecar], left_out: int) -> Iterator[str]:
             age(one.gone_s),
             f"{age(one.seen_s)} ago",
             f"{one.why.value}: {one.text or WORDS[one.why]}",
-            ",".join(one.services) or "-",
+            listed(one.services),
             one.software_version or "-",
         )
         for one in gone[:SHOWN]

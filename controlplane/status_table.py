@@ -6,7 +6,7 @@ import difflib
 import math
 from typing import TYPE_CHECKING
 
-from controlplane.text_table import columns
+from controlplane.text_table import columns, listed, shortened
 from protos.model import NO_REVOCATIONS, RevocationSet, Role
 from protos.status import SyncState
 
@@ -15,6 +15,12 @@ if TYPE_CHECKING:
 
     from protos.model import PathReport, ServiceMapping
     from protos.status import ResourceStatus, SidecarStatus
+
+MAX_LINES = 256
+"""On one sidecar: what it says that it offers, lacks or reaches must not hide the others."""
+
+MAX_LINE = 1000
+"""Characters of each."""
 
 _DAY_S = 86_400.0
 
@@ -33,12 +39,15 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
     if not sidecars:
         return "\n".join([*lines, "no sidecars"])
     lines += columns([_HEADER, *(_row(status) for status in sidecars)])
-    offered = sorted({offer.name for status in sidecars for offer in status.peer.offers})
+    offered = sorted({offer.name for one in sidecars if one.peer.role is Role.CLOUD for offer in one.peer.offers})
     for status in sidecars:
         details = [*_details(status), *_unmet(status, offered), *_untyped(status), *_unserved(status)]
         details += _revocations(status.revocations, of_own, now_wall)
         if details:
-            lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in details)]
+            shown = (shortened(line, MAX_LINE) for line in details[:MAX_LINES])
+            lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in shown)]
+        if len(details) > MAX_LINES:
+            lines.append(f"  and {len(details) - MAX_LINES} more: plr status {status.peer.name} --json")
     abridged = sum(status.abridged for status in sidecars)
     if abridged:
         lines += ["", f"mapping and paths of {abridged} that are in order are not shown: plr status NAME, or --all"]
@@ -57,7 +66,7 @@ def _row(status: SidecarStatus) -> tuple[str, ...]:
         f"{status.lease_left_s:.1f} s",
         status.peers.state.value,
         status.mapping.state.value if status.peer.role is Role.ROBOT else "-",
-        ",".join(services) or "-",
+        listed(services),
         status.software_version or "-",
     )
 

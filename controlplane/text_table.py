@@ -1,4 +1,4 @@
-"""Aligned columns for a terminal."""
+"""Aligned columns for a terminal. What one member says takes its own line, and no more of it than can be read."""
 
 from __future__ import annotations
 
@@ -7,11 +7,40 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+MAX_PADDED = 64
+"""Characters: a column is no wider for others, however long one cell is."""
+
+MAX_LISTED = 100
+"""Characters of a list in one cell."""
+
 
 def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """A line for each row, each column as wide as its widest cell."""
+    """A line for each row, each column as wide as its widest cell, up to MAX_PADDED."""
     if not rows:
         return
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    widths = [min(max(len(cell) for cell in column), MAX_PADDED) for column in zip(*rows, strict=True)]
     for row in rows:
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first of these in one cell, one at least, and how many more there are; "-" without any."""
+    if not names:
+        return "-"
+    shown = [shortened(names[0], MAX_LISTED)]
+    room = MAX_LISTED - len(shown[0])
+    for name in names[1:]:
+        room -= 1 + len(name)
+        if room < 0:
+            break
+        shown.append(name)
+    more = len(names) - len(shown)
+    return ",".join(shown) + (f" and {more} more" if more else "")
+
+
+def shortened(text: str, most: int) -> str:
+    """Cut in the middle what has more than `most` characters."""
+    if len(text) <= most:
+        return text
+    end = (most - 3) // 2
+    return f"{text[: most - 3 - end]}...{text[-end:]}"

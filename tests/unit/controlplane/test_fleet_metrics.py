@@ -232,6 +232,11 @@ def test_a_server_that_lost_a_service_is_told_of_and_one_that_goes_in_order_is_n
     (status,) = world.core.status(world.now)
     assert (status.withdrawn, status.unmet) == ((PLAN,), ("/named",))
     assert f"LOST {PLAN}" in render([status])
+    world.say(server, ServiceSet((offer(), offer("/named")), unmet=(PLAN,)))
+    samples = [
+        sample.labels for one in families(fleet_of(world)) for sample in one.samples if "_service_up" in sample.name
+    ]
+    assert len(samples) == 2, "one series each, whatever it says"
     world.say(server, ServiceSet((offer(), offer("/named"))))
     assert served(world, "a") == {PLAN: (1.0, 0.0), "/named": (1.0, 0.0)}
     world.say(server, ServiceSet((offer("/named"),)))

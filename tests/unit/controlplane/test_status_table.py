@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.status_table import render
+from controlplane.status_table import MAX_LINE, MAX_LINES, render
 from protos.model import (
     Assignment,
     HeldList,
@@ -116,3 +116,35 @@ def test_what_one_member_claims_of_revocation_lists_is_told_of_that_member_alone
     told = text.split("\n\n")
     assert told[1] == "honest:\n  revocation list 12, signed 0.0 days ago"
     assert told[2].startswith(f"evil:\n  claims revocation list {2**64 - 1}, which the control plane has not")
+
+
+@pytest.mark.audit("ops-12")
+def test_what_one_says_of_itself_takes_no_room_of_the_others() -> None:
+    offers = tuple(offer(f"/s{number:04}{'x' * 249}") for number in range(1024))
+    names = tuple(one.name for one in offers)
+    loud = Peer(NodeName("loud"), Role.CLOUD, SessionId(1), b"", 1, offers=offers)
+    quiet = Peer(NodeName("quiet"), Role.CLOUD, SessionId(2), b"", 1, offers=(offer(), offer("/other")))
+    text = render(
+        [
+            SidecarStatus(loud, True, 1.0, "1", refused_offers=names, withdrawn=names),
+            SidecarStatus(quiet, True, 1.0, "1"),
+        ]
+    )
+    rows = {line.split()[0]: line for line in text.splitlines() if line}
+    assert len(rows["quiet"]) < 150
+    assert rows["quiet"].split()[-2:] == [f"{PLAN},/other", "1"]
+    assert "and 1023 more" in rows["loud"]
+    assert max(map(len, text.splitlines())) < 2 + MAX_LINE + 1
+    assert len(text.splitlines()) < MAX_LINES + 10
+    assert text.splitlines()[-1] == "  and 769 more: plr status loud --json"
+
+
+@pytest.mark.audit("ops-12")
+def test_what_a_robot_says_that_it_offers_is_no_hint() -> None:
+    robot = Peer(NodeName("robot"), Role.ROBOT, SessionId(1), b"", 1, offers=(offer("/plan_paths"),))
+    other = Peer(NodeName("other"), Role.ROBOT, SessionId(2), b"", 1)
+    statuses = [
+        SidecarStatus(robot, True, 1.0, ""),
+        SidecarStatus(other, True, 1.0, "", unmet=(ServiceName("/plan_path"),)),
+    ]
+    assert "did you mean" not in render(statuses)
