@@ -12,6 +12,7 @@ from sidecar.core.rules import Rules
 from sidecar.core.shares import Shares
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.node_names import NodeNames
 from sidecar.ros.roll_call import POLL_S, RollCall
 from sidecar.ros.server_processes import ServerProcesses
 from sidecar.ros.service_runner import Execution, ServiceRunner
@@ -69,6 +70,7 @@ class CloudSide:
         self._several_servers: set[ServiceName] = set()
         self._processes = ServerProcesses(loop.domain_id, lambda: graph.participants(loop.node), loop.wake)
         self._roll_call = RollCall(loop.node)
+        self._names = NodeNames(loop.node, stats, limited_log)
         self._at_work: set[ServiceRunner] = set()
         """Runners whose server has something to answer, and is not known to live."""
         self._check_at = 0.0
@@ -197,7 +199,8 @@ class CloudSide:
 
     def look(self) -> Iterator[None]:
         """Compare the graph with the clients, in small steps; tell the data plane what is offered from now on."""
-        served = yield from graph.scan(self._loop.node)
+        self._names.begin_look()
+        served = yield from graph.scan(self._loop.node, self._names.name_of, self._is_in_rules, time.monotonic())
         self._stats.scans += 1
         now = time.monotonic()
         retry_types = now - self._types_retried_at >= TYPE_RETRY_S
@@ -218,16 +221,20 @@ class CloudSide:
             elif retry_types or name not in self._missing_types:
                 self._open_runner(name, type_name)
         yield
+        self._names.end_look()
         self._processes.forget_the_gone()
         self._roll_call.keep(graph.participants(self._loop.node))
         self._publish_state()
+
+    def _is_in_rules(self, service: ServiceName) -> bool:
+        return self._rules.find(service) is not None
 
     def _wanted(self, served: dict[ServiceName, graph.Served]) -> dict[ServiceName, str]:
         """Return name -> type of the services that applications serve here and a rule carries."""
         wanted: dict[ServiceName, str] = {}
         for name, service in served.items():
             types = service.applications()
-            if not types or self._rules.find(name) is None:
+            if not types or not self._is_in_rules(name):
                 continue
             runner = self._runners.get(name)
             # Two types under one name: the one in use stays, else the choice is at least the same every time.
@@ -270,6 +277,7 @@ class CloudSide:
                 self._stray,
                 self._unsent,
                 self._is_alive_since,
+                self._names.name_of,
             )
         except RosBridgeError as error:
             if name not in self._missing_types:
@@ -377,6 +385,8 @@ class CloudSide:
         dues = [due for runner in self._paced if (due := runner.window.next_due()) is not None]
         if self._at_work:
             dues.append(self._check_at)
+        if (names_at := self._names.next_due()) is not None:
+            dues.append(names_at)
         return min(dues, default=None)
 
     def on_timer(self, now: float) -> None:
@@ -388,6 +398,8 @@ class CloudSide:
                 self._notice_silence()
             self._check_at = now + (POLL_S if self._roll_call.under_way else CHECK_EVERY_S)
             self._paced |= self._at_work  # who was heard may get more than it answers
+        if self._names.turn(now):
+            self.look_is_due = True
         for runner in tuple(self._paced):
             due = runner.window.next_due()
             if due is None:
@@ -402,6 +414,7 @@ class CloudSide:
         self._data_plane.set_offers(())
         self._processes.close()
         self._roll_call.close()
+        self._names.close()
         for name in tuple(self._runners):
             runner = self._runners.pop(name)
             sent, unsent = runner.take_back()

@@ -9,6 +9,7 @@ The process id is its lowest 16 bits, little-endian, in the process's own namesp
 
 from __future__ import annotations
 
+ENDPOINT_BYTES = 16
 PARTICIPANT_BYTES = 12
 _PROCESS_BYTES = 8
 _FAST_DDS = b"\x01\x0f"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sidecar.core.events import RequestFailed, RequestId
     from sidecar.core.fallback import FallbackCall
     from sidecar.core.rules import ServiceRule
-    from sidecar.ros.graph import Served
+    from sidecar.ros.graph import NameOf, Served
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.ros_loop import RosLoop
     from sidecar.ros.server_processes import ServerProcesses
@@ -104,12 +104,14 @@ class FallbackCaller:
         stats: BridgeStats,
         limited_log: LimitedLog,
         processes: ServerProcesses,
+        name_of: NameOf,
         on_answer: Callable[[FallbackAnswer, float], None],
         on_failure: Callable[[RequestFailed, float], None],
     ) -> None:
         """`on_answer` gives an answer to the application, `on_failure` ends a request that gets none."""
         self._loop = loop
         self._processes = processes
+        self._name_of = name_of
         self._stats = stats
         self._limited = limited_log
         self._on_answer = on_answer
@@ -129,6 +131,11 @@ class FallbackCaller:
     def configured(self) -> bool:
         """Whether any service has a fallback."""
         return bool(self._policy.services)
+
+    @property
+    def wanted(self) -> frozenset[ServiceName]:
+        """The services that have a fallback, and those that are one."""
+        return frozenset(self._policy.services) | frozenset(self._policy.services.values())
 
     @property
     def settling(self) -> bool:
@@ -264,7 +271,7 @@ class FallbackCaller:
 
     def _open(self, service: ServiceName, name: ServiceName, type_name: str, now: float) -> None:
         try:
-            server = LocalServer(self._loop.node, name, load_service_type(type_name))
+            server = LocalServer(self._loop.node, name, load_service_type(type_name), self._name_of)
         except RosBridgeError as error:
             self._refused[service] = type_name
             self._complain(service, str(error), now)

@@ -1,12 +1,12 @@
 """Who serves what in the local ROS graph.
 
-rmw says that the graph has changed, not what of it; `looks.py` says when it is looked at.
+rmw says that the graph has changed, not what of it; `looks.py` says when it is looked at. An endpoint whose node rmw
+does not know may have a name all the same (`unknown_nodes.py`); without one it is no application's server.
 """
 
 from __future__ import annotations
 
 import re
-from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,10 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from protos.model import ServiceName
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Mapping
+    from collections.abc import Callable, Generator, Mapping
+
+    NameOf = Callable[[bytes, float], str | None]
+    """Of an endpoint that rmw has no name for: its node's full name now, if that is known."""
 
 SIDECAR_NODE_PREFIX = "_plr_sidecar_"
 """The leading underscore hides the node from `ros2 node list`."""
@@ -50,14 +53,15 @@ class Served:
         return frozenset().union(*self.by_type.values())
 
 
-def scan(node: Any) -> Generator[None, None, dict[ServiceName, Served]]:
-    """Return every service of the graph whose node is known, node after node."""
+def scan(
+    node: Any, name_of: NameOf, wanted: Callable[[ServiceName], bool], now: float
+) -> Generator[None, None, dict[ServiceName, Served]]:
+    """Return the services of the graph whose node is known, node after node, and all those that are `wanted`."""
     found: dict[ServiceName, dict[str, set[str]]] = {}
-    names = Counter(node.get_node_names_and_namespaces())
-    for name, namespace in names:
+    for name, namespace in frozenset(node.get_node_names_and_namespaces()):
         if name == _UNKNOWN_NODE:
             continue  # its endpoints are discovered before its name, which is a change of its own
-        full_name = f"{namespace.rstrip('/')}/{name}"
+        full_name = _full_name(namespace, name)
         try:
             services = node.get_service_names_and_types_by_node(name, namespace)
         except (_rclpy.NodeNameNonExistentError, _rclpy.RCLError):
@@ -67,27 +71,40 @@ def scan(node: Any) -> Generator[None, None, dict[ServiceName, Served]]:
             for kind in types:
                 by_type.setdefault(kind, set()).add(full_name)
         yield
-    if any(count > 1 for node_name, count in names.items() if node_name[0] != _UNKNOWN_NODE):
-        # Of several nodes of one name, as of a server that was started twice, rmw shows the services of one only.
-        for service in [s for s, _ in node.get_service_names_and_types() if s not in found]:
-            for info in _reply_writers(node, service):
-                if info["node_name"] != _UNKNOWN_NODE:
-                    full_name = f"{info['node_namespace'].rstrip('/')}/{info['node_name']}"
-                    by_type = found.setdefault(ServiceName(service), {})
-                    by_type.setdefault(_service_type(info["topic_type"]), set()).add(full_name)
-            yield
+    # Of several nodes of one name, as of a server that was started twice, rmw shows the services of one only; and none
+    # of a process whose nodes it does not know, perhaps beside a sidecar.
+    for service in [ServiceName(name) for name, _ in node.get_service_names_and_types()]:
+        if not wanted(service) or any(not is_sidecar(n) for nodes in found.get(service, {}).values() for n in nodes):
+            continue
+        for info in _reply_writers(node, service):
+            known = _node_of(info, name_of, now)
+            if known is not None:
+                by_type = found.setdefault(service, {})
+                by_type.setdefault(_service_type(info["topic_type"]), set()).add(known)
+        yield
     return {
         service: Served({kind: frozenset(nodes) for kind, nodes in by_type.items()})
         for service, by_type in found.items()
     }
 
 
-def server_endpoints(node: Any, service: ServiceName) -> dict[bytes, bool]:
-    """Return the DDS ids of the endpoints that answer for `service`, and whether each one's node is known.
+def server_endpoints(node: Any, service: ServiceName, name_of: NameOf, now: float) -> dict[bytes, bool]:
+    """Return the DDS ids of the endpoints that answer for `service`, and whether each is known as an application's.
 
     Nothing where rmw is not DDS.
     """
-    return {bytes(info["endpoint_gid"]): info["node_name"] != _UNKNOWN_NODE for info in _reply_writers(node, service)}
+    known = {bytes(info["endpoint_gid"]): _node_of(info, name_of, now) for info in _reply_writers(node, service)}
+    return {endpoint: name is not None and not is_sidecar(name) for endpoint, name in known.items()}
+
+
+def _node_of(info: dict[str, Any], name_of: NameOf, now: float) -> str | None:
+    if info["node_name"] == _UNKNOWN_NODE:
+        return name_of(bytes(info["endpoint_gid"]), now)
+    return _full_name(info["node_namespace"], info["node_name"])
+
+
+def _full_name(namespace: str, name: str) -> str:
+    return f"{namespace.rstrip('/')}/{name}"
 
 
 def _reply_writers(node: Any, service: str) -> list[dict[str, Any]]:

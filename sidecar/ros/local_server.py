@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from protos.model import ServiceName
+    from sidecar.ros.graph import NameOf
     from sidecar.ros.types import ServiceType
 
 TAKEN_AT_ONCE = 32
@@ -26,11 +27,12 @@ up to 2 s to give it what it missed (measured with servers killed and started ag
 class LocalServer:
     """A client of the service `name`."""
 
-    def __init__(self, node: Any, name: ServiceName, service_type: ServiceType) -> None:
+    def __init__(self, node: Any, name: ServiceName, service_type: ServiceType, name_of: NameOf) -> None:
         """Raises RosBridgeError: rmw refuses."""
         self.name = name
         self.type = service_type
         self._node = node
+        self._name_of = name_of
         try:
             self._client = node.create_client(service_type.service, name, qos_profile=service_qos(MOST_AT_ONCE))
         # rclpy validates names with exceptions of several unrelated classes.
@@ -71,7 +73,7 @@ class LocalServer:
 
     def look(self, is_dead: Callable[[bytes], bool], now: float) -> bool:
         """Look at the graph; returns whether all that were there at the last look are gone, and will answer nothing."""
-        known = graph.server_endpoints(self._node, self.name)
+        known = graph.server_endpoints(self._node, self.name, self._name_of, now)
         self.endpoints = frozenset(known)
         self._looked = True
         alive = frozenset(endpoint for endpoint, is_known in known.items() if is_known and not is_dead(endpoint))

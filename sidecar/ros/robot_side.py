@@ -19,6 +19,7 @@ from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.fallback_caller import FallbackCaller
 from sidecar.ros.new_clients import GIVE_UP_S, NewClients
+from sidecar.ros.node_names import NodeNames
 from sidecar.ros.notices import NoticePublisher
 from sidecar.ros.proxies import Proxies
 from sidecar.ros.rcl import NewClientError
@@ -83,6 +84,7 @@ class RobotSide:
         self._numbering = RequestNumbering(data_plane.session)
         self._processes = ServerProcesses(loop.domain_id, lambda: graph.participants(loop.node), loop.wake)
         """Of the fallbacks."""
+        self._names = NodeNames(loop.node, stats, limited_log)
         self._pacer: ReplyPacer[_Answer] = ReplyPacer()
         self._new_clients: NewClients[_Answer] = NewClients()
         self._fallbacks = FallbackCaller(
@@ -91,6 +93,7 @@ class RobotSide:
             stats=stats,
             limited_log=limited_log,
             processes=self._processes,
+            name_of=self._names.name_of,
             on_answer=self._answer_from_fallback,
             on_failure=self._tell_failure,
         )
@@ -308,10 +311,13 @@ class RobotSide:
         """Compare the graph with what is offered and with the fallbacks, in small steps."""
         if not self._proxies.offers and not self._fallbacks.configured:
             return
-        served = yield from graph.scan(self._loop.node)
+        wanted = frozenset(self._proxies.offers) | self._fallbacks.wanted
+        self._names.begin_look()
+        served = yield from graph.scan(self._loop.node, self._names.name_of, wanted.__contains__, time.monotonic())
         self._stats.scans += 1
         now = time.monotonic()
         self._fallbacks.look(served, self._proxies.offers, now)
+        self._names.end_look()
         self._processes.forget_the_gone()
         yield
         yield from self._proxies.look(served, self._fallbacks.types(), now)
@@ -332,7 +338,12 @@ class RobotSide:
 
     def next_due(self) -> float | None:
         """Return when `on_timer` has something to do, or None."""
-        dues = (self._pacer.next_due(), self._new_clients.next_due(), self._fallbacks.next_due())
+        dues = (
+            self._pacer.next_due(),
+            self._new_clients.next_due(),
+            self._fallbacks.next_due(),
+            self._names.next_due(),
+        )
         return min((due for due in dues if due is not None), default=None)
 
     def on_timer(self, now: float) -> None:
@@ -344,10 +355,13 @@ class RobotSide:
             for answer in self._pacer.take_due(now):
                 self._send(answer, now)
         self._try_new_client(now)
+        if self._names.turn(now):
+            self.look_is_due = True
 
     def close(self) -> None:
         """Withdraw every service."""
         self._fallbacks.close()
         self._processes.close()
+        self._names.close()
         self._proxies.close()
         self._publish_carried()

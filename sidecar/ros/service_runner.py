@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
     from sidecar.core.events import ExecutionId
     from sidecar.core.priority import Priority
+    from sidecar.ros.graph import NameOf
     from sidecar.ros.rcl import Message
     from sidecar.ros.types import ServiceType
 
@@ -47,6 +48,7 @@ class ServiceRunner:
         on_stray_answer: Callable[[ServiceRunner], None],
         on_unsent: Callable[[ServiceRunner, Execution, str], None],
         alive_since: Callable[[ServiceRunner, float], bool],
+        name_of: NameOf,
     ) -> None:
         """`alive_since`: whether the server has shown a sign of life since then, other than an answer."""
         self.name = name
@@ -58,7 +60,7 @@ class ServiceRunner:
         self._at_server: dict[int, Execution] = {}
         """By rmw's sequence number."""
         self.window: RequestWindow[Execution] = RequestWindow(alive_since=self._alive_since)
-        self._server = LocalServer(node, name, service_type)
+        self._server = LocalServer(node, name, service_type, name_of)
         self._heard_at = 0.0
         """When the server answered last, or got something to do while it had nothing."""
 

@@ -28,6 +28,11 @@ POLL_S = 0.01
 RULES = (ServiceRule("/*", deadline_s=0.1, lifetime_s=5.0),)
 
 
+def no_name(_endpoint: bytes, _now: float) -> str | None:
+    """As if only rmw knew names of nodes."""
+    return None
+
+
 def wait_until(happened: Callable[[], object], what: str, timeout_s: float = WAIT_S) -> None:
     """Poll until `happened()` is true."""
     end = time.monotonic() + timeout_s
@@ -47,6 +52,8 @@ class Mesh:
         self.robot = self._bridge("robot-1", Role.ROBOT, RULES)
         self.cloud = self._bridge("cloud-1", Role.CLOUD, RULES)
         self.link = Loopback(self.robot, self.cloud, self.faults)
+        self.environment: dict[str, str] = {}
+        """Added to that of the programs started from now on."""
         self._programs: list[Program] = []
         self._count = 0
 
@@ -86,7 +93,7 @@ class Mesh:
     def run(self, domain: int, *arguments: str, module: str = "tests.ros.app") -> Program:
         """Start a program of the tests with these arguments."""
         self._count += 1
-        program = Program(f"app{self._count}", ["-m", module, *arguments], domain, self.folder)
+        program = Program(f"app{self._count}", ["-m", module, *arguments], domain, self.folder, self.environment)
         self._programs.append(program)
         return program
 

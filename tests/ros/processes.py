@@ -9,7 +9,7 @@ import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -20,7 +20,15 @@ END_S = 30.0
 class Program:
     """A running `python ARGUMENTS`. Its output goes to `<name>.out` in `folder`."""
 
-    def __init__(self, name: str, arguments: Sequence[str | Path], domain: int, folder: Path) -> None:
+    def __init__(
+        self,
+        name: str,
+        arguments: Sequence[str | Path],
+        domain: int,
+        folder: Path,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        """`environment`: what is added to this process's."""
         self.output_path = folder / f"{name}.out"
         with self.output_path.open("w") as output:
             self._process = subprocess.Popen(
@@ -31,6 +39,7 @@ class Program:
                     "ROS_DOMAIN_ID": str(domain),
                     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
                     "ROS_LOG_DIR": str(folder / "ros-logs"),
+                    **(environment or {}),
                 },
                 stdin=subprocess.DEVNULL,
                 stdout=output,

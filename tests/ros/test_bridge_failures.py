@@ -15,7 +15,7 @@ from protos.model import ServiceName
 from sidecar.core.events import AbandonExecution, CancelExecution, RejectReason
 from sidecar.ros import graph
 from tests.ros.loopback import ROBOT
-from tests.ros.mesh import wait_until
+from tests.ros.mesh import no_name, wait_until
 from tests.ros.notice_listener import NoticeListener
 
 if TYPE_CHECKING:
@@ -138,7 +138,9 @@ def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.Mo
         old.stop(signal.SIGTERM)
         mesh.serve("--plan", "/plan")
         node = mesh.cloud._loop.node  # type: ignore[union-attr]  # a started bridge has one
-        wait_until(lambda: list(graph.server_endpoints(node, PLAN).values()) == [True], "only the new one")
+        wait_until(
+            lambda: list(graph.server_endpoints(node, PLAN, no_name, 0.0).values()) == [True], "only the new one"
+        )
     wait_until(lambda: len(mesh.link.refusals) == 4, "refusals")
     # What still stood in the window may have been told before: on a busy machine the new one takes seconds to come up.
     told = set(mesh.link.refusals)

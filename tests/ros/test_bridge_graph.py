@@ -15,7 +15,7 @@ from sidecar.core.rules import ServiceRule
 from sidecar.ros import graph
 from sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Loopback
-from tests.ros.mesh import RULES, wait_until
+from tests.ros.mesh import RULES, no_name, wait_until
 
 if TYPE_CHECKING:
     from tests.ros.mesh import Mesh
@@ -33,7 +33,7 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def scanned(node: Any) -> dict[ServiceName, graph.Served]:
-    steps = graph.scan(node)
+    steps = graph.scan(node, no_name, lambda _service: True, 0.0)
     while True:
         try:
             next(steps)

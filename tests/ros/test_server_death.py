@@ -15,7 +15,7 @@ from protos.model import ServiceName
 from sidecar.core.events import RejectReason
 from sidecar.ros import dds_id, graph, process_finder, server_processes
 from sidecar.ros.process_finder import has_ended, open_process
-from tests.ros.mesh import wait_until
+from tests.ros.mesh import no_name, wait_until
 
 if TYPE_CHECKING:
     from sidecar.ros.ros_loop import RosLoop
@@ -35,7 +35,7 @@ def loop_of(mesh: Mesh) -> RosLoop:
 
 
 def endpoints(mesh: Mesh) -> set[bytes]:
-    return set(graph.server_endpoints(loop_of(mesh).node, PLAN))
+    return set(graph.server_endpoints(loop_of(mesh).node, PLAN, no_name, 0.0))
 
 
 def blind(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +107,7 @@ def test_the_end_of_another_process_with_the_same_bits_is_no_death(mesh: Mesh, m
     mesh.start()
     wrong = mesh.serve("--negate", "/negate", "--node", "wrong")
     mesh.wait_carried("/negate")
-    (wrong_id,) = graph.server_endpoints(loop_of(mesh).node, ServiceName("/negate"))
+    (wrong_id,) = graph.server_endpoints(loop_of(mesh).node, ServiceName("/negate"), no_name, 0.0)
 
     monkeypatch.setattr(server_processes, "pid_bits", lambda _endpoint: dds_id.pid_bits(wrong_id))
     monkeypatch.setattr(

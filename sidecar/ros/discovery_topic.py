@@ -1,0 +1,77 @@
+"""Reading what the ROS processes of the domain say of their nodes (rmw's discovery topic).
+
+Each process keeps what it said last for those that come later (`transient_local`). So a new reader of that topic makes
+each process that lives send it again: DDS's own threads do so, within tens of milliseconds, also while the application
+is busy. A process that was killed, or stands still, sends nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from typing import TYPE_CHECKING, Any
+
+from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.graph import PARTICIPANTS_TOPIC
+from sidecar.ros.rcl import LatchedTopic, MessageType
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+MAX_HEARD = 1024
+"""Participants that one call hears; the topic's depth."""
+TAKEN_AT_ONCE = 64
+BYTES_AT_ONCE = 1 << 16
+"""Some milliseconds, if it is many small nodes; the last message taken may be beyond that."""
+
+log = logging.getLogger(__name__)
+
+
+class DiscoveryTopic:
+    """A reader for one call at a time. All methods belong to the ROS thread."""
+
+    def __init__(self, node: Any) -> None:
+        self._node = node
+        self._type: MessageType | None = None
+        self._topic: LatchedTopic | None = None
+        self.usable = True
+        """False where rmw has no such topic."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a call is under way."""
+        return self._topic is not None
+
+    def open(self) -> bool:
+        """Call all processes; False if it can not be."""
+        if not self.usable:
+            return False
+        try:
+            if self._type is None:
+                # Without it no rmw of DDS works, but that of another kind does.
+                module = importlib.import_module("rmw_dds_common.msg")
+                self._type = MessageType(module.ParticipantEntitiesInfo)
+            self._topic = LatchedTopic(self._node.handle.pointer, PARTICIPANTS_TOPIC, self._type, MAX_HEARD)
+        except (ImportError, AttributeError, RosBridgeError) as error:
+            self.usable = False
+            log.error(
+                "the ROS processes of this domain can not be asked whether they live, nor for their nodes: %s", error
+            )
+            return False
+        return True
+
+    def take(self) -> Iterator[bytes]:
+        """Yield the answers that have arrived, some of many."""
+        taken_bytes = 0
+        for _ in range(TAKEN_AT_ONCE):
+            info = None if self._topic is None or taken_bytes >= BYTES_AT_ONCE else self._topic.take()
+            if info is None:
+                return
+            taken_bytes += len(info)
+            yield info
+
+    def close(self) -> None:
+        """End the call."""
+        if self._topic is not None:
+            self._topic.close()
+            self._topic = None

@@ -1,0 +1,98 @@
+"""The names of nodes that rmw does not know, asked for at their own processes."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from sidecar.ros.discovery_topic import DiscoveryTopic
+from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.participant_info import speaker
+from sidecar.ros.unknown_nodes import UnknownNodes
+
+if TYPE_CHECKING:
+    from sidecar.ros.log_limit import LimitedLog
+    from sidecar.ros.stats import BridgeStats
+
+CALL_S = 0.7
+"""How long a call waits for those that it is about."""
+POLL_S = 0.02
+NAMES_LOGGED = 8
+
+log = logging.getLogger(__name__)
+
+
+class NodeNames:
+    """One call at a time. All methods belong to the ROS thread."""
+
+    def __init__(self, node: Any, stats: BridgeStats, limited_log: LimitedLog) -> None:
+        self._unknown = UnknownNodes()
+        self._topic = DiscoveryTopic(node)
+        self._stats = stats
+        self._limited = limited_log
+        self._asked: set[bytes] = set()
+        """Participants of the present call that have not answered."""
+        self._learned: set[str] = set()
+        """Names that became known by it."""
+        self._hears_at = 0.0
+        self._ends_at = 0.0
+
+    def begin_look(self) -> None:
+        """Another look at the graph begins."""
+        self._unknown.begin_look()
+
+    def name_of(self, endpoint: bytes, now: float) -> str | None:
+        """Return the full name of its node, or None, and it is asked for soon; for each that rmw has no name for."""
+        return self._unknown.name_of(endpoint, now)
+
+    def end_look(self) -> None:
+        """Forget the endpoints that the look did not meet."""
+        if dropped := self._unknown.end_look():
+            self._stats.dropped["too_many_unknown_nodes"] += dropped
+
+    def next_due(self) -> float | None:
+        """Return when `turn` has something to do, or None."""
+        return self._hears_at if self._topic.is_open else self._unknown.next_due()
+
+    def turn(self, now: float) -> bool:
+        """Ask, if it is time, or hear who answers; True when a name became known."""
+        due = self.next_due()
+        if due is None or now < due:
+            return False
+        if not self._topic.is_open:
+            self._asked = set(self._unknown.take_due(now))
+            if self._asked and self._topic.open():
+                self._hears_at, self._ends_at = now + POLL_S, now + CALL_S
+            return False
+        learned = self._hear(now)
+        self._hears_at = now + POLL_S
+        if not self._asked or now >= self._ends_at:
+            self._topic.close()
+            self._tell()
+        return learned
+
+    def close(self) -> None:
+        """Ask nobody any more."""
+        self._topic.close()
+
+    def _hear(self, now: float) -> bool:
+        learned: set[str] = set()
+        for info in self._topic.take():
+            self._asked.discard(speaker(info))
+            try:
+                learned |= self._unknown.learn(info)
+            except RosBridgeError as error:
+                self._stats.dropped["bad_discovery_message"] += 1
+                self._limited.log(logging.WARNING, ("discovery", ""), now, "a ROS process of this domain: %s", error)
+        self._learned |= learned
+        return bool(learned)
+
+    def _tell(self) -> None:
+        if not self._learned:
+            return
+        names = " ".join(sorted(self._learned)[:NAMES_LOGGED])
+        if len(self._learned) > NAMES_LOGGED:
+            names += f" and {len(self._learned) - NAMES_LOGGED} more"
+        why = "their process stood still for longer than DDS's lease, or this one did"
+        log.info("found nodes again whose names ROS had lost (%s): %s", why, names)
+        self._learned.clear()

@@ -1,0 +1,96 @@
+"""Reads what a ROS process says of its nodes: rmw_dds_common/msg/ParticipantEntitiesInfo, as bytes in CDR.
+
+    encapsulation       4 bytes
+    gid                 16 bytes, of the participant
+    nodes               length, and for each:
+        namespace, name     strings: length with the NUL, characters
+        readers, writers    length and 16 bytes for each endpoint
+
+Lengths are 32 bits, aligned to 4 bytes. Any process of the ROS domain can send this: nothing is believed that the bytes
+do not bear out, and a message takes no more than MAX_INFO_BYTES.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import TYPE_CHECKING
+
+from sidecar.ros.dds_id import ENDPOINT_BYTES, PARTICIPANT_BYTES
+from sidecar.ros.errors import RosBridgeError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+MAX_INFO_BYTES = 1 << 18
+"""A process with a hundred nodes of 20 endpoints each says 35 kB. So many bytes are read in some milliseconds."""
+_ENCAPSULATION_BYTES = 4
+_LITTLE_ENDIAN, _BIG_ENDIAN = b"\0\1", b"\0\0"
+_NAMESPACE = re.compile(rb"/|(?:/[A-Za-z0-9_]+)+")
+_NAME = re.compile(rb"[A-Za-z0-9_]+")
+_MAX_NAME_BYTES = 256
+"""With the NUL: the message's own limit."""
+
+
+def speaker(info: bytes) -> bytes:
+    """Return the id of the participant that the message is about; shorter if it is cut off."""
+    return info[_ENCAPSULATION_BYTES : _ENCAPSULATION_BYTES + PARTICIPANT_BYTES]
+
+
+def nodes_of(info: bytes) -> Iterator[tuple[str, frozenset[bytes]]]:
+    """Yield each node's full name and the DDS ids of its writers, among which are those of its services' answers.
+
+    Raises RosBridgeError where the bytes are no such message, perhaps after the first nodes.
+    """
+    if len(info) > MAX_INFO_BYTES:
+        raise RosBridgeError(
+            f"{len(info)} bytes are more than the {MAX_INFO_BYTES} that a process may say of its nodes"
+        )
+    reader = _Reader(info)
+    for _ in range(reader.length()):
+        namespace = reader.name(_NAMESPACE)
+        name = reader.name(_NAME)
+        reader.endpoints()
+        writers = reader.endpoints()
+        ids = (writers[at : at + ENDPOINT_BYTES] for at in range(0, len(writers), ENDPOINT_BYTES))
+        yield f"{namespace.rstrip('/')}/{name}", frozenset(ids)
+
+
+class _Reader:
+    """Goes over the bytes, from behind the participant's id. All methods raise RosBridgeError."""
+
+    def __init__(self, info: bytes) -> None:
+        representation = info[:2]
+        if representation not in (_LITTLE_ENDIAN, _BIG_ENDIAN):
+            raise RosBridgeError(
+                f"what a process says of its nodes is in the unknown representation {representation.hex()}"
+            )
+        self._length = struct.Struct("<I" if representation == _LITTLE_ENDIAN else ">I")
+        self._info = info
+        self._at = _ENCAPSULATION_BYTES + ENDPOINT_BYTES
+
+    def length(self) -> int:
+        begin = -(-self._at // 4) * 4
+        self._at = begin + 4
+        if self._at > len(self._info):
+            raise RosBridgeError("what a process says of its nodes is cut off")
+        (found,) = self._length.unpack_from(self._info, begin)
+        return int(found)
+
+    def endpoints(self) -> bytes:
+        return self._take(self.length() * ENDPOINT_BYTES)
+
+    def name(self, form: re.Pattern[bytes]) -> str:
+        size = self.length()
+        if not 0 < size <= _MAX_NAME_BYTES:
+            raise RosBridgeError(f"a node's name or namespace of {size} bytes")
+        text = self._take(size)
+        if text[-1] or not form.fullmatch(text[:-1]):
+            raise RosBridgeError(f"{text!r} is no node's name or namespace")
+        return text[:-1].decode("ascii")
+
+    def _take(self, size: int) -> bytes:
+        begin, self._at = self._at, self._at + size
+        if self._at > len(self._info):
+            raise RosBridgeError("what a process says of its nodes is cut off")
+        return self._info[begin : self._at]
