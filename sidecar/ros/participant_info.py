@@ -7,7 +7,7 @@
         readers, writers    length and 16 bytes for each endpoint
 
 Lengths are 32 bits, aligned to 4 bytes. Any process of the ROS domain can send this: nothing is believed that the bytes
-do not bear out, and a message takes no more than MAX_INFO_BYTES.
+do not bear out, and a message has no more than MAX_INFO_BYTES and MAX_NODES.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 MAX_INFO_BYTES = 1 << 18
 """A process with a hundred nodes of 20 endpoints each says 35 kB. So many bytes are read in some milliseconds."""
+MAX_NODES = 512
+"""Of one process."""
 _ENCAPSULATION_BYTES = 4
 _LITTLE_ENDIAN, _BIG_ENDIAN = b"\0\1", b"\0\0"
 _NAMESPACE = re.compile(rb"/|(?:/[A-Za-z0-9_]+)+")
@@ -47,7 +49,10 @@ def nodes_of(info: bytes) -> Iterator[tuple[str, frozenset[bytes]]]:
             f"{len(info)} bytes are more than the {MAX_INFO_BYTES} that a process may say of its nodes"
         )
     reader = _Reader(info)
-    for _ in range(reader.length()):
+    nodes = reader.length()
+    if nodes > MAX_NODES:
+        raise RosBridgeError(f"a process with {nodes} nodes, more than {MAX_NODES}")
+    for _ in range(nodes):
         namespace = reader.name(_NAMESPACE)
         name = reader.name(_NAME)
         reader.endpoints()

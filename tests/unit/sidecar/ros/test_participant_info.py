@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.participant_info import MAX_INFO_BYTES, nodes_of, speaker
+from sidecar.ros.participant_info import MAX_INFO_BYTES, MAX_NODES, nodes_of, speaker
 from tests.unit.sidecar.ros.participant_messages import Node, endpoint, participant_info
 
 READERS = [endpoint(7, 1), endpoint(7, 2)]
@@ -65,11 +65,15 @@ def test_every_message_that_is_cut_off_is_refused() -> None:
 def test_lengths_that_the_bytes_do_not_bear_out_take_no_time() -> None:
     info = bytearray(participant_info(7, []))
     info[-4:] = b"\xff\xff\xff\xff"
+    with pytest.raises(RosBridgeError, match="4294967295 nodes"):
+        list(nodes_of(bytes(info)))
+    info[-4:] = MAX_NODES.to_bytes(4, "little")
     with pytest.raises(RosBridgeError, match="cut off"):
         list(nodes_of(bytes(info)))
-    # As many empty nodes as fit: each takes bytes.
-    with pytest.raises(RosBridgeError, match="0 bytes"):
-        list(nodes_of(bytes(info) + bytes(1000)))
+    endless = bytearray(participant_info(7, [("/", "planner", [], [])]))
+    endless[-4:] = b"\xff\xff\xff\xff"
+    with pytest.raises(RosBridgeError, match="cut off"):
+        list(nodes_of(bytes(endless)))
     with pytest.raises(RosBridgeError, match="are more than"):
         list(nodes_of(bytes(info) + bytes(MAX_INFO_BYTES)))
 
