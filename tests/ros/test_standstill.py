@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import logging
 import signal
+import time
 from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.ros.mesh import wait_until
+from tests.ros.mesh import POLL_S, wait_until
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from sidecar.ros.bridge import RosBridge
     from tests.ros.mesh import Mesh
+    from tests.ros.processes import Program
 
 pytestmark = pytest.mark.ros
 
+TRIES = 4
+SEEN_AGAIN_S = 5.0
+"""As a rule it takes 0.2 s."""
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
 LEASE = """<?xml version="1.0" encoding="UTF-8"?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
@@ -39,8 +46,7 @@ def short_lease(mesh: Mesh) -> None:
     profile = mesh.folder / "short_lease.xml"
     profile.write_text(LEASE)
     mesh.environment["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)
-    # As sidecars talk to them. With shared memory a process that was stopped does not always come back in Fast DDS.
-    mesh.environment["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
+    mesh.environment["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"  # as sidecars talk to them
 
 
 def nodes(bridge: RosBridge, service: str) -> dict[bytes, str]:
@@ -55,46 +61,69 @@ def wait_known(bridge: RosBridge, service: str, node: str) -> None:
     wait_until(lambda: list(nodes(bridge, service).values()) == [node], f"the node {node}")
 
 
-@pytest.mark.usefixtures("short_lease")
-def test_a_server_that_stood_still_is_offered_again_and_a_sidecar_is_not(
-    mesh: Mesh, caplog: pytest.LogCaptureFixture
+def come_back(
+    bridge: RosBridge, start: Callable[[], Program], service: str, node: str, while_gone: Callable[[], object] = bool
 ) -> None:
-    """What rmw does not know the node of may be either; a sidecar's proxy must not be offered on."""
-    caplog.set_level(logging.INFO, "sidecar")
-    mesh.start()
-    sidecar = mesh.run(mesh.cloud_domain, "/elsewhere", "std_srvs/srv/Trigger", module="tests.ros.proxy_host")
-    server = mesh.serve("--plan", "/plan")
-    mesh.wait_carried("/plan")
-    wait_known(mesh.cloud, "/plan", "test_server")
-    wait_known(mesh.cloud, "/elsewhere", "_plr_sidecar_other_robot")
-    for program in (server, sidecar):
+    """Start a program that serves it, stop it until its lease is over, let it go on, and wait until rmw sees it again.
+
+    Fast DDS loses one in ten or so for good (also of plain servers, and with its lease of 20 s): those that had
+    started a second before. Such a one shows nothing, and another one is started.
+    """
+    for _ in range(TRIES):
+        program = start()
+        wait_known(bridge, service, node)
         program.send(signal.SIGSTOP)
-    wait_until(lambda: not nodes(mesh.cloud, "/plan") and not nodes(mesh.cloud, "/elsewhere"), "the leases' ends")
-    mesh.wait_carried()
-    for program in (server, sidecar):
+        wait_until(lambda: not nodes(bridge, service), "the end of the lease")
+        while_gone()
         program.send(signal.SIGCONT)
+        end = time.monotonic() + SEEN_AGAIN_S
+        while time.monotonic() < end:
+            if nodes(bridge, service):
+                return
+            time.sleep(POLL_S)
+        program.stop(signal.SIGKILL)
+    pytest.fail("Fast DDS finds none of them again")
+
+
+@pytest.mark.usefixtures("short_lease")
+def test_a_server_that_stood_still_is_offered_again(mesh: Mesh) -> None:
+    mesh.start()
+    come_back(mesh.cloud, lambda: mesh.serve("--plan", "/plan"), "/plan", "test_server", mesh.wait_carried)
     mesh.wait_carried("/plan")
+    assert mesh.result(mesh.call("/plan", "--count", "5"))["answered"] == 5
+    wait_known(mesh.cloud, "/plan", UNKNOWN)
+
+
+@pytest.mark.usefixtures("short_lease")
+def test_a_sidecar_that_stood_still_is_no_application(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
+    """Its proxy is not offered on, neither while nothing is known of it nor after."""
+    caplog.set_level(logging.INFO, "sidecar")
+    mesh.cloud.start(mesh.link.cloud)
+
+    def start() -> Program:
+        return mesh.run(mesh.cloud_domain, "/elsewhere", "std_srvs/srv/Trigger", module="tests.ros.proxy_host")
+
+    come_back(mesh.cloud, start, "/elsewhere", "_plr_sidecar_other_robot")
     wait_until(lambda: "/_plr_sidecar_other_robot" in caplog.text, "the sidecar's name")
     # The name is there in time for the next look.
     scans = mesh.cloud.stats.scans
     wait_until(lambda: mesh.cloud.stats.scans > scans, "another look")
-    assert mesh.result(mesh.call("/plan", "--count", "5"))["answered"] == 5
-    wait_known(mesh.cloud, "/plan", UNKNOWN)
     wait_known(mesh.cloud, "/elsewhere", UNKNOWN)
-    offered = [record.getMessage() for record in caplog.records if "is offered to robots" in record.msg]
-    assert offered == ["service /plan (nav_msgs/srv/GetPlan) is offered to robots"] * 2
+    assert not [record for record in caplog.records if "is offered to robots" in record.msg]
 
 
 @pytest.mark.usefixtures("short_lease")
 def test_a_local_server_that_stood_still_is_left_alone_again(mesh: Mesh) -> None:
     mesh.start()
-    own = mesh.serve("--plan", "/plan", "--node", "own_planner", domain=mesh.robot_domain)
     mesh.serve("--plan", "/plan", "--negate", "/negate")
-    mesh.wait_carried("/negate")
-    wait_known(mesh.robot, "/plan", "own_planner")
-    own.send(signal.SIGSTOP)
-    mesh.wait_carried("/negate", "/plan")
-    own.send(signal.SIGCONT)
+    mesh.wait_carried("/plan", "/negate")
+    own = "own_planner"
+    servers = ("--plan", "/own", "--plan", "/plan", "--node", own)
+
+    def start() -> Program:
+        return mesh.serve(*servers, domain=mesh.robot_domain)
+
+    come_back(mesh.robot, start, "/own", own, lambda: mesh.wait_carried("/negate", "/plan"))
     mesh.wait_carried("/negate")
     assert mesh.robot.stats.left_alone == {"/plan": ("/own_planner",)}
-    wait_known(mesh.robot, "/plan", UNKNOWN)
+    wait_known(mesh.robot, "/own", UNKNOWN)
