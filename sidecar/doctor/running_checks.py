@@ -290,11 +290,14 @@ def _by(ones: Sequence[dict[str, Any]], key: Callable[[dict[str, Any]], str]) ->
 def services(state: State) -> Iterator[Finding]:
     """Judge what is carried."""
     told = state.get("services") or {}
-    robot = (state.get("node") or {}).get("role") == "robot"
-    who = "a server that this robot reaches" if robot else "a node of this host's ROS domain"
+    node = state.get("node") or {}
+    robot = node.get("role") == "robot"
+    if robot:
+        who, remedy = "a server that this robot reaches", "see path above, then compare the names: plr status"
+    else:
+        who, remedy = _domain(node)
     for name in told.get("unmet") or ():
-        do = "see path above, then compare the names: plr status"
-        yield warn("service", f"{name}: configured, and not offered by {who}", do)
+        yield warn("service", f"{name}: configured, and not offered by {who}", remedy)
     for name, nodes in sorted((told.get("left_alone") or {}).items()):
         text = f"{name}: served by {', '.join(nodes)} on this robot, so that it is left alone"
         yield warn("service", text, "stop that node, or rename its service")
@@ -303,6 +306,15 @@ def services(state: State) -> Iterator[Finding]:
         yield ok("service", f"offered {'here' if robot else 'to robots'}: {', '.join(sorted(carried))}")
     else:
         yield warn("service", "none is offered", "docs/troubleshooting.md, The service does not appear on the robot")
+
+
+def _domain(node: Mapping[str, Any]) -> tuple[str, str]:
+    """Return in which ROS domain a cloud looks for servers, and what to do if it finds none."""
+    domain = "ROS_DOMAIN_ID"
+    told = node.get("environment")  # one of an earlier version does not tell
+    shown = f", {domain} {told.get(domain) or '0'}" if isinstance(told, dict) else ""
+    remedy = f"compare the names (plr status), and the {domain} that the server was started with"
+    return f"a node of this host's ROS domain{shown}", remedy
 
 
 def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Finding]:

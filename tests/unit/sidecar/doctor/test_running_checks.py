@@ -184,6 +184,23 @@ def test_services() -> None:
     assert len(texts(running_checks.services(state(services=told)), Level.WARN)) == 3
 
 
+@pytest.mark.parametrize(
+    ("environment", "where"),
+    [
+        ({"ROS_DOMAIN_ID": "7"}, "ROS domain, ROS_DOMAIN_ID 7"),
+        ({}, "ROS domain, ROS_DOMAIN_ID 0"),
+        ({"ROS_DOMAIN_ID": ""}, "ROS domain, ROS_DOMAIN_ID 0"),
+        (None, "ROS domain"),  # a sidecar of an earlier version
+    ],
+)
+def test_a_server_that_a_cloud_misses_may_be_in_another_domain(environment: object, where: str) -> None:
+    node = {"name": "cloud-a", "role": "cloud", "environment": environment}
+    told = {"carried": {"/map": "a/srv/B"}, "unmet": ["/plan"]}
+    (found,) = [one for one in running_checks.services(state(node=node, services=told)) if one.level is Level.WARN]
+    assert found.text == f"/plan: configured, and not offered by a node of this host's {where}"
+    assert found.remedy == "compare the names (plr status), and the ROS_DOMAIN_ID that the server was started with"
+
+
 def test_the_mapping() -> None:
     none = state(mapping={"version": 0, "source": None, "age_s": None}, mapped=[])
     assert "this robot chooses by round trips" in texts(running_checks.mapping(none, lambda _: None), Level.WARN)[0]
