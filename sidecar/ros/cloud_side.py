@@ -19,7 +19,7 @@ from sidecar.ros.service_runner import Execution, ServiceRunner
 from sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Generator, Iterator
 
     from protos.model import ServiceName
     from sidecar.core.events import ApplicationEvent, ExecutionId
@@ -68,6 +68,7 @@ class CloudSide:
         self._missing_types: dict[ServiceName, str] = {}
         self._types_retried_at = 0.0
         self._several_servers: set[ServiceName] = set()
+        self._several_types: set[ServiceName] = set()
         self._processes = ServerProcesses(loop.domain_id, lambda: graph.participants(loop.node), loop.wake)
         self._roll_call = RollCall(loop.node)
         self._names = NodeNames(loop.node, stats, limited_log)
@@ -206,7 +207,7 @@ class CloudSide:
         retry_types = now - self._types_retried_at >= TYPE_RETRY_S
         if retry_types:
             self._types_retried_at = now
-        wanted = self._wanted(served)
+        wanted = yield from self._wanted(served)
         for name in [name for name, runner in self._runners.items() if wanted.get(name) != runner.type.name]:
             self._close_runner(name, "its server is gone")
             yield
@@ -229,7 +230,7 @@ class CloudSide:
     def _is_in_rules(self, service: ServiceName) -> bool:
         return self._rules.find(service) is not None
 
-    def _wanted(self, served: dict[ServiceName, graph.Served]) -> dict[ServiceName, str]:
+    def _wanted(self, served: dict[ServiceName, graph.Served]) -> Generator[None, None, dict[ServiceName, str]]:
         """Return name -> type of the services that applications serve here and a rule carries."""
         wanted: dict[ServiceName, str] = {}
         for name, service in served.items():
@@ -237,9 +238,41 @@ class CloudSide:
             if not types or not self._is_in_rules(name):
                 continue
             runner = self._runners.get(name)
-            # Two types under one name: the one in use stays, else the choice is at least the same every time.
-            wanted[name] = runner.type.name if runner is not None and runner.type.name in types else min(types)
+            used = None if runner is None else runner.type.name
+            if len(types) > 1 or (runner is not None and (used not in types or runner.server.lost)):
+                wanted[name] = self._choose_type(name, used, types)
+            else:
+                wanted[name] = min(types)
+                self._several_types.discard(name)
+            yield
+        self._several_types &= wanted.keys()
+        self._several_servers &= wanted.keys()
         return wanted
+
+    def _choose_type(self, name: ServiceName, used: str | None, nodes: dict[str, frozenset[str]]) -> str:
+        """Choose among several types of one service: the one in use stays while a server of it may live.
+
+        `nodes`: type -> nodes that serve it. Of nodes that share a name, as a dead server and the one that took its
+        place, rmw shows the services of one only.
+        """
+        endpoints = graph.server_endpoints(self._loop.node, name, self._names.name_of, time.monotonic())
+        living = set(nodes.keys() - endpoints.keys())  # rmw is not DDS, or the graph changes right now
+        for kind, known in endpoints.items():
+            for endpoint in known:
+                self._processes.watch(endpoint)  # also those that are not in use: they may be chosen later
+            # Silence is not enough: who stands still may have work, and goes on with it.
+            if any(is_known and not self._processes.has_ended(endpoint) for endpoint, is_known in known.items()):
+                living.add(kind)
+        candidates = living or nodes.keys()
+        # Else the choice is at least the same every time.
+        chosen = used if used is not None and used in candidates else min(candidates)
+        if len(living) < 2:
+            self._several_types.discard(name)
+        elif name not in self._several_types:
+            self._several_types.add(name)
+            served = ", ".join(f"{kind} ({' '.join(sorted(nodes.get(kind, ()))) or '?'})" for kind in sorted(living))
+            log.warning("service %s is served here with several types, %s: robots get %s", name, served, chosen)
+        return chosen
 
     def _look_at(self, runner: ServiceRunner, now: float) -> None:
         """A server that is gone, though another came since, will not answer what it was asked."""
@@ -252,7 +285,8 @@ class CloudSide:
     def _notice_several_servers(self, runner: ServiceRunner, nodes: frozenset[str]) -> None:
         """ROS gives each request to all servers of a name: at most once on each, but more than once here."""
         name = runner.name
-        servers = max(len(nodes), runner.server.living)  # nodes may share a name
+        # Nodes may share a name, and some may be dead.
+        servers = runner.server.living if runner.server.endpoints else len(nodes)
         if servers < 2:
             self._several_servers.discard(name)
         elif name not in self._several_servers:

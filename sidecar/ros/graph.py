@@ -88,13 +88,17 @@ def scan(
     }
 
 
-def server_endpoints(node: Any, service: ServiceName, name_of: NameOf, now: float) -> dict[bytes, bool]:
-    """Return the DDS ids of the endpoints that answer for `service`, and whether each is known as an application's.
+def server_endpoints(node: Any, service: ServiceName, name_of: NameOf, now: float) -> dict[str, dict[bytes, bool]]:
+    """Return type -> DDS ids of the endpoints that answer for `service`, and whether each is known as an application's.
 
     Nothing where rmw is not DDS.
     """
-    known = {bytes(info["endpoint_gid"]): _node_of(info, name_of, now) for info in _reply_writers(node, service)}
-    return {endpoint: name is not None and not is_sidecar(name) for endpoint, name in known.items()}
+    found: dict[str, dict[bytes, bool]] = {}
+    for info in _reply_writers(node, service):
+        name = _node_of(info, name_of, now)
+        is_known = name is not None and not is_sidecar(name)
+        found.setdefault(_service_type(info["topic_type"]), {})[bytes(info["endpoint_gid"])] = is_known
+    return found
 
 
 def _node_of(info: dict[str, Any], name_of: NameOf, now: float) -> str | None:

@@ -40,12 +40,13 @@ class LocalServer:
             raise RosBridgeError(f"rmw refuses a client of {name}, type {service_type.name}: {error}") from error
         self._pointer: int = self._client.handle.pointer
         self.endpoints: frozenset[bytes] = frozenset()
-        """DDS ids of all that the graph shows for it, to tell a restarted one from the old one; empty where rmw is not
-        DDS."""
+        """DDS ids of all of its type that the graph shows for it, to tell a restarted one from the old one; empty where
+        rmw is not DDS."""
         self._alive: frozenset[bytes] = frozenset()
         self._asked: frozenset[bytes] = frozenset()
         """Those who may still have to answer something."""
         self._usable_at: float | None = None
+        self._matched = False
         self._looked = False
         self.ready = False
         """Whether requests may be sent: before, rmw would drop them without a word, or nobody is there."""
@@ -73,19 +74,22 @@ class LocalServer:
 
     def look(self, is_dead: Callable[[bytes], bool], now: float) -> bool:
         """Look at the graph; returns whether all that were there at the last look are gone, and will answer nothing."""
-        known = graph.server_endpoints(self._node, self.name, self._name_of, now)
+        # A node that serves the name with another type gets nothing of what we send, and answers nothing.
+        known = graph.server_endpoints(self._node, self.name, self._name_of, now).get(self.type.name, {})
         self.endpoints = frozenset(known)
         self._looked = True
         alive = frozenset(endpoint for endpoint, is_known in known.items() if is_known and not is_dead(endpoint))
         if not alive & self._alive:
             self._usable_at = now + SETTLES_S if alive else None
+            self._matched = False
         self._alive = alive
         # A silent one keeps what it has until another takes its place, or until it is gone from the graph.
         went = bool(self._asked) and not self._asked & (alive or self.endpoints)
         if went or alive:
             self._asked = alive
-        matched = bool(self._client.handle.service_server_is_available())
-        self.ready = matched and self.is_usable(now)
+        # Asked until it is so: rmw says no again for a moment whenever another node begins to serve the name.
+        self._matched = self._matched or bool(self._client.handle.service_server_is_available())
+        self.ready = self._matched and self.is_usable(now)
         return went
 
     def strike_out(self, is_dead: Callable[[bytes], bool]) -> bool:

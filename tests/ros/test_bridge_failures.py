@@ -139,7 +139,10 @@ def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.Mo
         mesh.serve("--plan", "/plan")
         node = mesh.cloud._loop.node  # type: ignore[union-attr]  # a started bridge has one
         wait_until(
-            lambda: list(graph.server_endpoints(node, PLAN, no_name, 0.0).values()) == [True], "only the new one"
+            lambda: (
+                [list(one.values()) for one in graph.server_endpoints(node, PLAN, no_name, 0.0).values()] == [[True]]
+            ),
+            "only the new one",
         )
     wait_until(lambda: len(mesh.link.refusals) == 4, "refusals")
     # What still stood in the window may have been told before: on a busy machine the new one takes seconds to come up.

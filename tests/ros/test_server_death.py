@@ -35,7 +35,7 @@ def loop_of(mesh: Mesh) -> RosLoop:
 
 
 def endpoints(mesh: Mesh) -> set[bytes]:
-    return set(graph.server_endpoints(loop_of(mesh).node, PLAN, no_name, 0.0))
+    return set().union(*graph.server_endpoints(loop_of(mesh).node, PLAN, no_name, 0.0).values())
 
 
 def blind(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +107,7 @@ def test_the_end_of_another_process_with_the_same_bits_is_no_death(mesh: Mesh, m
     mesh.start()
     wrong = mesh.serve("--negate", "/negate", "--node", "wrong")
     mesh.wait_carried("/negate")
-    (wrong_id,) = graph.server_endpoints(loop_of(mesh).node, ServiceName("/negate"), no_name, 0.0)
+    ((wrong_id,),) = graph.server_endpoints(loop_of(mesh).node, ServiceName("/negate"), no_name, 0.0).values()
 
     monkeypatch.setattr(server_processes, "pid_bits", lambda _endpoint: dds_id.pid_bits(wrong_id))
     monkeypatch.setattr(

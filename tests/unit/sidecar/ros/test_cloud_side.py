@@ -79,3 +79,31 @@ def test_what_lies_at_a_server_that_stood_still_counts_when_it_goes_on() -> None
     assert ask(range(5, 9)) == []
     assert runner.take_back() == ([], [5, 6, 7, 8])
     assert ask(range(9, 12)) == [9]  # another server: nothing lies there
+
+
+@pytest.mark.audit("dp-15")
+@pytest.mark.parametrize(
+    ("used", "ended", "chosen"),
+    [
+        ("b/srv/Used", set(), "b/srv/Used"),
+        ("b/srv/Used", {b"stray"}, "b/srv/Used"),
+        ("b/srv/Used", {b"used"}, "a/srv/Stray"),  # its process has ended, though DDS shows it for 20 s more
+        ("b/srv/Used", {b"used", b"stray"}, "b/srv/Used"),
+        (None, set(), "a/srv/Stray"),  # the same every time
+        (None, {b"stray"}, "b/srv/Used"),
+        ("c/srv/Nameless", set(), "a/srv/Stray"),  # a node that is not known serves it: it is none yet, or no more
+    ],
+)
+def test_a_type_is_chosen_among_those_whose_servers_live(
+    side: Any, monkeypatch: pytest.MonkeyPatch, used: str | None, ended: set[bytes], chosen: str
+) -> None:
+    shown = {"a/srv/Stray": {b"stray": True}, "b/srv/Used": {b"used": True}, "c/srv/Nameless": {b"nameless": False}}
+    monkeypatch.setattr("sidecar.ros.graph.server_endpoints", lambda _node, _service: shown)
+    watched: set[bytes] = set()
+    side._loop = SimpleNamespace(node=None)
+    side._processes = SimpleNamespace(watch=watched.add, has_ended=ended.__contains__)
+    side._several_types = set()
+    nodes = {"a/srv/Stray": frozenset({"/stray"}), "b/srv/Used": frozenset({"/used"})}
+    assert side._choose_type("/plan", used, nodes) == chosen
+    assert watched == {b"stray", b"used", b"nameless"}
+    assert side._several_types == (set() if ended else {"/plan"})
