@@ -37,7 +37,10 @@ MAX_CARRIED_SERVICES = 512
 TYPE_RETRY_S = 30.0
 """How often a type that is not installed is looked for again: someone may be installing it."""
 SILENCE_S = 0.5
-"""A server that answers nothing for so long is asked whether it lives, if its process is not watched."""
+"""A server that answers nothing for so long is asked whether it lives."""
+TRUSTED_S = 5.0
+"""So long at most it counts as alive once it was heard, while its process is watched and no further request waits: each
+question makes every ROS process of the domain send something."""
 CHECK_EVERY_S = 0.25
 """How often that is looked at while such a server has something to answer."""
 
@@ -70,10 +73,12 @@ class CloudSide:
         self._several_servers: set[ServiceName] = set()
         self._several_types: set[ServiceName] = set()
         self._processes = ServerProcesses(loop.domain_id, lambda: graph.participants(loop.node), loop.wake)
-        self._roll_call = RollCall(loop.node)
+        self._roll_call = RollCall(loop.node, self._processes.wants_processor)
         self._names = NodeNames(loop.node, stats, limited_log)
         self._at_work: set[ServiceRunner] = set()
-        """Runners whose server has something to answer, and is not known to live."""
+        """Runners whose server has something to answer, or is dead as far as is known."""
+        self._in_doubt: frozenset[ServiceRunner] = frozenset()
+        """Those of them whose server has answered nothing for so long that it must be heard to count as alive."""
         self._check_at = 0.0
         self.look_is_due = False
         """The graph should be looked at although it has not changed."""
@@ -127,8 +132,7 @@ class CloudSide:
         if not runner.add(execution, now):
             self._stats.requests_paced += 1
             self._paced.add(runner)
-        if runner not in self._at_work and not self._is_watched(runner):
-            self._at_work.add(runner)
+        self._at_work.add(runner)
         self._stats.requests_sent[event.service] += 1
 
     def refuse(self, event: ExecuteRequest, reason: RejectReason, detail: str, now: float) -> None:
@@ -292,10 +296,10 @@ class CloudSide:
         elif name not in self._several_servers:
             self._several_servers.add(name)
             log.warning(
-                "service %s has %d servers here (%s): each request runs on all of them, the first answer counts",
+                "service %s has %d servers here%s: each request runs on all of them, the first answer counts",
                 name,
                 servers,
-                ", ".join(sorted(nodes)),
+                f" ({', '.join(sorted(nodes))})" if nodes else "",  # rmw may show only the other type of a node's name
             )
 
     def _open_runner(self, name: ServiceName, type_name: str) -> None:
@@ -368,25 +372,33 @@ class CloudSide:
         return self._processes.has_ended(endpoint) or self._roll_call.is_silent(endpoint)
 
     def _is_alive_since(self, runner: ServiceRunner, since: float) -> bool:
-        """Whether one of its servers lives: the end would have been noticed, or it was heard since then."""
+        """Whether one of its servers lives: its end would have been noticed, or it was heard since then.
+
+        A process that was not seen to end may stand still all the same: that it answers nothing puts it in doubt.
+        """
         endpoints = runner.server.endpoints
+        in_doubt = runner in self._in_doubt
         return not endpoints or any(
-            self._processes.watches(endpoint) or self._roll_call.has_heard(endpoint, since)
+            (not in_doubt and self._processes.watches(endpoint)) or self._roll_call.has_heard(endpoint, since)
             for endpoint in endpoints
             if not self._processes.has_ended(endpoint)
         )
 
-    def _is_watched(self, runner: ServiceRunner) -> bool:
-        return all(self._processes.watches(endpoint) for endpoint in runner.server.endpoints)
-
     def _notice_ends(self) -> None:
         """What was handed to a process that ended is lost; what waits for it another server may run."""
-        hit = [r for r in self._runners.values() if r.server.strike_out(self._processes.has_ended)]
+        ended = self._processes.has_ended
+        hit = [
+            runner
+            for runner in self._runners.values()
+            # Those that were silent before were struck out then, and kept what they had.
+            if runner.server.strike_out(ended) or (runner.pending and runner.server.is_over(ended))
+        ]
         if hit:
             log.warning("the process of a server ended: %s", " ".join(sorted(runner.name for runner in hit)))
         for runner in hit:
             self._give_up_executions(runner, "the server's process ended")
         self._publish_state()
+        self.look_is_due = True  # for those of another type
 
     def _notice_silence(self) -> None:
         """What was handed to a server that shows no sign of life may still be answered; the rest need not wait."""
@@ -404,13 +416,28 @@ class CloudSide:
     def _endpoints_to_ask(self, now: float) -> list[bytes]:
         """Ids of servers whose silence may mean their death, and of those that were silent until now."""
         self._at_work = {runner for runner in self._at_work if runner.silent_since is not None or runner.server.lost}
-        return [
-            endpoint
+        self._in_doubt = frozenset(
+            runner
             for runner in self._at_work
             if runner.server.lost or (runner.silent_since is not None and now - runner.silent_since >= SILENCE_S)
+        )
+        return [
+            endpoint
+            for runner in self._in_doubt
             for endpoint in runner.server.endpoints
-            if not self._processes.watches(endpoint) and not self._processes.has_ended(endpoint)
+            if self._is_to_be_asked(runner, endpoint, now)
         ]
+
+    def _is_to_be_asked(self, runner: ServiceRunner, endpoint: bytes, now: float) -> bool:
+        if self._processes.has_ended(endpoint):
+            return False
+        silent_since = runner.silent_since
+        if silent_since is None or runner.server.lost or runner.window.waiting:
+            return True
+        if not self._processes.watches(endpoint):
+            return True
+        # Nobody waits, and its end would be noticed: the longer it has been at work, the rarer.
+        return not self._roll_call.has_heard(endpoint, now - min((now - silent_since) / 2.0, TRUSTED_S))
 
     # -- time ----------------------------------------------------------------------------------------------------
 

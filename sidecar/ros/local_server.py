@@ -92,6 +92,10 @@ class LocalServer:
         self.ready = self._matched and self.is_usable(now)
         return went
 
+    def is_over(self, has_ended: Callable[[bytes], bool]) -> bool:
+        """Whether all that the graph shows for it have ended, and so answer nothing more."""
+        return bool(self.endpoints) and all(has_ended(endpoint) for endpoint in self.endpoints)
+
     def strike_out(self, is_dead: Callable[[bytes], bool]) -> bool:
         """Some process died, or is silent; returns whether nobody is left to ask."""
         alive = frozenset(endpoint for endpoint in self._alive if not is_dead(endpoint))

@@ -22,6 +22,9 @@ PORTS_PER_DOMAIN = 250
 _PID_BITS = 16
 _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where Fast DDS has its ports; nothing is written there
 _PORT_LOCK = re.compile(r"fast(?:rtps|dds)_port(\d+)_el")
+_RUNNABLE = "R"
+_STOPPED = frozenset({"T", "t"})
+"""By a signal, or by a debugger (proc(5), stat)."""
 _UDP_TABLES = ("/proc/net/udp", "/proc/net/udp6")
 
 
@@ -49,6 +52,24 @@ def has_ended(pidfd: int) -> bool:
     poll = select.poll()
     poll.register(pidfd, select.POLLIN)
     return bool(poll.poll(0))
+
+
+def wants_processor(pidfd: int) -> bool:
+    """True when a thread of the process runs or waits for a processor; a stopped or frozen one does not."""
+    with contextlib.suppress(OSError, ValueError, StopIteration):
+        lines = Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines()
+        pid = int(next(line for line in lines if line.startswith("Pid:")).split()[1])
+        if _state(Path(f"/proc/{pid}/stat")) in _STOPPED:
+            return False  # so are all its threads, perhaps very many
+        return any(_state(thread / "stat") == _RUNNABLE for thread in Path(f"/proc/{pid}/task").iterdir())
+    return False
+
+
+def _state(stat: Path) -> str:
+    try:
+        return stat.read_text().rpartition(")")[2].split()[0]
+    except (OSError, IndexError):
+        return ""  # it ended
 
 
 def _sees_its_own_namespace() -> bool:

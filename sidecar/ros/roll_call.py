@@ -1,4 +1,4 @@
-"""Asking the ROS processes of the domain whether they live, where their process ids tell nothing.
+"""Asking the ROS processes of the domain whether they live: a process id tells of an end, but not of a standstill.
 
 `discovery_topic.py` says how they are asked.
 """
@@ -13,22 +13,25 @@ from sidecar.ros.discovery_topic import DiscoveryTopic
 from sidecar.ros.participant_info import speaker
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
 CALL_S = 0.7
 """How long a call waits for those that it is about. They take 20 ms on a machine with five processes for each core."""
 CALL_EVERY_S = 1.0
 """From one call to the next, if the one before was answered; otherwise at once."""
 CALLS_MISSED = 2
-"""Who answers none of so many calls in a row is taken for dead until it answers one."""
+"""Who answers none of so many calls in a row is taken for dead until it answers one. A call counts only for those that
+do not wait for a processor: on a machine that is too busy, everybody answers late."""
 POLL_S = 0.02
 
 
 class RollCall:
     """One call at a time. All methods belong to the ROS thread."""
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node: Any, wants_processor: Callable[[bytes], bool]) -> None:
+        """`wants_processor`: whether a participant's process is known to run, or to wait for a processor."""
         self._topic = DiscoveryTopic(node)
+        self._wants_processor = wants_processor
         self._asked: set[bytes] = set()
         """Participants of the present call that have not answered."""
         self._ends_at = 0.0
@@ -59,9 +62,11 @@ class RollCall:
         if self._asked and now < self._ends_at:
             return changed
         for participant in self._asked:
+            if self._wants_processor(participant):
+                continue
             self._missed[participant] = self._missed.get(participant, 0) + 1
             changed |= self._missed[participant] == CALLS_MISSED
-        in_doubt = any(self._missed[participant] < CALLS_MISSED for participant in self._asked)
+        in_doubt = any(self._missed.get(participant, 0) < CALLS_MISSED for participant in self._asked)
         self._next_at = now if in_doubt else now + CALL_EVERY_S
         self._end()
         return changed

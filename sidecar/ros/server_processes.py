@@ -13,7 +13,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from sidecar.ros.dds_id import pid_bits, process_of
-from sidecar.ros.process_finder import has_ended, open_process
+from sidecar.ros.process_finder import has_ended, open_process, wants_processor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -63,6 +63,11 @@ class ServerProcesses:
     def has_ended(self, endpoint: bytes) -> bool:
         """True when its process is over, whatever the graph says."""
         return process_of(endpoint) in self._ended
+
+    def wants_processor(self, endpoint: bytes) -> bool:
+        """Whether its process is known, and runs or would if the machine were not busy."""
+        pidfd = self._pidfds.get(process_of(endpoint))
+        return pidfd is not None and wants_processor(pidfd)
 
     def take_ended(self) -> bool:
         """Note the processes that ended since the last call; returns whether there are any."""

@@ -14,7 +14,9 @@ import pytest
 from protos.model import ServiceName
 from sidecar.core.events import RejectReason
 from sidecar.ros import dds_id, graph, process_finder, server_processes
-from sidecar.ros.process_finder import has_ended, open_process
+from sidecar.ros.cloud_side import SILENCE_S
+from sidecar.ros.process_finder import has_ended, open_process, wants_processor
+from sidecar.ros.roll_call import CALL_S
 from tests.ros.mesh import no_name, wait_until
 
 if TYPE_CHECKING:
@@ -140,31 +142,96 @@ def test_a_killed_server_whose_process_is_unknown(mesh: Mesh, monkeypatch: pytes
 
 
 @pytest.mark.audit("dp-15")
-def test_a_slow_server_whose_process_is_unknown_is_not_dead(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("is_known", "busy_s", "count"), [(False, 5, 3), (True, 4, 2)])
+def test_a_slow_server_is_not_dead(
+    mesh: Mesh, monkeypatch: pytest.MonkeyPatch, is_known: bool, busy_s: int, count: int
+) -> None:
     """A planner that computes for seconds, and holds Python's interpreter lock meanwhile."""
-    blind(monkeypatch)
+    if not is_known:
+        blind(monkeypatch)
     mesh.start()
-    mesh.serve("--plan", "/plan", "--busy-s", "5")
+    mesh.serve("--plan", "/plan", "--busy-s", str(busy_s))
     mesh.wait_carried("/plan")
-    result = mesh.result(mesh.call("/plan", "--count", "3", "--timeout-s", "25"))
-    assert result["answered"] == 3
+    result = mesh.result(mesh.call("/plan", "--count", str(count), "--timeout-s", "25"))
+    assert result["answered"] == count
     assert not mesh.link.refusals
     assert mesh.link.carried == {"/plan"}
 
 
 @pytest.mark.audit("dp-15")
-def test_a_server_that_stands_still_is_used_again(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    blind(monkeypatch)
+@pytest.mark.parametrize("is_known", [False, True])
+def test_a_server_that_stands_still_is_used_again(mesh: Mesh, monkeypatch: pytest.MonkeyPatch, is_known: bool) -> None:
+    if not is_known:
+        blind(monkeypatch)
     mesh.start()
     server = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
     assert mesh.result(mesh.call("/plan"))["answered"] == 1
     server.send(signal.SIGSTOP)
-    mesh.call("/plan", "--count", "1", "--timeout-s", "30")
+    mesh.call("/plan", "--count", "1", "--timeout-s", "1")
     mesh.wait_carried()
     server.send(signal.SIGCONT)
     mesh.wait_carried("/plan")
     assert mesh.result(mesh.call("/plan", "--count", "5"))["answered"] == 5
+
+
+@pytest.mark.audit("dp-15")
+def test_a_server_that_hangs_and_is_killed_then(mesh: Mesh) -> None:
+    """Its process is known: while it stands still, what it was handed may still run; once it ended, it may not."""
+    mesh.start()
+    server = mesh.serve("--plan", "/plan")
+    mesh.wait_carried("/plan")
+    server.send(signal.SIGSTOP)
+    stopped_at = time.monotonic()
+    mesh.call("/plan", "--count", "60", "--tolerance", "-1", "--timeout-s", "1")
+    wait_until(lambda: mesh.link.refusals, "refusals")
+    mesh.wait_carried()
+    assert {reason for reason, _ in mesh.link.refusals} == {RejectReason.NOT_OFFERED}
+    kept = mesh.cloud.stats.pending
+    assert 1 <= kept == 60 - len(mesh.link.refusals)
+    assert kept <= 5, "what was not handed over before the silence was noticed is free"
+    server.stop(signal.SIGKILL)
+    wait_until(lambda: not mesh.cloud.stats.pending, "the rest")
+    assert [reason for reason, _ in mesh.link.refusals].count(RejectReason.SERVER_LOST) == kept
+    assert endpoints(mesh), "DDS noticed by itself: this shows nothing"
+    assert time.monotonic() - stopped_at < LEASE_S
+
+
+@pytest.mark.audit("dp-15")
+def test_a_server_that_waits_for_a_processor_is_not_dead(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a machine that is too busy nobody answers in time."""
+    monkeypatch.setattr("sidecar.ros.server_processes.wants_processor", lambda _pidfd: True)
+    mesh.start()
+    server = mesh.serve("--plan", "/plan")
+    mesh.wait_carried("/plan")
+    server.send(signal.SIGSTOP)
+    program = mesh.call("/plan", "--timeout-s", "30")
+    wait_until(lambda: mesh.cloud.stats.pending, "the request")
+    time.sleep(3 * CALL_S + SILENCE_S)
+    assert mesh.link.carried == {"/plan"}
+    server.send(signal.SIGCONT)
+    assert mesh.result(program)["answered"] == 1
+    assert not mesh.link.refusals
+
+
+@pytest.mark.audit("dp-15")
+def test_who_wants_a_processor() -> None:
+    begin = "print(flush=True)\n"
+    for program, wants in (("while True: pass", True), ("import time; time.sleep(60)", False)):
+        with subprocess.Popen([sys.executable, "-c", begin + program], stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            pidfd = os.pidfd_open(process.pid)
+            try:
+                wait_until(lambda fd=pidfd, wants=wants: wants_processor(fd) is wants, program)  # type: ignore[misc]
+                process.send_signal(signal.SIGSTOP)
+                os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+                assert not wants_processor(pidfd)
+            finally:
+                process.kill()
+            process.wait()
+            assert not wants_processor(pidfd)
+            os.close(pidfd)
 
 
 @pytest.mark.audit("dp-15")

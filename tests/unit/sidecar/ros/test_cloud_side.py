@@ -12,7 +12,7 @@ from protos.model import NodeName
 from sidecar.core.events import AbandonExecution, ExecutionId
 from sidecar.core.priority import Priority
 from sidecar.core.shares import Shares
-from sidecar.ros.cloud_side import MAX_EXECUTIONS, CloudSide
+from sidecar.ros.cloud_side import MAX_EXECUTIONS, SILENCE_S, TRUSTED_S, CloudSide
 from sidecar.ros.request_window import RequestWindow
 from sidecar.ros.service_runner import ServiceRunner
 from sidecar.ros.stats import BridgeStats
@@ -26,6 +26,8 @@ def side() -> Any:
     made._executions = {}
     made._shares = Shares(MAX_EXECUTIONS)
     made._paced = set()
+    made._at_work = set()
+    made._in_doubt = frozenset()
     return made
 
 
@@ -37,11 +39,45 @@ def test_a_dead_server_beside_a_living_one_keeps_nothing_from_it(side: Any) -> N
     side._roll_call = SimpleNamespace(
         has_heard=lambda endpoint, _since: endpoint not in silent, is_silent=lambda endpoint: endpoint in silent
     )
-    runner: Any = SimpleNamespace(server=SimpleNamespace(endpoints=frozenset((b"old", b"new")), living=1))
+    runner = Mock(server=SimpleNamespace(endpoints=frozenset((b"old", b"new")), living=1))
     assert side._is_alive_since(runner, 1.0)
     silent.add(b"new")
     runner.server.living = 0
     assert not side._is_alive_since(runner, 1.0)
+
+
+@pytest.mark.audit("dp-15")
+def test_a_watched_server_that_answers_nothing_must_be_heard(side: Any) -> None:
+    """Its end would have been noticed, but it may stand still."""
+    ended: set[bytes] = set()
+    heard_at = {b"one": 1.0}
+    side._processes = SimpleNamespace(watches=lambda _endpoint: True, has_ended=ended.__contains__)
+    side._roll_call = SimpleNamespace(has_heard=lambda endpoint, since: heard_at[endpoint] >= since)
+    server = SimpleNamespace(endpoints=frozenset((b"one",)), lost=False)
+    runner = Mock(server=server, silent_since=10.0, window=Mock(waiting=0))
+    side._at_work = {runner}
+    assert side._endpoints_to_ask(10.0 + SILENCE_S / 2) == []
+    assert side._is_alive_since(runner, 10.0)
+    assert side._endpoints_to_ask(10.0 + SILENCE_S) == [b"one"]
+    assert not side._is_alive_since(runner, 10.0)
+    heard_at[b"one"] = 11.0
+    assert side._is_alive_since(runner, 10.0)
+    assert side._endpoints_to_ask(11.5) == []
+    assert side._is_alive_since(runner, 10.0)
+    runner.window.waiting = 1
+    assert side._endpoints_to_ask(11.5) == [b"one"]
+    runner.window.waiting = 0
+    assert side._endpoints_to_ask(13.0) == [b"one"]
+    heard_at[b"one"] = 30.0
+    assert side._endpoints_to_ask(30.0 + TRUSTED_S - 0.1) == []
+    assert side._endpoints_to_ask(30.0 + TRUSTED_S + 0.1) == [b"one"]
+    ended.add(b"one")
+    assert side._endpoints_to_ask(40.0) == []
+    assert not side._is_alive_since(runner, 10.0)
+    runner.silent_since = None  # it answered
+    assert side._endpoints_to_ask(41.0) == []
+    assert not side._at_work
+    assert not side._in_doubt
 
 
 @pytest.mark.audit("dp-3")
