@@ -225,6 +225,17 @@ def test_prometheus_accepts_its_configuration() -> None:
 
 
 @pytest.mark.audit("ops-12")
+def test_prometheus_accepts_an_agents_configuration_which_names_the_node() -> None:
+    run("promtool", "check", "config", "--agent", "agent.yml", cwd=PROMETHEUS)
+    config = yaml.safe_load((PROMETHEUS / "agent.yml").read_text())
+    (job,) = config["scrape_configs"]
+    (node,) = job["static_configs"]
+    assert job["job_name"] == "plr-sidecar"
+    assert node["targets"] == [sidecar_config(Role.ROBOT).metrics_listen]
+    assert node["labels"]["instance"] not in node["targets"]
+
+
+@pytest.mark.audit("ops-12")
 def test_prometheus_knows_where_the_runbook_is_and_tells_the_alertmanager_no_label_of_that() -> None:
     config = yaml.safe_load((PROMETHEUS / "prometheus.yml").read_text())
     assert config["global"]["external_labels"]["plr_docs"].startswith("https://")
