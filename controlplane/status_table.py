@@ -102,7 +102,10 @@ def _unmet(status: SidecarStatus, offered: Sequence[str]) -> Iterator[str]:
         close = difflib.get_close_matches(name, [other for other in offered if other not in own], n=1)
         hint = f"; did you mean {close[0]}?" if close and close[0] != name else ""
         whose = "no server that it knows of" if status.peer.role is Role.ROBOT else "no node there"
-        yield f"UNMET {name}: configured, and {whose} offers it{hint}"
+        why = "" if status.peer.role is Role.ROBOT else ", or none that can be called; plr doctor there says which"
+        yield f"UNMET {name}: configured, and {whose} offers it{hint or why}"
+    for name in status.unreached:
+        yield f"UNREACHED {name}: servers that it knows of offer it, and it reaches none of them"
 
 
 def _untyped(status: SidecarStatus) -> Iterator[str]:

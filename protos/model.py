@@ -345,9 +345,12 @@ class ServiceSet:
     offers: tuple[ServiceOffer, ...] = ()
     uses: tuple[ServiceUse, ...] = ()
     unmet: tuple[ServiceName, ...] = ()
-    """That its configuration names and nobody serves, at most MAX_UNMET; for the operator."""
+    """That its configuration names and nobody serves, as far as it knows, at most MAX_UNMET; for the operator."""
     untyped: tuple[ServiceName, ...] = ()
     """That it cannot carry or offer, as their type is not installed there, at most MAX_UNMET; for the operator."""
+    unreached: tuple[ServiceName, ...] = ()
+    """Robot: that its configuration names and servers offer that it knows of, none of which it reaches, at most
+    MAX_UNMET; for the operator."""
 
 
 @dataclass(frozen=True, slots=True)

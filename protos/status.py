@@ -67,6 +67,8 @@ class SidecarStatus:
     """Services that its configuration names and nobody serves."""
     untyped: tuple[ServiceName, ...] = ()
     """Services that it would carry or offer if their type were installed there."""
+    unreached: tuple[ServiceName, ...] = ()
+    """Services that its configuration names and servers offer that it knows of, none of which it reaches."""
     down: tuple[InterfaceName, ...] = ()
     """Interfaces that it would use and that carry nothing now."""
     withdrawn: tuple[ServiceName, ...] = ()

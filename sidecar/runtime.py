@@ -43,7 +43,7 @@ from sidecar.revocations import Revocations
 from sidecar.ros.bridge import RosBridge
 from sidecar.start_session import signed, start_session
 from sidecar.state_store import StateDirError, StateStore
-from sidecar.unmet_services import UnmetServices, told
+from sidecar.unmet_services import UnmetServices, told, told_mismatched, told_unreached
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -207,16 +207,21 @@ class Sidecar:
         self._control.try_again()  # an interface may have come before it was noted that the mapping lacks it
 
     def look_at_services(self) -> None:
-        """Tell, once, of those that the configuration names and nobody serves."""
+        """Tell, once, of those that the configuration names and are not to be had."""
         stats = self._bridge.stats
         met = {*stats.carried, *stats.left_alone, *stats.missing_types}
-        before = self._unmet.unmet, self._untyped
-        news = self._unmet.look(met, time.monotonic())
+        before = self._unmet.unmet, set(self._unmet.unreached), self._untyped
+        unreached = self._data_plane.unreached_services() if self._config.role is Role.ROBOT else {}
+        news = self._unmet.look(met, unreached, time.monotonic())
         self._untyped = frozenset(stats.missing_types)
-        if (self._unmet.unmet, self._untyped) != before:
+        if (self._unmet.unmet, set(self._unmet.unreached), self._untyped) != before:
             self._on_services_changed()
         for name in news:
-            if self._config.role is Role.ROBOT:
+            if servers := self._unmet.unreached.get(name, 0):
+                line = told_unreached(name, servers)
+            elif name in stats.mismatched:
+                line = told_mismatched(name)
+            elif self._config.role is Role.ROBOT:
                 line = told(name, self._data_plane.services_of_peers(), "no server that this robot knows of")
             else:
                 line = told(name, stats.carried, "no node of this host's ROS domain")
@@ -266,6 +271,7 @@ class Sidecar:
             control=self._control.view,
             bridge=lambda: self._bridge.stats,
             unmet=lambda: self._unmet.unmet,
+            unreached=lambda: self._unmet.unreached,
             origin=lambda: self._mapping_origin,
             tls=self._tls,
             clock=self._clock,
@@ -332,7 +338,8 @@ class Sidecar:
         offers, uses = self._data_plane.services()
         unmet = map(ServiceName, sorted(self._unmet.unmet)[:MAX_UNMET])
         untyped = sorted(self._untyped)[:MAX_UNMET]
-        self._control.set_services(ServiceSet(offers, uses, tuple(unmet), tuple(untyped)))
+        unreached = map(ServiceName, sorted(self._unmet.unreached)[:MAX_UNMET])
+        self._control.set_services(ServiceSet(offers, uses, tuple(unmet), tuple(untyped), tuple(unreached)))
 
     def _on_reach_changed(self) -> None:
         self._control.try_again()

@@ -1,16 +1,18 @@
-"""Which services the configuration names and nobody serves: most often the name is wrong."""
+"""Which services the configuration names and are not to be had: nobody serves them, and most often the name is wrong;
+or a robot reaches none of the servers that it knows of.
+"""
 
 from __future__ import annotations
 
 import difflib
 from typing import TYPE_CHECKING
 
+from protos.model import ServiceName
 from sidecar.config_fields import is_glob
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Iterable, Mapping
 
-    from protos.model import ServiceName
 
 GRACE_S = 15.0
 """After the start: what servers, their discovery and the control plane take, also on a slow machine."""
@@ -26,24 +28,40 @@ class UnmetServices:
         self._told: set[str] = set()
         self.unmet: frozenset[str] = frozenset()
         """Those that nobody served at the last look."""
+        self.unreached: Mapping[str, int] = {}
+        """Those that some serve of whom none was reached at the last look, and how many these are."""
 
-    def look(self, met: Collection[ServiceName], now: float) -> list[str]:
-        """Note which are served now; return those never seen served, each once, when it is time to tell of them."""
+    def look(self, met: Collection[ServiceName], unreached: Mapping[ServiceName, int], now: float) -> list[str]:
+        """Note which are served now, and how many servers of others are known and not reached; return those never seen
+        served, each once, when it is time to tell of them."""
         if now < self._judged_from:
             self._told.update(name for name in self._names if name in met)
             return []
-        self.unmet = frozenset(name for name in self._names if name not in met)
+        lacking = [name for name in self._names if name not in met]
+        self.unreached = {name: servers for name in lacking if (servers := unreached.get(ServiceName(name), 0))}
+        self.unmet = frozenset(name for name in lacking if name not in self.unreached)
         self._told.update(name for name in self._names if name in met)
         news = [name for name in self._names if name not in self._told]
         self._told.update(news)
         return news
 
 
+def told_unreached(name: str, servers: int) -> str:
+    """Return a line about a name of which a robot knows this many servers, and reaches none."""
+    return f"service {name} is offered by {servers} servers that this robot knows of, and it reaches none of them"
+
+
+def told_mismatched(name: str) -> str:
+    """Return a line about a name whose server on a cloud's host cannot be called."""
+    whose = "a node of this host's ROS domain"
+    return f"service {name} is served by {whose}, with a QoS that does not fit: make it reliable, as it is by default"
+
+
 def told(name: str, offered: Iterable[str], whose: str) -> str:
     """Return a line about a name that is not served; `offered` are the names that are, `whose` says by whom."""
     names = sorted(set(offered))
     if name in names:
-        return f"service {name} is configured and offered, and no server of it is reached: plr doctor says more"
+        return f"service {name} is configured and offered, and no server of it is reached, or none of the type it wants"
     close = difflib.get_close_matches(name, names, n=1)
     if close:
         return f"service {name} is configured, and {whose} offers it; did you mean {close[0]}?"

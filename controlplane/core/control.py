@@ -689,7 +689,7 @@ class ControlCore:
         if gone is not None and gone.role is Role.ROBOT and self.registry.get(robot) is None:
             last = self.departed.last_known(robot)
             return explain_departed(gone, last, service, estimator=self.estimator, history=self.history, now=now)
-        sidecar, use = find(self.registry, robot, service)
+        sidecar, use = find(self.registry, self.permits, robot, service)
         mapping = self._publisher[robot].mapping
         return explain(
             sidecar,

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.estimator import Evidence
     from controlplane.core.mapping_history import History
+    from controlplane.core.permits import Permits
     from controlplane.core.picture import Picture
     from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.posterior import Estimate
@@ -65,7 +66,7 @@ class Measured(Protocol):
         """The pairs of interfaces that carried copies of the same requests."""
 
 
-def find(registry: Registry, robot: NodeName, service: ServiceName) -> tuple[Sidecar, ServiceUse]:
+def find(registry: Registry, permits: Permits, robot: NodeName, service: ServiceName) -> tuple[Sidecar, ServiceUse]:
     """The robot and its use of the service. Raises UnknownNameError."""
     sidecar = registry.get(robot)
     if sidecar is None:
@@ -73,22 +74,47 @@ def find(registry: Registry, robot: NodeName, service: ServiceName) -> tuple[Sid
         raise UnknownNameError(f"no robot {robot} is registered{_nearest(robot, robots)}")
     if sidecar.role is not Role.ROBOT:
         raise UnknownNameError(f"{robot} is a cloud: ask about a robot")
-    return sidecar, find_use(sidecar, service, {offer.name for other in registry for offer in other.offers})
+    group = permits.group(robot)
+    offered: set[ServiceName] = set()
+    clouds = 0
+    for other in registry:
+        if other.role is Role.CLOUD:
+            names = {offer.name for offer in other.offers}
+            offered |= names
+            clouds += service in names and service in permits.of(group, other)
+    return sidecar, find_use(sidecar, service, offered, clouds)
 
 
-def find_use(robot: Sidecar, service: ServiceName, offered: Collection[ServiceName] = ()) -> ServiceUse:
-    """The robot's use of the service, or of one of those `offered`. Raises UnknownNameError."""
+def find_use(
+    robot: Sidecar, service: ServiceName, offered: Collection[ServiceName] = (), clouds: int = 0
+) -> ServiceUse:
+    """The robot's use of the service; `offered` is what any cloud offers, `clouds` how many let it call this service.
+    Raises UnknownNameError."""
     for use in robot.uses:
         if use.name == service:
             return use
-    if service in robot.unmet:
+    if service in robot.unreached:
         raise UnknownNameError(
-            f"{robot.name} is configured to carry {service}, and no cloud that it knows of offers it"
-            f"{_nearest(service, offered)}"
+            f"{robot.name} carries no {service}: it is offered by {clouds} clouds, and it reaches none of them;"
+            f" plr status {robot.name} shows the paths, and plr doctor there says more"
         )
+    if service in robot.unmet:
+        what = f"{robot.name} is configured to carry {service}, and no cloud that it knows of offers it"
+        if clouds:
+            raise UnknownNameError(f"{what}; {clouds} do with another type than it wants, or it has not met them yet")
+        if service in offered:
+            raise UnknownNameError(f"{what}; the policy keeps those that do from it")
+        raise UnknownNameError(f"{what}{_nearest(service, offered)}")
     if service in robot.untyped:
         raise UnknownNameError(
             f"{robot.name} cannot carry {service}: its service type is not installed there; plr doctor there names it"
+        )
+    if service in offered:
+        why = "its configuration does not name it, a node there serves it, or it reaches none of them"
+        raise UnknownNameError(
+            f"{robot.name} carries no service {service}, and clouds offer it that it may call: {why}"
+            if clouds
+            else f"{robot.name} carries no service {service}, and the policy keeps those that offer it from it"
         )
     known = [use.name for use in robot.uses] or offered
     raise UnknownNameError(f"{robot.name} carries no service {service}{_nearest(service, known)}")

@@ -159,7 +159,7 @@ def view_of(
         mapping=(mapping.sent or ())[:MAX_VIEWED],
         misses=tuple(_misses(sidecar.name, use, plan, picture, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
         interfaces=tuple(interfaces[:MAX_VIEWED]),
-        paths_of_services=_paths_of_services(sidecar, mapping.sent, is_offered),
+        paths_of_services=_paths_of_services(sidecar, mapping.sent, is_offered, any(path.up for path in paths)),
         lost={server: at for server in unreached if (at := reached.by(sidecar.name, server)) is not None},
         unproven=frozenset(server for server in unreached if not reached.witnesses(server)),
         doubted=frozenset(
@@ -186,15 +186,18 @@ def _served(
 
 
 def _paths_of_services(
-    sidecar: Sidecar, sent: tuple[ServiceMapping, ...] | None, is_offered: Callable[[ServiceName], bool]
+    sidecar: Sidecar, sent: tuple[ServiceMapping, ...] | None, is_offered: Callable[[ServiceName], bool], reaches: bool
 ) -> tuple[tuple[ServiceName, int], ...]:
     """What the robot carries, as told last, if it was told; and what it wants and nobody serves: by what it says, or
-    since it carried that until no cloud that it may call offered it."""
+    since it carried that until no cloud that it may call offered it; or it says that it reaches none of those who serve
+    it, and `reaches` others."""
     told = {mapping.service: len(mapping.assignments) for mapping in sent or ()}
     carries = [use.name for use in sidecar.uses]
     found = {name: told[name] for name in carries[:MAX_VIEWED] if name in told}
     given_up = sorted(name for name in sidecar.carried.difference(carries) if not is_offered(name))
-    lacks = {name: 0 for name in (*sidecar.unmet, *given_up) if name not in found}
+    # Who reaches no server at all has a trouble of its own.
+    unreached = sidecar.unreached if reaches else ()
+    lacks = {name: 0 for name in (*sidecar.unmet, *unreached, *given_up) if name not in found}
     return tuple(islice((found | lacks).items(), MAX_VIEWED))
 
 

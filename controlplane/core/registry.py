@@ -138,6 +138,11 @@ class Sidecar:
         return self.services.unmet if self.services is not None else ()
 
     @property
+    def unreached(self) -> tuple[ServiceName, ...]:
+        """Services that its configuration names and servers offer that it knows of, none of which it reaches."""
+        return self.services.unreached if self.services is not None else ()
+
+    @property
     def untyped(self) -> tuple[ServiceName, ...]:
         """Services that it would carry or offer if their type were installed there."""
         return self.services.untyped if self.services is not None else ()

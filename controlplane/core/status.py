@@ -71,6 +71,7 @@ def statuses(
             revocations=sidecar.revocations,
             unmet=sidecar.unmet,
             untyped=sidecar.untyped,
+            unreached=sidecar.unreached,
             down=tuple(label.interface for label in sidecar.down),
             withdrawn=tuple(sorted(sidecar.withdrawn.difference(sidecar.unmet))),
             unanswered={

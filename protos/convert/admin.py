@@ -93,6 +93,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         revocations=revocations_from_proto(message.revocations),
         unmet=service_names(message.unmet, MAX_UNMET, "unmet"),
         untyped=service_names(message.untyped, MAX_UNMET, "untyped"),
+        unreached=service_names(message.unreached, MAX_UNMET, "unreached"),
         down=interface_names(message.down, "down"),
         withdrawn=service_names(message.withdrawn, MAX_OFFERS, "withdrawn"),
         unanswered=_unanswered_from_proto(message.unanswered),
@@ -115,6 +116,7 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         revocations=revocations_to_proto(status.revocations),
         unmet=status.unmet,
         untyped=status.untyped,
+        unreached=status.unreached,
         down=status.down,
         withdrawn=status.withdrawn,
         unanswered=(

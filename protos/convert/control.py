@@ -133,7 +133,8 @@ def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMe
             unique((use.name for use in uses), "uses")
             unmet = service_names(message.services.unmet, MAX_UNMET, "unmet")
             untyped = service_names(message.services.untyped, MAX_UNMET, "untyped")
-            return ServiceSet(offers_from_proto(message.services.offers), uses, unmet, untyped)
+            unreached = service_names(message.services.unreached, MAX_UNMET, "unreached")
+            return ServiceSet(offers_from_proto(message.services.offers), uses, unmet, untyped, unreached)
         case "report":
             return report_from_proto(message.report)
         case "ack":
@@ -194,9 +195,13 @@ def sidecar_message_to_proto(value: SidecarMessage) -> control_pb2.SidecarMessag
             return control_pb2.SidecarMessage(register=_registration_to_proto(value))
         case CandidateSet():
             return control_pb2.SidecarMessage(candidates=_candidate_set_to_proto(value))
-        case ServiceSet(offers=offers, uses=uses, unmet=unmet, untyped=untyped):
+        case ServiceSet(offers=offers, uses=uses, unmet=unmet, untyped=untyped, unreached=unreached):
             services = control_pb2.Services(
-                offers=map(offer_to_proto, offers), uses=map(use_to_proto, uses), unmet=unmet, untyped=untyped
+                offers=map(offer_to_proto, offers),
+                uses=map(use_to_proto, uses),
+                unmet=unmet,
+                untyped=untyped,
+                unreached=unreached,
             )
             return control_pb2.SidecarMessage(services=services)
         case Report():

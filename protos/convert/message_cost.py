@@ -22,7 +22,7 @@ _NAMES = {field.number: field.name for field in control_pb2.SidecarMessage.DESCR
 
 _ELEMENTS = {
     "candidates": 3 * MAX_CANDIDATES,
-    "services": MAX_OFFERS + MAX_USES + 2 * MAX_UNMET,
+    "services": MAX_OFFERS + MAX_USES + 3 * MAX_UNMET,
     "report": MAX_LATENCIES + MAX_PATHS + MAX_OUTCOMES + 2 * MAX_JOINTS + MAX_PENALTIES + MAX_GOODBYES,
     "revocations": MAX_CA_CERTIFICATES,
 }

@@ -303,6 +303,10 @@ class Engine:
         peers = map(self.peers.get, self.peers.names())
         return {offer.name for peer in peers if peer is not None for offer in peer.offers}
 
+    def unreached_services(self) -> dict[ServiceName, int]:
+        """Return the services that peers offer and none of these is reached, and how many peers that are."""
+        return self._offers.unreached
+
     def recheck_peers(self, judged: Iterable[Peer], now: float) -> list[NodeName]:
         """Judgements changed: sessions of those bad now end; returns the refused taken, as they are `judged` good."""
         gone, taken = self.peers.recheck(), self.peers.readmit(judged)

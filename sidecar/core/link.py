@@ -140,10 +140,10 @@ class Link:
             case SetReady(ready):
                 self._ready = ready
                 self._probe_what_is_down(now)
-            case SetCarrier(on):
+            case SetCarrier(on, why_not):
                 self._carrier = on
                 if not on:
-                    self._keeper.take_all_down("no carrier")
+                    self._keeper.take_all_down(why_not)
                 self._probe_what_is_down(now)
             case ResetPaths(reason):
                 self._keeper.take_all_down(reason)

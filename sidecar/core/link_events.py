@@ -50,6 +50,8 @@ class SetCarrier:
     """Whether the interface can carry anything: without carrier or address its paths are down at once, unprobed."""
 
     on: bool
+    why_not: str = "no carrier"
+    """For people."""
 
 
 @dataclass(frozen=True, slots=True)

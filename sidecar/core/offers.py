@@ -68,6 +68,17 @@ class Offers:
         return self._offered
 
     @property
+    def unreached(self) -> dict[ServiceName, int]:
+        """Services that peers offer as the configuration wants them, and that are not offered here, as no path leads to
+        one of those peers; and how many these are."""
+        self._choose_touched()
+        return {
+            name: len(servers)
+            for name, (_, servers) in self._wanted.items()
+            if name not in self._offered and name not in self._refused
+        }
+
+    @property
     def conflicts(self) -> set[tuple[ServiceName, NodeName, str]]:
         """Servers left out because they offer another type than the configuration's, or than the rest."""
         self._choose_touched()

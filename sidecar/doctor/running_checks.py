@@ -100,7 +100,16 @@ def stun(state: State) -> Iterator[Finding]:
             else:
                 remedy = "3478/udp of the control plane, a route over this interface, rp_filter"
                 yield warn("stun", f"{what}: {why}", f"look at {remedy}: docs/troubleshooting.md, STUN fails")
-        if not interface["stun"]:
+        if interface["stun"]:
+            continue
+        if families := interface.get("stun_families"):
+            known = " and ".join(f"IPv{family}" for family in families)
+            yield warn(
+                "stun",
+                f"{interface['name']}: no STUN server is known of the family of its addresses, only of {known}",
+                "is there a NAT: name a server that has such an address, in stun.servers or the control plane's DNS",
+            )
+        else:
             yield warn("stun", f"{interface['name']}: no STUN server is known", "is the control plane's name resolved?")
 
 
@@ -293,11 +302,17 @@ def services(state: State) -> Iterator[Finding]:
     node = state.get("node") or {}
     robot = node.get("role") == "robot"
     if robot:
-        who, remedy = "a server that this robot reaches", "see path above, then compare the names: plr status"
+        who, remedy = "a server that this robot knows of", "compare the names: plr status"
     else:
         who, remedy = _domain(node)
     for name in told.get("unmet") or ():
         yield warn("service", f"{name}: configured, and not offered by {who}", remedy)
+    for name in told.get("mismatched") or ():
+        text = f"{name}: served by a node of this host's ROS domain, with a QoS that does not fit"
+        yield warn("service", text, "make the server with the default QoS of services, which is reliable")
+    for name, servers in sorted((told.get("unreached") or {}).items()):
+        text = f"{name}: offered by {servers} servers that this robot knows of, and none of them is reached"
+        yield warn("service", text, "see path")
     for name, nodes in sorted((told.get("left_alone") or {}).items()):
         text = f"{name}: served by {', '.join(nodes)} on this robot, so that it is left alone"
         yield warn("service", text, "stop that node, or rename its service")

@@ -103,6 +103,7 @@ class _Interface(_Entry):
     mtu: Whole = 0
     bound_to: Text = ""
     hangs: Whole = 0
+    stun_families: list[Whole] = []
     stun: list[_Stun] = []
 
 
@@ -121,6 +122,8 @@ class _Services(_Entry):
     left_alone: dict[Text, list[Text]] = {}
     missing_types: dict[Text, Text] = {}
     unmet: list[Text] = []
+    mismatched: list[Text] = []
+    unreached: dict[Text, Whole] = {}
     configured: list[Text] = []
 
 

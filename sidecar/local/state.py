@@ -68,6 +68,8 @@ class LocalState:
     control: Callable[[], ControlView]
     bridge: Callable[[], BridgeStats]
     unmet: Callable[[], Iterable[str]]
+    unreached: Callable[[], Mapping[str, int]]
+    """Services of which servers are known and none is reached, and of how many servers."""
     origin: Callable[[], MappingOrigin | None]
     tls: TlsWatch | None
     clock: ClockFloor
@@ -166,7 +168,9 @@ class LocalState:
                 "carried": {name: types.get(name, "") for name in sorted(bridge.carried)},
                 "left_alone": {name: list(nodes) for name, nodes in bridge.left_alone.items()},
                 "missing_types": dict(bridge.missing_types),
-                "unmet": sorted(self.unmet()),
+                "unmet": sorted(set(self.unmet()) - bridge.mismatched),
+                "mismatched": sorted(bridge.mismatched),
+                "unreached": dict(self.unreached()),
                 "configured": [service.name for service in self.config.services],
             },
         )
@@ -233,6 +237,7 @@ def _interface(view: InterfaceView, now: float) -> dict[str, Any]:
         "mtu": view.mtu,
         "bound_to": view.bound_to,
         "hangs": view.hangs,
+        "stun_families": sorted(one.family for one in view.stun),
         "stun": [
             {
                 "family": one.family,

@@ -221,6 +221,11 @@ class ThreadedDataPlane:
         with self._lock:
             return self._engine.services_of_peers()
 
+    def unreached_services(self) -> dict[ServiceName, int]:
+        """Return the services that peers offer and none of these is reached, and how many peers that are."""
+        with self._lock:
+            return self._engine.unreached_services()
+
     def apply_peers(self, peer_set: PeerSet) -> str | None:
         """Take a view of the peers; returns why it is refused, or None."""
         self._judge(peer_set.peers)

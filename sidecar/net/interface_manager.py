@@ -234,7 +234,7 @@ class InterfaceManager:
     def _suspend(self, managed: ManagedInterface, reason: str) -> None:
         log.warning("%s: %s; its requests take other paths", managed.name, reason)
         with self._lock:
-            managed.suspend()
+            managed.suspend(reason)
 
     def _scan(self) -> None:
         started = time.monotonic()

@@ -72,10 +72,10 @@ class ManagedInterface:
             return True
         return self._bound_address is not None and self._bound_address not in interface.addresses
 
-    def suspend(self) -> None:
-        """It can carry nothing: its paths are down at once."""
+    def suspend(self, reason: str) -> None:
+        """It can carry nothing, for this reason: its paths are down at once."""
         self.suspended = True
-        self._post(SetCarrier(on=False))
+        self._post(SetCarrier(on=False, why_not=reason))
 
     def update(self, interface: Interface) -> bool:
         """Take the interface as it is now; returns whether anything changed for its peers."""

@@ -62,6 +62,11 @@ class LocalServer:
         return bool(self.endpoints) and not self._alive
 
     @property
+    def mismatched(self) -> bool:
+        """Whether one lives and rmw does not connect it with us: its QoS does not fit, or it came a moment ago."""
+        return bool(self._alive) and not self.ready
+
+    @property
     def living(self) -> int:
         """How many of those that the graph shows live; each of them gets every request."""
         return len(self._alive)

@@ -54,5 +54,7 @@ class BridgeStats:
     """Robot: offered services that other nodes already serve here, and those nodes. Replaced, never changed."""
     missing_types: dict[ServiceName, str] = field(default_factory=dict)
     """Services that are not carried because of their type, and that type. Replaced, never changed."""
+    mismatched: frozenset[ServiceName] = frozenset()
+    """Cloud: services with a server that rmw does not connect with us: its QoS does not fit, or it has just come."""
     carried: frozenset[ServiceName] = frozenset()
     """Robot: proxied services that exist. Cloud: services offered to robots."""

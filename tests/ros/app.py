@@ -20,7 +20,7 @@ import rclpy
 from nav_msgs.srv import GetPlan
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import SetBool
 
@@ -29,6 +29,7 @@ LINGER_S = 0.3
 """After the last answer, so that a second answer to a request is seen."""
 DEEP = QoSProfile(depth=1000)
 DEFAULT = QoSProfile(depth=10)
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def say(line: str) -> None:
@@ -60,7 +61,7 @@ def serve(options: argparse.Namespace) -> None:
         response.message = options.node
         return response
 
-    qos = DEEP if options.deep else DEFAULT
+    qos = BEST_EFFORT if options.best_effort else DEEP if options.deep else DEFAULT
     for name in options.plan:
         node.create_service(GetPlan, name, plan, qos_profile=qos, callback_group=group)
     for name in options.negate:
@@ -134,6 +135,7 @@ def main() -> None:
     server.add_argument("--negate", action="append", default=[])
     server.add_argument("--busy-s", type=float, default=0.0, help="seconds of work that block the server")
     server.add_argument("--deep", action="store_true", help="a deep queue instead of the default profile")
+    server.add_argument("--best-effort", action="store_true")
     server.add_argument("--parameters", action="store_true")
     client = commands.add_parser("call")
     client.set_defaults(run=call)

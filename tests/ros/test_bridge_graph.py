@@ -57,6 +57,15 @@ def test_parameters_are_carried_when_named(mesh: Mesh) -> None:
     assert [offer.capacity for offer in mesh.link.offers] == [3]
 
 
+def test_a_server_whose_qos_does_not_fit_is_told_from_none(mesh: Mesh) -> None:
+    mesh.start()
+    mesh.serve("--plan", "/plan", "--best-effort")
+    mesh.serve("--negate", "/negate")
+    mesh.wait_carried("/negate")
+    wait_until(lambda: mesh.cloud.stats.mismatched == {PLAN}, "the mismatch is seen")
+    assert mesh.cloud.stats.carried == {"/negate"}
+
+
 def test_a_name_that_is_served_on_the_robot_is_left_alone(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "sidecar")
     mesh.start()

@@ -8,6 +8,7 @@ import pytest
 
 from controlplane.core.control_events import UnmetNotice
 from controlplane.core.explanation import UnknownNameError
+from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.status_table import render
 from protos.model import NodeName, ServiceName, ServiceSet
 from tests.sim.control_world import SETTLED_S, World
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.audit("ops-5")
 
 WRONG = ServiceName("/plam")
+PLAN = ServiceName("/plan")
 
 
 def events(world: World) -> list[Event]:
@@ -44,7 +46,7 @@ def test_a_cloud_did_not_mean_what_it_offers() -> None:
     cloud = world.cloud("a")
     world.say(cloud, ServiceSet((offer(),), (), (WRONG,)))
     shown = render(world.core.status(world.now))
-    assert "UNMET /plam: configured, and no node there offers it" in shown
+    assert "UNMET /plam: configured, and no node there offers it, or none that can be called" in shown
     assert "did you mean" not in shown
 
 
@@ -55,6 +57,36 @@ def test_explain_suggests_the_name_that_was_meant() -> None:
     world.say(robot, ServiceSet((), (), (WRONG,)))
     with pytest.raises(UnknownNameError, match=r"configured to carry /plam.*did you mean /plan\?"):
         world.core.explain(NodeName("robot"), WRONG, world.now)
+
+
+def test_a_service_whose_servers_are_not_reached_is_told_so_and_blames_no_name() -> None:
+    world = World()
+    world.cloud("a")
+    world.cloud("b")
+    robot = world.robot()
+    world.say(robot, ServiceSet(unreached=(PLAN,)))
+    world.run(SETTLED_S)
+    shown = render(world.core.status(world.now))
+    assert "UNREACHED /plan: servers that it knows of offer it, and it reaches none of them" in shown
+    assert "UNMET" not in shown
+    assert not [event for event in events(world) if isinstance(event, UnmetNotice)]
+    text = r"^robot carries no /plan: it is offered by 2 clouds, and it reaches none of them; plr status robot shows"
+    with pytest.raises(UnknownNameError, match=text):
+        world.core.explain(NodeName("robot"), PLAN, world.now)
+
+
+@pytest.mark.parametrize("told", [ServiceSet(), ServiceSet(unmet=(PLAN,))], ids=["not_configured", "unmet"])
+@pytest.mark.parametrize("calls", ["/plan", "/other"], ids=["allowed", "forbidden"])
+def test_explain_never_suggests_the_very_name(told: ServiceSet, calls: str) -> None:
+    world = World()
+    world.core.set_policy(Policy((CallRule(("*",), (calls,), ("*",)),), (OfferRule(("*",), ("*",)),)), world.now)
+    world.say(world.cloud("a"), ServiceSet((offer(), offer("/other"))))
+    robot = world.robot()
+    world.say(robot, told)
+    with pytest.raises(UnknownNameError) as refused:
+        world.core.explain(NodeName("robot"), PLAN, world.now)
+    assert "did you mean" not in str(refused.value)
+    assert ("the policy keeps" in str(refused.value)) == (calls != "/plan")
 
 
 def test_a_type_that_is_not_installed_is_told_and_blames_no_name() -> None:

@@ -276,6 +276,7 @@ class SidecarStatus(_message.Message):
     WITHDRAWN_FIELD_NUMBER: _builtins.int
     UNANSWERED_FIELD_NUMBER: _builtins.int
     UNTYPED_FIELD_NUMBER: _builtins.int
+    UNREACHED_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
@@ -303,7 +304,7 @@ class SidecarStatus(_message.Message):
     def revocations(self) -> _control_pb2.Revocations: ...
     @_builtins.property
     def unmet(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """Services that its configuration names and nobody serves."""
+        """Services that its configuration names and nobody serves, as far as it knows."""
 
     @_builtins.property
     def down(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
@@ -320,6 +321,10 @@ class SidecarStatus(_message.Message):
     @_builtins.property
     def untyped(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Services that it would carry or offer if their type were installed there."""
+
+    @_builtins.property
+    def unreached(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Robots: services that its configuration names and servers that it knows of offer, none of which it reaches."""
 
     def __init__(
         self,
@@ -341,10 +346,11 @@ class SidecarStatus(_message.Message):
         withdrawn: _abc.Iterable[_builtins.str] | None = ...,
         unanswered: _abc.Iterable[Global___UnansweredService] | None = ...,
         untyped: _abc.Iterable[_builtins.str] | None = ...,
+        unreached: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unanswered", b"unanswered", "unmet", b"unmet", "untyped", b"untyped", "uses", b"uses", "withdrawn", b"withdrawn"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unanswered", b"unanswered", "unmet", b"unmet", "unreached", b"unreached", "untyped", b"untyped", "uses", b"uses", "withdrawn", b"withdrawn"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -250,17 +250,26 @@ class Services(_message.Message):
     USES_FIELD_NUMBER: _builtins.int
     UNMET_FIELD_NUMBER: _builtins.int
     UNTYPED_FIELD_NUMBER: _builtins.int
+    UNREACHED_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def offers(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.ServiceOffer]: ...
     @_builtins.property
     def uses(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.ServiceUse]: ...
     @_builtins.property
     def unmet(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """That the configuration names and nobody serves, some of them if they are many; for the operator's eyes."""
+        """That the configuration names and nobody serves, as far as it knows, some of them if they are many; for the
+        operator's eyes.
+        """
 
     @_builtins.property
     def untyped(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """That somebody serves and it cannot carry or offer, as their type is not installed there; bounded as `unmet` is."""
+
+    @_builtins.property
+    def unreached(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """Robots: that the configuration names and servers that it knows of offer, none of which it reaches; bounded as
+        `unmet` is.
+        """
 
     def __init__(
         self,
@@ -269,10 +278,11 @@ class Services(_message.Message):
         uses: _abc.Iterable[_types_pb2.ServiceUse] | None = ...,
         unmet: _abc.Iterable[_builtins.str] | None = ...,
         untyped: _abc.Iterable[_builtins.str] | None = ...,
+        unreached: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["offers", b"offers", "unmet", b"unmet", "untyped", b"untyped", "uses", b"uses"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["offers", b"offers", "unmet", b"unmet", "unreached", b"unreached", "untyped", b"untyped", "uses", b"uses"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

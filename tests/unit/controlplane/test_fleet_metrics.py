@@ -48,6 +48,7 @@ from protos.model import (
     InterfaceName,
     NodeName,
     OutcomeReport,
+    PathReport,
     RemovalReason,
     Report,
     Role,
@@ -197,6 +198,24 @@ def test_a_service_that_nobody_serves_goes_over_no_path_whoever_says_so() -> Non
     world.leave(robot)
     world.say(world.join(registration("robot")), ServiceSet())
     assert paths() == {}, "another run, which may be configured otherwise"
+
+
+@pytest.mark.audit("ops-12")
+def test_a_service_whose_servers_a_robot_misses_has_no_path_unless_it_misses_all_servers() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    world.cloud("a")
+    world.say(world.cloud("b"), ServiceSet((offer("/other"),)))
+    robot = world.robot()
+    world.say(robot, ServiceSet(unreached=(PLAN,)))
+
+    def paths(*reported: PathReport) -> dict[str, float]:
+        world.say(robot, Report(paths=reported))
+        found = series(families(fleet_of(world)))
+        return {dict(key[1])["service"]: n for key, n in found.items() if key[0] == "plr_robot_service_paths"}
+
+    down = path("wlan0", "a", up=False)
+    assert paths(down, path("wlan0", "b")) == {PLAN: 0.0}
+    assert paths(down, path("wlan0", "b", up=False)) == {}, "PlrRobotNoPath, or PlrServerDown, tells it"
 
 
 def test_a_policy_that_forbids_a_service_leaves_it_no_path() -> None:

@@ -187,6 +187,12 @@ def test_a_lost_carrier_takes_every_path_down_at_once_and_hands_back_what_they_c
     assert [type(item) for item in bench.frames(bench.sent())] == [Introduction]
 
 
+def test_paths_of_an_interface_without_address_are_not_said_to_lack_a_carrier() -> None:
+    bench = up()
+    bench.link.execute(SetCarrier(on=False, why_not="no address"), bench.now)
+    assert PathChanged(PATH, PathState.DOWN, "no address") in bench.events()
+
+
 def test_what_was_under_way_when_the_carrier_went_does_not_bring_the_path_up() -> None:
     bench = up()
     bench.link.execute(Send(PATH, message()), bench.now)

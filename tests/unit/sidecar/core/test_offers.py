@@ -61,6 +61,32 @@ def test_an_unreachable_server_offers_nothing_yet() -> None:
     assert robot.update() == [OfferService(ECHO, TYPE)]
 
 
+def test_what_servers_offer_of_which_none_is_reached_is_told_with_their_number() -> None:
+    robot = Robot(peer(A), peer(B, session=2))
+    robot.reach(A, PathState.DOWN)
+    robot.reach(B, PathState.DOWN)
+    robot.update()
+    assert robot.offers.unreached == {ECHO: 2}
+    robot.reach(B)
+    robot.update()
+    assert robot.offers.unreached == {}
+    robot.reach(B, PathState.DOWN)
+    robot.update(10.0)
+    assert robot.offers.unreached == {}, "it is still offered"
+    robot.update(10.0 + WITHDRAW_AFTER_S)
+    robot.update(11.0 + 2 * WITHDRAW_AFTER_S)
+    assert robot.offers.unreached == {ECHO: 2}
+    robot.set_peers([])
+    assert robot.offers.unreached == {}
+
+
+def test_servers_of_another_type_than_is_wanted_are_none_to_be_reached() -> None:
+    robot = Robot(peer(A), kind="other_interfaces/srv/Other")
+    robot.reach(A, PathState.DOWN)
+    robot.update()
+    assert robot.offers.unreached == {}
+
+
 def test_services_without_a_rule_are_not_carried() -> None:
     robot = Robot(peer(A, offers=(ServiceOffer(ServiceName("/secret"), TYPE),)))
     assert robot.update() == []

@@ -145,6 +145,15 @@ def test_what_stun_says_of_the_nat(of: dict[str, Any], expected: str) -> None:
     assert expected in text
 
 
+def test_stun_servers_of_the_other_family_alone_are_told_from_none() -> None:
+    none = state(interfaces=[interface("wlan0", stun=[], stun_families=[])])
+    assert "no STUN server is known;" in f"{texts(running_checks.stun(none), Level.WARN)[0]};"
+    other = state(interfaces=[interface("wlan0", addresses=["fd00:1::9"], stun=[], stun_families=[4])])
+    (text,) = texts(running_checks.stun(other), Level.WARN)
+    assert "no STUN server is known of the family of its addresses, only of IPv4" in text
+    assert "resolved" not in text
+
+
 def test_stun_that_is_not_answered_is_warned_of_unless_the_other_family_is() -> None:
     silent = stun(mapping=None, answered_s=None, problem="no answer from 192.0.2.9:3478")
     alone = state(interfaces=[interface("wlan0", stun=[silent])])
@@ -182,6 +191,19 @@ def test_who_is_gone_is_told_until_it_is_back() -> None:
 def test_services() -> None:
     told = {"carried": {}, "unmet": ["/plan"], "left_alone": {"/map": ["/map_server"]}, "missing_types": {}}
     assert len(texts(running_checks.services(state(services=told)), Level.WARN)) == 3
+
+
+def test_a_server_whose_qos_does_not_fit_blames_no_name() -> None:
+    told = {"carried": {"/map": "nav_msgs/srv/GetMap"}, "unmet": [], "mismatched": ["/plan"]}
+    (finding,) = [one for one in running_checks.services(state(services=told)) if one.level is Level.WARN]
+    assert "with a QoS that does not fit" in finding.text
+    assert "reliable" in finding.remedy
+
+
+def test_a_service_whose_servers_are_not_reached_is_not_told_as_a_wrong_name() -> None:
+    told = {"carried": {"/map": "nav_msgs/srv/GetMap"}, "unmet": [], "unreached": {"/plan": 2}}
+    (text,) = texts(running_checks.services(state(services=told)), Level.WARN)
+    assert text.startswith("/plan: offered by 2 servers that this robot knows of, and none of them is reached")
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 
 from protos.model import InterfaceName, Role
 from sidecar.config import SidecarConfig, StunConfig
+from sidecar.core.link_events import SetCarrier
 from sidecar.core.scan_schedule import RETRY_S
 from sidecar.net import interface_manager as module
 from sidecar.net.interface_manager import InterfaceManager
@@ -95,6 +96,14 @@ def test_an_interface_without_carrier_keeps_its_thread_and_is_offered_to_nobody(
     host.look(LO)
     assert addresses(host) == ["127.0.0.1"]
     assert host.links[LO.name] is thread
+
+
+def test_an_interface_that_lost_its_address_says_so(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+    host.look(LO)
+    posted: list[object] = []
+    monkeypatch.setattr(host.manager._managed[LO.name], "_post", posted.append)
+    host.look(replace(LO, addresses=()))
+    assert posted == [SetCarrier(on=False, why_not="no address")]
 
 
 @pytest.mark.audit("ops-13")
