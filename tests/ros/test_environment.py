@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib.machinery import EXTENSION_SUFFIXES
 from typing import TYPE_CHECKING
 
 import pytest
@@ -109,6 +110,7 @@ def test_a_library_that_rclpy_does_not_find_is_named_in_one_line(tmp_path: Path,
     (tmp_path / "rclpy" / "__init__.py").write_text(
         "raise ImportError('librcl.so: cannot open shared object file: No such file or directory\\nsee elsewhere')\n"
     )
+    (tmp_path / "rclpy" / f"_rclpy_pybind11{EXTENSION_SUFFIXES[0]}").touch()
     argv = [sys.executable, "-m", "sidecar", "--config", str(config), *(["--check-config"] if check else [])]
     environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(argv, env=environ, capture_output=True, text=True, timeout=120, check=False)
