@@ -42,10 +42,6 @@ MAX_SERIES_OF_SERVICES = 20_000
 MAX_GONE = 1024
 """Members that are gone and still have series, those that went last."""
 
-TOGETHER_S = 60.0
-"""Who reached a server last within so long before the last of them did has lost it together with that one: robots
-report every ten seconds at least."""
-
 REUSED_S = 1.0
 """Scrapes within this time share their values."""
 
@@ -222,7 +218,6 @@ def _servers(fleet: Fleet) -> Metric:
     def reach() -> Iterator[tuple[Labels, float]]:
         counts: Counter[tuple[NodeName, str]] = Counter()
         doubted: Counter[NodeName] = Counter()
-        lost_at: dict[NodeName, list[float]] = {}
         for robot in fleet.members:
             reaches = {path.server for path in robot.paths if path.up}
             # Who reaches nobody has a trouble of its own.
@@ -230,22 +225,15 @@ def _servers(fleet: Fleet) -> Metric:
                 counts.update((server, "up") for server in reaches)
                 counts.update((server, "never") for server in robot.unproven)
                 doubted.update(robot.doubted)
-                for server, at in robot.lost.items():
-                    lost_at.setdefault(server, []).append(at)
+                counts.update((server, "lost") for server in robot.lost)
         # That one says that it did proves nothing against two.
         counts.update({(server, "never"): count for server, count in doubted.items() if count > 1})
-        for server, times in lost_at.items():
-            counts[server, "lost"] = len(times)
-            counts[server, "lost_together"] = sum(at >= max(times) - TOGETHER_S for at in times)
         for member in fleet.members:
             if member.role is Role.CLOUD:
-                for path in ("up", "lost", "lost_together", "never"):
+                for path in ("up", "lost", "never"):
                     yield (member.name, path), float(counts[member.name, path])
 
-    text = (
-        "Robots that reach the server (up), or only others: those that reached it before (lost), those that lost it "
-        "when the last one did (lost_together), or all (never)."
-    )
+    text = "Robots that reach the server (up), or only others: those that reached it before (lost), or all (never)."
     return _gauge("plr_server_robots", text, ("server", "path"), reach)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from typing import TYPE_CHECKING
 
 from controlplane.text_table import columns, listed, shortened
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
 
     from protos.model import PathReport, ServiceMapping
     from protos.status import ResourceStatus, SidecarStatus
+
+_WARNS = re.compile(r"\b[A-Z]{4,}\b")
+"""Lines about what is wrong have a word in capitals."""
 
 MAX_LINES = 256
 """On one sidecar: what it says that it offers, lacks or reaches must not hide the others."""
@@ -44,6 +48,8 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
         details = [*_details(status), *_unmet(status, offered), *_untyped(status), *_unserved(status)]
         details += _revocations(status.revocations, of_own, now_wall)
         if details:
+            if len(details) > MAX_LINES:
+                details.sort(key=lambda line: _WARNS.search(line) is None)
             shown = (shortened(line, MAX_LINE) for line in details[:MAX_LINES])
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in shown)]
         if len(details) > MAX_LINES:

@@ -211,8 +211,10 @@ class Sidecar:
         stats = self._bridge.stats
         met = {*stats.carried, *stats.left_alone, *stats.missing_types}
         before = self._unmet.unmet, set(self._unmet.unreached), self._untyped
-        unreached = self._data_plane.unreached_services() if self._config.role is Role.ROBOT else {}
-        news = self._unmet.look(met, unreached, time.monotonic())
+        robot = self._config.role is Role.ROBOT
+        unreached = self._data_plane.unreached_services() if robot else {}
+        coming = self._data_plane.services_of_peers() if robot else stats.mismatched
+        news = self._unmet.look(met, unreached, time.monotonic(), coming)
         self._untyped = frozenset(stats.missing_types)
         if (self._unmet.unmet, set(self._unmet.unreached), self._untyped) != before:
             self._on_services_changed()
@@ -221,7 +223,7 @@ class Sidecar:
                 line = told_unreached(name, servers)
             elif name in stats.mismatched:
                 line = told_mismatched(name)
-            elif self._config.role is Role.ROBOT:
+            elif robot:
                 line = told(name, self._data_plane.services_of_peers(), "no server that this robot knows of")
             else:
                 line = told(name, stats.carried, "no node of this host's ROS domain")

@@ -30,10 +30,22 @@ class UnmetServices:
         """Those that nobody served at the last look."""
         self.unreached: Mapping[str, int] = {}
         """Those that some serve of whom none was reached at the last look, and how many these are."""
+        self._coming: frozenset[str] = frozenset()
+        """Those that somebody served at the last look; it may have begun a moment before."""
 
-    def look(self, met: Collection[ServiceName], unreached: Mapping[ServiceName, int], now: float) -> list[str]:
+    def look(
+        self,
+        met: Collection[ServiceName],
+        unreached: Mapping[ServiceName, int],
+        now: float,
+        coming: Iterable[ServiceName] = (),
+    ) -> list[str]:
         """Note which are served now, and how many servers of others are known and not reached; return those never seen
-        served, each once, when it is time to tell of them."""
+        served, each once, when it is time to tell of them.
+
+        `coming`: those that somebody serves, whether or not they can be had: it takes a moment until they can.
+        """
+        before, self._coming = self._coming, frozenset(coming)
         if now < self._judged_from:
             self._told.update(name for name in self._names if name in met)
             return []
@@ -41,7 +53,8 @@ class UnmetServices:
         self.unreached = {name: servers for name in lacking if (servers := unreached.get(ServiceName(name), 0))}
         self.unmet = frozenset(name for name in lacking if name not in self.unreached)
         self._told.update(name for name in self._names if name in met)
-        news = [name for name in self._names if name not in self._told]
+        just_come = self._coming - before
+        news = [name for name in self._names if name not in self._told and name not in just_come]
         self._told.update(news)
         return news
 

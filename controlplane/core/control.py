@@ -288,7 +288,7 @@ class ControlCore:
         self.counters.report_entries_forbidden += left_out
         for path in report.paths:
             if path.up:
-                self.reached.note(name, path.server, now)
+                self.reached.note(name, path.server)
         self.unanswered.note(name, report.latencies, now)
         surprised = self._drawing.reported(name, report)
         change = Change.MISSES if surprised else Change.REPORT

@@ -4,7 +4,7 @@ another thread while the core goes on. Times are monotonic seconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from protos.model import Role
 from protos.status import SyncState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from controlplane.core.estimator import Estimator
     from controlplane.core.picture import Picture
@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 
 MAX_VIEWED = 512
 """Paths, and services, of one robot that are looked at."""
+
+MAX_GIVEN_UP = 64
+"""Services of one robot, which it carried and does not carry now, of which is looked at whether they are offered: that
+takes a look at each cloud that offers them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +98,8 @@ class MemberView:
     interfaces: tuple[InterfaceView, ...] = ()
     paths_of_services: tuple[tuple[ServiceName, int], ...] = ()
     """Over how many paths requests go, of each service that it was told of or cannot have."""
-    lost: Mapping[NodeName, float] = field(default_factory=dict)
-    """Servers that it does not reach, and did, and when it did last."""
+    lost: frozenset[NodeName] = frozenset()
+    """Servers that it does not reach, and did."""
     unproven: frozenset[NodeName] = frozenset()
     """Servers that it does not reach, and nobody ever has."""
     doubted: frozenset[NodeName] = frozenset()
@@ -160,12 +164,10 @@ def view_of(
         misses=tuple(_misses(sidecar.name, use, plan, picture, estimator, now) for use in sidecar.uses[:MAX_VIEWED]),
         interfaces=tuple(interfaces[:MAX_VIEWED]),
         paths_of_services=_paths_of_services(sidecar, mapping.sent, is_offered, any(path.up for path in paths)),
-        lost={server: at for server in unreached if (at := reached.by(sidecar.name, server)) is not None},
+        lost=frozenset(server for server in unreached if reached.by(sidecar.name, server)),
         unproven=frozenset(server for server in unreached if not reached.witnesses(server)),
         doubted=frozenset(
-            server
-            for server in unreached
-            if reached.witnesses(server) == 1 and reached.by(sidecar.name, server) is None
+            server for server in unreached if reached.witnesses(server) == 1 and not reached.by(sidecar.name, server)
         ),
         follows=mapping.state not in (SyncState.STALE, SyncState.REJECTED),
         servers=len(peers.peers) if peers is not None else 0,
@@ -194,7 +196,8 @@ def _paths_of_services(
     told = {mapping.service: len(mapping.assignments) for mapping in sent or ()}
     carries = [use.name for use in sidecar.uses]
     found = {name: told[name] for name in carries[:MAX_VIEWED] if name in told}
-    given_up = sorted(name for name in sidecar.carried.difference(carries) if not is_offered(name))
+    wanted = islice(sorted(sidecar.carried.difference(carries)), MAX_GIVEN_UP)
+    given_up = [name for name in wanted if not is_offered(name)]
     # Who reaches no server at all has a trouble of its own.
     unreached = sidecar.unreached if reaches else ()
     lacks = {name: 0 for name in (*sidecar.unmet, *unreached, *given_up) if name not in found}

@@ -64,7 +64,7 @@ class Permits:
         if self._policy is None:
             return ALL_CALLS
         known = self._permits.get((group, cloud.name))
-        if known is not None and known[0] == cloud.offered:
+        if known is not None and (known[0] is cloud.offered or known[0] == cloud.offered):
             return known[1]
         rules = [self._policy.calls[index] for index in group]
         names = frozenset(

@@ -2,7 +2,7 @@
 
 A robot may be told of servers that no network leads it to (another site's). That it does not reach these says nothing;
 that it does not reach one that it did reach does. One robot may be hacked: that it reaches a server, or did, proves
-nothing against two that do not.
+nothing against two that do not: of a server that nobody else ever reached.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ MAX_PAIRS = 131_072
 
 
 class Reached:
-    """Remembers it since the start. Times are monotonic seconds."""
+    """Remembers it since the start."""
 
     def __init__(self) -> None:
-        self._pairs: OrderedDict[tuple[NodeName, NodeName], float] = OrderedDict()
-        """When it did last, the longest ago first."""
+        self._pairs: OrderedDict[tuple[NodeName, NodeName], None] = OrderedDict()
+        """The one that was noted longest ago first."""
         self._servers_of: dict[NodeName, set[NodeName]] = {}
         self._robots_of: Counter[NodeName] = Counter()
         self.forgotten = 0
@@ -31,11 +31,11 @@ class Reached:
     def __len__(self) -> int:
         return len(self._pairs)
 
-    def note(self, robot: NodeName, server: NodeName, now: float) -> None:
+    def note(self, robot: NodeName, server: NodeName) -> None:
         """The robot reaches the server now."""
         pair = (robot, server)
         known = pair in self._pairs
-        self._pairs[pair] = now
+        self._pairs[pair] = None
         if known:
             self._pairs.move_to_end(pair)
             return
@@ -60,9 +60,9 @@ class Reached:
         for server in list(self._servers_of.get(robot, ())):
             self._drop(robot, server)
 
-    def by(self, robot: NodeName, server: NodeName) -> float | None:
-        """When this robot reached the server last; None: never."""
-        return self._pairs.get((robot, server))
+    def by(self, robot: NodeName, server: NodeName) -> bool:
+        """Whether this robot ever reached the server."""
+        return (robot, server) in self._pairs
 
     def witnesses(self, server: NodeName) -> int:
         """How many robots, there or gone, have."""

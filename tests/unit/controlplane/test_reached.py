@@ -15,25 +15,25 @@ A, B = NodeName("a"), NodeName("b")
 
 def test_it_is_remembered_by_robot_and_by_server() -> None:
     reached = Reached()
-    reached.note(NodeName("robot"), A, 7.0)
-    assert reached.by(NodeName("robot"), A) == 7.0
-    assert reached.by(NodeName("other"), A) is None
+    reached.note(NodeName("robot"), A)
+    assert reached.by(NodeName("robot"), A)
+    assert not reached.by(NodeName("other"), A)
     assert (reached.witnesses(A), reached.witnesses(B)) == (1, 0)
-    reached.note(NodeName("other"), A, 8.0)
-    reached.note(NodeName("robot"), A, 9.0)
-    assert (reached.by(NodeName("robot"), A), reached.witnesses(A)) == (9.0, 2)
+    reached.note(NodeName("other"), A)
+    reached.note(NodeName("robot"), A)
+    assert (reached.by(NodeName("robot"), A), reached.witnesses(A)) == (True, 2)
     reached.forget(NodeName("robot"))
-    assert (reached.by(NodeName("robot"), A), reached.witnesses(A), len(reached)) == (None, 1, 1)
+    assert (reached.by(NodeName("robot"), A), reached.witnesses(A), len(reached)) == (False, 1, 1)
 
 
 def test_who_reached_longest_ago_is_forgotten_first_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_PAIRS", 2)
     reached = Reached()
     first, second, third = (NodeName(f"robot-{number}") for number in range(3))
-    reached.note(first, A, 1.0)
-    reached.note(second, B, 1.0)
-    reached.note(first, A, 1.0)
-    reached.note(third, A, 1.0)
+    reached.note(first, A)
+    reached.note(second, B)
+    reached.note(first, A)
+    reached.note(third, A)
     assert (len(reached), reached.forgotten) == (2, 1)
-    assert reached.by(first, A) is not None
+    assert reached.by(first, A)
     assert reached.witnesses(B) == 0

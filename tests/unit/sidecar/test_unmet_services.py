@@ -45,6 +45,13 @@ def test_what_known_servers_offer_is_not_unmet_though_none_is_reached() -> None:
     assert unmet.unreached == {WHERE: 1}
 
 
+def test_what_came_a_moment_ago_is_not_blamed() -> None:
+    unmet = UnmetServices([PLAN, WHERE], 0.0)
+    unmet.look(set(), {}, GRACE_S - 1.0, [PLAN])
+    assert unmet.look(set(), {WHERE: 1}, GRACE_S + 1.0, [PLAN, WHERE]) == [PLAN]
+    assert unmet.look({PLAN}, {}, GRACE_S + 3.0, [PLAN, WHERE]) == [WHERE], "it lasts"
+
+
 def test_a_server_whose_qos_does_not_fit_is_told_with_its_cure() -> None:
     assert told_mismatched(PLAN) == (
         "service /plan is served by a node of this host's ROS domain, with a QoS that does not fit: make it reliable, "
