@@ -272,7 +272,7 @@ def test_plr_status_shows_who_uses_which_revocation_list(plane: SecuredControlPl
     with Robot(plane.address, tmp_path / "tls", "robot-8") as robot:
         robot.client.set_revocations(revocation_set(old, too_old=1))
         robot.welcomes.get(timeout=PATIENCE_S)
-        behind = f"revocation list {was.number}, signed 0.0 days ago: OLDER than {now.number}, which others have"
+        behind = f"revocation list {was.number}, signed 0.0 days ago: OLDER than the control plane's {now.number}"
         while behind not in (text := shown()):
             assert f"control plane: revocation list {now.number}, signed 0.0 days ago" in text
         assert "REVOCATION LIST TOO OLD of 1 CAs" in text
