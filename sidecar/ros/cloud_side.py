@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceOffer
@@ -280,7 +281,7 @@ class CloudSide:
 
     def _look_at(self, runner: ServiceRunner, now: float) -> None:
         """A server that is gone, though another came since, will not answer what it was asked."""
-        if runner.server.look(self._is_dead, now):
+        if runner.server.look(partial(self._is_dead, runner), now):
             log.warning("service %s: its server is gone or was replaced by another", runner.name)
             self._give_up_executions(runner, "the server was replaced")
         for endpoint in runner.server.endpoints:
@@ -369,8 +370,20 @@ class CloudSide:
 
     # -- whether the servers live -----------------------------------------------------------------------------------
 
-    def _is_dead(self, endpoint: bytes) -> bool:
-        return self._processes.has_ended(endpoint) or self._roll_call.is_silent(endpoint)
+    def _is_dead(self, runner: ServiceRunner, endpoint: bytes) -> bool:
+        """Whether it ended, or is silent and was not before.
+
+        One that has only just started answers nothing either, until it has found us: on a busy machine in seconds.
+        """
+        if self._processes.has_ended(endpoint):
+            return True
+        if not self._roll_call.is_silent(endpoint):
+            return False
+        return (
+            runner.server.has_answered(endpoint)
+            or self._roll_call.has_ever_heard(endpoint)
+            or not self._processes.watches(endpoint)
+        )
 
     def _is_alive_since(self, runner: ServiceRunner, since: float) -> bool:
         """Whether one of its servers lives: its end would have been noticed, or it was heard since then.
@@ -404,7 +417,7 @@ class CloudSide:
     def _notice_silence(self) -> None:
         """What was handed to a server that shows no sign of life may still be answered; the rest need not wait."""
         why = "the server shows no sign of life"
-        hit = [runner for runner in self._runners.values() if runner.server.strike_out(self._is_dead)]
+        hit = [runner for runner in self._runners.values() if runner.server.strike_out(partial(self._is_dead, runner))]
         if hit:
             log.warning("a server shows no sign of life: %s", " ".join(sorted(runner.name for runner in hit)))
         for runner in hit:

@@ -49,6 +49,10 @@ class RollCall:
         """Whether its participant answered a call since then, or can not be asked at all."""
         return not self._topic.usable or self._heard_at.get(participant_of(endpoint), -math.inf) >= since
 
+    def has_ever_heard(self, endpoint: bytes) -> bool:
+        """Whether its participant answered a call since the graph shows it."""
+        return participant_of(endpoint) in self._heard_at
+
     @property
     def under_way(self) -> bool:
         """Whether somebody was asked, and `turn` is wanted in POLL_S."""

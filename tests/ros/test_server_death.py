@@ -181,6 +181,7 @@ def test_a_server_that_hangs_and_is_killed_then(mesh: Mesh) -> None:
     mesh.start()
     server = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
+    assert mesh.result(mesh.call("/plan"))["answered"] == 1
     server.send(signal.SIGSTOP)
     stopped_at = time.monotonic()
     mesh.call("/plan", "--count", "60", "--tolerance", "-1", "--timeout-s", "1")
@@ -198,12 +199,15 @@ def test_a_server_that_hangs_and_is_killed_then(mesh: Mesh) -> None:
 
 
 @pytest.mark.audit("dp-15")
-def test_a_server_that_waits_for_a_processor_is_not_dead(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a machine that is too busy nobody answers in time."""
-    monkeypatch.setattr("sidecar.ros.server_processes.wants_processor", lambda _pidfd: True)
+@pytest.mark.parametrize("why", ["it waits for a processor", "it has only just started"])
+def test_silence_that_tells_nothing_is_no_death(mesh: Mesh, monkeypatch: pytest.MonkeyPatch, why: str) -> None:
+    """On a machine that is too busy nobody answers in time, nor finds the others in time."""
     mesh.start()
     server = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
+    if why == "it waits for a processor":
+        monkeypatch.setattr("sidecar.ros.server_processes.wants_processor", lambda _pidfd: True)
+        assert mesh.result(mesh.call("/plan"))["answered"] == 1
     server.send(signal.SIGSTOP)
     program = mesh.call("/plan", "--timeout-s", "30")
     wait_until(lambda: mesh.cloud.stats.pending, "the request")
