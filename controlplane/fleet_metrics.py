@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 MAX_SERIES = 100_000
 """Of all members."""
 
-SERIES_OF_MEMBER = 7
+SERIES_OF_MEMBER = 6
 """Of each at most, there or gone, beside a robot's own and a server's by service: a server's."""
 
 MAX_SERIES_OF_SERVICES = 20_000

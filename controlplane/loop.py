@@ -496,9 +496,10 @@ class ControlLoop:
         """What the driver itself left out or put off, by reason."""
         return {
             "report_slowed": self.report_shares.slowed,
-            "report_share_forgotten": self.report_shares.forgotten,
             "log_line_left_out": self._lines.left_out,
-            "log_share_forgotten": self._lines.forgotten,
+            "share_forgotten": self._core.shares_forgotten
+            + self.report_shares.members.forgotten
+            + self._lines.shares.forgotten,
         }
 
     def close_streams(self) -> None:

@@ -41,9 +41,8 @@ NO_EVENTS = EventLogState()
 
 NOTHING_DROPPED: Mapping[str, int] = {
     "report_slowed": 0,
-    "report_share_forgotten": 0,
     "log_line_left_out": 0,
-    "log_share_forgotten": 0,
+    "share_forgotten": 0,
 }
 
 REFUSAL_REASONS = (

@@ -18,11 +18,11 @@ from controlplane.core.compute import MAX_PROCESSING
 from controlplane.core.control_events import Settings
 from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED
 from controlplane.core.mapping_history import MAX_CHANGES, MAX_HISTORIES
+from controlplane.core.member_table import MAX_MEMBERS
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.publisher import MAX_GONE_SNAPSHOTS
 from controlplane.core.reached import MAX_PAIRS
 from controlplane.core.registry import MAX_REMEMBERED_REMOVALS
-from controlplane.core.restlessness import MAX_MEMBERS
 from protos.model import InterfaceName, NodeName, RemovalReason, Role, ServiceName, ServiceOffer, ServiceSet, ServiceUse
 
 if TYPE_CHECKING:
@@ -62,8 +62,10 @@ CAPPED = {
     "reached._robots_of": MAX_PAIRS,
     "reached._servers_of": MAX_PAIRS,
     "history._histories[].changes": MAX_HISTORIES * MAX_CHANGES,
-    "restlessness._shares": MAX_MEMBERS,
-    "registry._shares._shares": MAX_MEMBERS,
+    "restlessness.shares._kept": MAX_MEMBERS,
+    "urgency.shares._kept": MAX_MEMBERS,
+    "registry.postponed.shares._kept": MAX_MEMBERS,
+    "registry._shares.shares._kept": MAX_MEMBERS,
     "registry._removals": MAX_REMEMBERED_REMOVALS,
     "_publisher._gone": MAX_GONE_SNAPSHOTS,
     "estimator._compute._servers": MAX_PROCESSING,

@@ -664,6 +664,11 @@ class ControlCore:
 
     # ── what the operator sees ──
 
+    @property
+    def shares_forgotten(self) -> int:
+        """Members whose share of something began afresh for want of room."""
+        return self.registry.shares_forgotten + self.restlessness.shares.forgotten + self.urgency.shares.forgotten
+
     def status(
         self, now: float, names: Iterable[NodeName] | None = None, *, abridged: bool = False
     ) -> list[SidecarStatus]:

@@ -5,9 +5,9 @@ Or that one member lets bytes come of which nothing can be made: so each member 
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import TYPE_CHECKING
 
+from controlplane.core.member_table import MemberTable
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
@@ -19,23 +19,14 @@ COUNTED_BURST = 2.0
 COUNTED_PER_S = 2.0 / 300.0
 """After that: in the five minutes that the alert looks at, less than half of what calls it."""
 
-MAX_MEMBERS = 8192
-"""Members that are counted, the one put off longest ago goes: twice those that can be registered."""
-
 
 class Postponed:
     """Counts them. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        self._shares: OrderedDict[NodeName, TokenBucket] = OrderedDict()
+        self.shares = MemberTable(lambda now: TokenBucket(rate=COUNTED_PER_S, burst=COUNTED_BURST, now=now))
         self.counted = 0
 
     def note(self, name: NodeName, now: float) -> None:
         """The lease of this member is put off."""
-        share = self._shares.get(name)
-        if share is None:
-            share = self._shares[name] = TokenBucket(rate=COUNTED_PER_S, burst=COUNTED_BURST, now=now)
-            if len(self._shares) > MAX_MEMBERS:
-                self._shares.popitem(last=False)
-        self._shares.move_to_end(name)
-        self.counted += share.take(now)
+        self.counted += self.shares.of(name, now).take(now)

@@ -366,6 +366,11 @@ class Registry:
                 if not clouds:
                     del self._offering[offer.name]
 
+    @property
+    def shares_forgotten(self) -> int:
+        """Members whose shares of what the registry counts began afresh for want of room."""
+        return self._shares.shares.forgotten + self.postponed.shares.forgotten
+
     def offering(self, service: ServiceName) -> Iterator[Sidecar]:
         """The registered clouds that offer it, whether or not they may."""
         return (self._sidecars[name] for name in self._offering.get(service, ()))

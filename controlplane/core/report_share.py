@@ -12,9 +12,10 @@ Times are monotonic seconds.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from controlplane.core.member_table import MemberTable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -47,9 +48,6 @@ BUSY_WEIGHT = 0.3
 MEMORY_S = 3.0
 """Entries count for about so long: a flood is noticed within a second or two."""
 
-MAX_MEMBERS = 8192
-"""Members whose entries are counted, the one that reported longest ago goes: twice those that can be registered."""
-
 
 @dataclass(slots=True)
 class _Member:
@@ -59,17 +57,20 @@ class _Member:
     """Entries taken lately, those of long ago less and less."""
     at: float
 
+    @classmethod
+    def begin(cls, now: float) -> _Member:
+        return cls(0.0, 0.0, now)
+
 
 class ReportShares:
     """Counts the entries of each member, however many streams it opens."""
 
     def __init__(self) -> None:
-        self._members: OrderedDict[NodeName, _Member] = OrderedDict()
+        self.members = MemberTable(_Member.begin)
         self._level = math.inf
         self._busy = 0.0
         self.slowed = 0
         """Times that a member was not read for a while."""
-        self.forgotten = 0
 
     @property
     def entries_per_s(self) -> float:
@@ -78,13 +79,7 @@ class ReportShares:
 
     def take(self, name: NodeName, entries: int, now: float) -> bool:
         """A report of so many entries was read; whether nothing more is to be read of this member for a while."""
-        member = self._members.get(name)
-        if member is None:
-            member = self._members[name] = _Member(0.0, 0.0, now)
-            if len(self._members) > MAX_MEMBERS:
-                self._members.popitem(last=False)
-                self.forgotten += 1
-        self._members.move_to_end(name)
+        member = self.members.of(name, now)
         self._pass(member, now)
         member.debt += entries
         member.recent += entries
@@ -94,7 +89,7 @@ class ReportShares:
 
     def wait_s(self, name: NodeName, now: float) -> float:
         """For how long nothing more is to be read of this member, as the level is now."""
-        member = self._members.get(name)
+        member = self.members.get(name)
         if member is None:
             return 0.0
         self._pass(member, now)
@@ -117,7 +112,7 @@ class ReportShares:
             self._level = self._level * RISE if self._level < ENTRIES_PER_S else math.inf
         elif self._busy > BUSY:
             rates = []
-            for member in self._members.values():
+            for member in self.members.values():
                 self._pass(member, now)
                 rates.append(member.recent / MEMORY_S)
             room = max(sum(rates) * BUSY / self._busy, LEAST_ENTRIES_PER_S)

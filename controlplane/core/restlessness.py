@@ -6,10 +6,10 @@ that others know of the member is told again: if that is much, it has a share of
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from controlplane.core.member_table import MemberTable
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
@@ -36,9 +36,6 @@ the last ones with 10 kB each."""
 BYTES_PER_S = 1000.0
 """After that: what a robot's control stream takes anyway, on a link that is billed."""
 
-MAX_MEMBERS = 8192
-"""Members whose changes are counted, the one that changed longest ago goes: twice those that can be registered."""
-
 
 @dataclass(slots=True)
 class _Share:
@@ -46,6 +43,10 @@ class _Share:
     told_bytes: float
     """Told, and not paid for by time yet."""
     at: float
+
+    @classmethod
+    def begin(cls, now: float) -> _Share:
+        return cls(TokenBucket(rate=CHANGES_PER_S, burst=CHANGES_BURST, now=now), 0.0, now)
 
     def is_spent(self, now: float) -> bool:
         """Whether no more than light changes are told of this member for a while."""
@@ -65,7 +66,7 @@ class Restlessness:
     """Counts the changes of each member, and keeps those that wait. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        self._shares: OrderedDict[NodeName, _Share] = OrderedDict()
+        self.shares = MemberTable(_Share.begin)
         self._waiting: dict[NodeName, tuple[StreamId, dict[type[Announcement], Announcement]]] = {}
         self._look_at: float | None = None
         self.held = 0
@@ -96,25 +97,15 @@ class Restlessness:
 
     def take(self, name: NodeName, now: float) -> bool:
         """Count a change of this member; False if that is more than its share."""
-        return self._share(name, now).changes.take(now)
+        return self.shares.of(name, now).changes.take(now)
 
     def may_tell(self, name: NodeName, size: int, now: float) -> bool:
         """Whether so many bytes are within this member's share."""
-        return size <= LIGHT_BYTES or not self._share(name, now).is_spent(now)
+        return size <= LIGHT_BYTES or not self.shares.of(name, now).is_spent(now)
 
     def tell(self, name: NodeName, size: int, now: float) -> None:
         """So many bytes are told of this member, whether or not it may."""
-        self._share(name, now).tell(size, now)
-
-    def _share(self, name: NodeName, now: float) -> _Share:
-        share = self._shares.get(name)
-        if share is None:
-            changes = TokenBucket(rate=CHANGES_PER_S, burst=CHANGES_BURST, now=now)
-            share = self._shares[name] = _Share(changes, 0.0, now)
-            if len(self._shares) > MAX_MEMBERS:
-                self._shares.popitem(last=False)
-        self._shares.move_to_end(name)
-        return share
+        self.shares.of(name, now).tell(size, now)
 
     def forget(self, name: NodeName) -> None:
         """A stream of this member begins or ends: it says anew what it has to say. Its share stays what it is."""

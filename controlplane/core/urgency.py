@@ -6,9 +6,9 @@ lasts, and after that with the next routine solving: others' news wait for it no
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import TYPE_CHECKING
 
+from controlplane.core.member_table import MemberTable
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
@@ -24,26 +24,17 @@ PAIRS_PER_S = 100.0
 LEAST_PAIRS = 40
 """A robot counts as so many at least: each drawing is a picture of the whole fleet, too."""
 
-MAX_ROBOTS = 8192
-"""Robots that are counted, the one that was urgent longest ago goes: twice those that can be registered."""
-
 
 class Urgency:
     """Counts what each robot has had. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        self._shares: OrderedDict[NodeName, TokenBucket] = OrderedDict()
+        self.shares = MemberTable(lambda now: TokenBucket(rate=PAIRS_PER_S, burst=PAIRS_BURST, now=now))
         self.held = 0
         """News that had to wait for a routine solving."""
 
     def take(self, robot: NodeName, pairs: int, now: float) -> bool:
         """Whether this robot, which takes so many pairs to draw, may be drawn at once."""
-        share = self._shares.get(robot)
-        if share is None:
-            share = self._shares[robot] = TokenBucket(rate=PAIRS_PER_S, burst=PAIRS_BURST, now=now)
-            if len(self._shares) > MAX_ROBOTS:
-                self._shares.popitem(last=False)
-        self._shares.move_to_end(robot)
-        taken = share.take(now, min(max(pairs, LEAST_PAIRS), PAIRS_BURST))
+        taken = self.shares.of(robot, now).take(now, min(max(pairs, LEAST_PAIRS), PAIRS_BURST))
         self.held += not taken
         return taken

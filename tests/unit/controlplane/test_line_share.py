@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core import line_share
+from controlplane.core import member_table
 from controlplane.core.line_share import LINES_BURST, LINES_PER_S, LineShare
 from protos.token_bucket import TokenBucket
 
@@ -20,7 +20,7 @@ def test_one_that_registers_every_second_fills_no_log_and_is_counted() -> None:
 
 
 def test_the_table_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line_share, "MAX_MEMBERS", 2)
+    monkeypatch.setattr(member_table, "MAX_MEMBERS", 2)
     lines = LineShare()
     for _ in range(int(LINES_BURST) + 1):
         lines.take("a", 0.0)
@@ -28,7 +28,7 @@ def test_the_table_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     lines.take("b", 0.0)
     lines.take("c", 0.0)
     assert lines.take("a", 0.0) == 0, "forgotten, and counted anew"
-    assert lines.forgotten == 2
+    assert lines.shares.forgotten == 2
 
 
 @pytest.mark.audit("ops-16")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core import registration_share as module
+from controlplane.core import member_table
 from controlplane.core.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
 from controlplane.core.registry import Admission, Refusal, Registry
 from protos.model import NodeName, Role
@@ -55,7 +55,7 @@ def test_the_share_of_one_is_not_anothers_and_a_stranger_takes_none_of_it() -> N
 
 
 def test_who_registered_longest_ago_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_MEMBERS", 2)
+    monkeypatch.setattr(member_table, "MAX_MEMBERS", 2)
     shares = RegistrationShare()
     a, b, c = (NodeName(name) for name in "abc")
     while shares.take(a, 0.0, new_run=True):
@@ -64,4 +64,4 @@ def test_who_registered_longest_ago_is_forgotten_first(monkeypatch: pytest.Monke
     assert not shares.take(a, 0.0, new_run=True)
     assert shares.take(c, 0.0, new_run=True)
     assert not shares.take(a, 0.0, new_run=True)
-    assert len(shares._shares) == 2
+    assert len(shares.shares) == 2

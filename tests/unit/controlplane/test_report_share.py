@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from controlplane.core import report_share
+from controlplane.core import member_table
 from controlplane.core.report_share import (
     BUSY,
     ENTRIES_BURST,
@@ -140,7 +140,7 @@ def test_reports_of_a_large_robot_are_read_at_once_and_of_more_at_a_bearable_pac
 
 def test_who_connects_again_and_again_has_one_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is the member's, not the stream's; and those of others do not take it away."""
-    monkeypatch.setattr(report_share, "MAX_MEMBERS", 3)
+    monkeypatch.setattr(member_table, "MAX_MEMBERS", 3)
     shares = ReportShares()
     assert shares.take(ROBOT, int(ENTRIES_BURST) + 2000, 0.0)
     shares.take(NodeName("b"), 1, 0.0)
@@ -150,5 +150,5 @@ def test_who_connects_again_and_again_has_one_share(monkeypatch: pytest.MonkeyPa
     shares.take(NodeName("d"), 1, 0.5)
     assert shares.wait_s(ROBOT, 0.5) == pytest.approx(0.5), "who reported longest ago is forgotten"
     assert shares.wait_s(NodeName("b"), 0.5) == 0.0
-    assert shares.forgotten == 1
+    assert shares.members.forgotten == 1
     assert LEAST_BURST < ENTRIES_BURST

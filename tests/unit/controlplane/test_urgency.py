@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core import urgency
+from controlplane.core import member_table
 from controlplane.core.urgency import LEAST_PAIRS, PAIRS_BURST, PAIRS_PER_S, Urgency
 from protos.model import NodeName
 
@@ -25,8 +25,8 @@ def test_a_robot_has_its_share_and_takes_nothing_of_the_others(pairs: int) -> No
 
 
 def test_as_many_robots_are_counted_as_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(urgency, "MAX_ROBOTS", 3)
+    monkeypatch.setattr(member_table, "MAX_MEMBERS", 3)
     shares = Urgency()
     for number in range(9):
         shares.take(NodeName(f"robot-{number}"), 6, now=0.0)
-    assert len(shares._shares) == 3
+    assert (len(shares.shares), shares.shares.forgotten) == (3, 6)
