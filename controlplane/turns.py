@@ -26,23 +26,23 @@ class Turns:
     def __init__(self) -> None:
         self._turn = asyncio.Lock()
 
-    async def each(self, items: Iterable[T], work: Callable[[T], R]) -> AsyncIterator[list[R]]:
+    async def each(self, items: Iterable[T], work: Callable[[T], R], turn_s: float = TURN_S) -> AsyncIterator[list[R]]:
         """Yield what `work` makes of each item, as lists of what one turn made.
 
-        The items are taken as the turns come: an iterable may follow what happens meanwhile.
+        `turn_s`: processor time of a turn, for somebody who waits for all of it. The items are taken as the turns come: an iterable may follow what happens meanwhile.
         """
         rest = iter(items)
         done = False
         while not done:
             async with self._turn:
                 await asyncio.sleep(0)
-                found, done = _one_turn(rest, work)
+                found, done = _one_turn(rest, work, turn_s)
             if found:
                 yield found
 
 
-def _one_turn(items: Iterable[T], work: Callable[[T], R]) -> tuple[list[R], bool]:
-    ends = time.thread_time() + TURN_S
+def _one_turn(items: Iterable[T], work: Callable[[T], R], turn_s: float) -> tuple[list[R], bool]:
+    ends = time.thread_time() + turn_s
     found: list[R] = []
     for item in items:
         found.append(work(item))
