@@ -29,7 +29,8 @@ class Turns:
     async def each(self, items: Iterable[T], work: Callable[[T], R], turn_s: float = TURN_S) -> AsyncIterator[list[R]]:
         """Yield what `work` makes of each item, as lists of what one turn made.
 
-        `turn_s`: processor time of a turn, for somebody who waits for all of it. The items are taken as the turns come: an iterable may follow what happens meanwhile.
+        `turn_s`: processor time of a turn, for somebody who waits for all of it. The items are taken as the turns come:
+        an iterable may follow what happens meanwhile.
         """
         rest = iter(items)
         done = False
