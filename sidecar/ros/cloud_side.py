@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceOffer
@@ -188,6 +187,8 @@ class CloudSide:
     def _answered(self, runner: ServiceRunner, execution: Execution, payload: bytes, now: float) -> None:
         self._forget(execution.id)
         self._stats.answers_taken[runner.name] += 1
+        if (server := runner.server.only) is not None and self._roll_call.answered(server, now):
+            self.look_is_due = True
         self._data_plane.complete(execution.id, payload, now - execution.arrived_at)
 
     def _unsent(self, runner: ServiceRunner, execution: Execution, why: str) -> None:
@@ -281,9 +282,11 @@ class CloudSide:
 
     def _look_at(self, runner: ServiceRunner, now: float) -> None:
         """A server that is gone, though another came since, will not answer what it was asked."""
-        if runner.server.look(partial(self._is_dead, runner), now):
+        if runner.server.look(self._is_dead, now):
             log.warning("service %s: its server is gone or was replaced by another", runner.name)
             self._give_up_executions(runner, "the server was replaced")
+        if runner.server.lost:
+            self._at_work.add(runner)  # until it is heard again, or gone
         for endpoint in runner.server.endpoints:
             self._processes.watch(endpoint)
 
@@ -370,20 +373,15 @@ class CloudSide:
 
     # -- whether the servers live -----------------------------------------------------------------------------------
 
-    def _is_dead(self, runner: ServiceRunner, endpoint: bytes) -> bool:
+    def _is_dead(self, endpoint: bytes) -> bool:
         """Whether it ended, or is silent and was not before.
 
         One that has only just started answers nothing either, until it has found us: on a busy machine in seconds.
         """
         if self._processes.has_ended(endpoint):
             return True
-        if not self._roll_call.is_silent(endpoint):
-            return False
-        return (
-            runner.server.has_answered(endpoint)
-            or self._roll_call.has_ever_heard(endpoint)
-            or not self._processes.watches(endpoint)
-        )
+        proved = self._roll_call.has_ever_heard(endpoint) or not self._processes.watches(endpoint)
+        return proved and self._roll_call.is_silent(endpoint)
 
     def _is_alive_since(self, runner: ServiceRunner, since: float) -> bool:
         """Whether one of its servers lives: its end would have been noticed, or it was heard since then.
@@ -417,7 +415,7 @@ class CloudSide:
     def _notice_silence(self) -> None:
         """What was handed to a server that shows no sign of life may still be answered; the rest need not wait."""
         why = "the server shows no sign of life"
-        hit = [runner for runner in self._runners.values() if runner.server.strike_out(partial(self._is_dead, runner))]
+        hit = [runner for runner in self._runners.values() if runner.server.strike_out(self._is_dead)]
         if hit:
             log.warning("a server shows no sign of life: %s", " ".join(sorted(runner.name for runner in hit)))
         for runner in hit:

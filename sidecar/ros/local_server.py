@@ -45,8 +45,6 @@ class LocalServer:
         self._alive: frozenset[bytes] = frozenset()
         self._asked: frozenset[bytes] = frozenset()
         """Those who may still have to answer something."""
-        self._answered: frozenset[bytes] = frozenset()
-        """Of the endpoints, those that lived when an answer came: the way there and back is known to work."""
         self._usable_at: float | None = None
         self._matched = False
         self._looked = False
@@ -73,9 +71,11 @@ class LocalServer:
         """How many of those that the graph shows live; each of them gets every request."""
         return len(self._alive)
 
-    def has_answered(self, endpoint: bytes) -> bool:
-        """Whether an answer came while this one was there."""
-        return endpoint in self._answered
+    @property
+    def only(self) -> bytes | None:
+        """The one that lives, or all are silent and the graph shows but this one: whoever answers is that one."""
+        answering = self._alive or self.endpoints
+        return next(iter(answering)) if len(answering) == 1 else None
 
     def is_usable(self, now: float) -> bool:
         """Whether one of those that the graph shows lives and knows of us by now."""
@@ -88,7 +88,6 @@ class LocalServer:
         # A node that serves the name with another type gets nothing of what we send, and answers nothing.
         known = graph.server_endpoints(self._node, self.name, self._name_of, now).get(self.type.name, {})
         self.endpoints = frozenset(known)
-        self._answered &= self.endpoints
         self._looked = True
         alive = frozenset(endpoint for endpoint, is_known in known.items() if is_known and not is_dead(endpoint))
         if not alive & self._alive:
@@ -128,7 +127,6 @@ class LocalServer:
             taken = take_response(self._pointer, self.type.response)
             if taken is None:
                 return
-            self._answered |= self._alive
             yield taken
 
     def close(self) -> None:

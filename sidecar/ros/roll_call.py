@@ -46,12 +46,18 @@ class RollCall:
         return self._missed.get(participant_of(endpoint), 0) >= CALLS_MISSED
 
     def has_heard(self, endpoint: bytes, since: float) -> bool:
-        """Whether its participant answered a call since then, or can not be asked at all."""
+        """Whether its participant answered since then, or cannot be asked at all."""
         return not self._topic.usable or self._heard_at.get(participant_of(endpoint), -math.inf) >= since
 
     def has_ever_heard(self, endpoint: bytes) -> bool:
-        """Whether its participant answered a call since the graph shows it."""
+        """Whether its participant answered anything since the graph shows it."""
         return participant_of(endpoint) in self._heard_at
+
+    def answered(self, endpoint: bytes, now: float) -> bool:
+        """It answered a request: as good as a call; True when `is_silent` changed."""
+        participant = participant_of(endpoint)
+        self._heard_at[participant] = now
+        return self._missed.pop(participant, 0) >= CALLS_MISSED
 
     @property
     def under_way(self) -> bool:

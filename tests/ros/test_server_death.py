@@ -176,6 +176,23 @@ def test_a_server_that_stands_still_is_used_again(mesh: Mesh, monkeypatch: pytes
 
 
 @pytest.mark.audit("dp-15")
+def test_all_that_a_silent_process_serves_goes(mesh: Mesh) -> None:
+    """Of one service it answered a request, of the other it never had one."""
+    mesh.start()
+    server = mesh.serve("--plan", "/plan", "--negate", "/negate")
+    mesh.wait_carried("/negate", "/plan")
+    assert mesh.result(mesh.call("/plan"))["answered"] == 1
+    server.send(signal.SIGSTOP)
+    stopped_at = time.monotonic()
+    mesh.call("/plan", "--count", "1", "--timeout-s", "1")
+    mesh.wait_carried()
+    assert endpoints(mesh), "DDS noticed by itself: this shows nothing"
+    assert time.monotonic() - stopped_at < LEASE_S
+    server.send(signal.SIGCONT)
+    mesh.wait_carried("/negate", "/plan")
+
+
+@pytest.mark.audit("dp-15")
 def test_a_server_that_hangs_and_is_killed_then(mesh: Mesh) -> None:
     """Its process is known: while it stands still, what it was handed may still run; once it ended, it may not."""
     mesh.start()
