@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
 SERVICE_NAME = admin_pb2.DESCRIPTOR.services_by_name["Admin"].full_name
 
-STATUS_TURN_S = 0.006
-"""Processor time of a turn: somebody waits for all of it, and between two turns the loop and the solver have theirs."""
+STATUS_TURNS = 3.0
+"""As long is a turn of it as so many usual ones: somebody waits for all of it, and between two turns the loop and the
+solver have theirs."""
 
 DEPARTED_TOLD = 256
 """Sidecars that are gone in one status, those that went last; `plr events` tells of the others."""
@@ -97,7 +98,7 @@ class AdminService:
             yield admin_pb2.GetStatusResponse(departed=gone).SerializeToString()
         names = query.names or loop.names()
         abridged = 0 < query.detailed_at_most < len(names)
-        async for found in loop.turns.each(names, partial(loop.status, abridged=abridged), STATUS_TURN_S):
+        async for found in loop.turns.each(names, partial(loop.status, abridged=abridged), STATUS_TURNS):
             yield b"".join(found)
 
     async def explain(self, request: admin_pb2.ExplainRequest, context: Any) -> admin_pb2.ExplainResponse:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import re
 from typing import TYPE_CHECKING
 
 from controlplane.text_table import columns, listed, shortened
@@ -16,9 +15,6 @@ if TYPE_CHECKING:
 
     from protos.model import PathReport, ServiceMapping
     from protos.status import ResourceStatus, SidecarStatus
-
-_WARNS = re.compile(r"\b[A-Z]{4,}\b")
-"""Lines about what is wrong have a word in capitals."""
 
 MAX_LINES = 256
 """On one sidecar: what it says that it offers, lacks or reaches must not hide the others."""
@@ -45,12 +41,14 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
     lines += columns([_HEADER, *(_row(status) for status in sidecars)])
     offered = sorted({offer.name for one in sidecars if one.peer.role is Role.CLOUD for offer in one.peer.offers})
     for status in sidecars:
-        details = [*_details(status), *_unmet(status, offered), *_untyped(status), *_unserved(status)]
-        details += _revocations(status.revocations, of_own, now_wall)
+        details = [*_details(status)]
+        wrong = [*_unmet(status, offered), *_untyped(status), *_unserved(status)]
+        wrong += _revocations(status.revocations, of_own, now_wall)
+        details += ((line, True) for line in wrong)
         if details:
             if len(details) > MAX_LINES:
-                details.sort(key=lambda line: _WARNS.search(line) is None)
-            shown = (shortened(line, MAX_LINE) for line in details[:MAX_LINES])
+                details.sort(key=lambda detail: not detail[1])
+            shown = (shortened(line, MAX_LINE) for line, _ in details[:MAX_LINES])
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in shown)]
         if len(details) > MAX_LINES:
             lines.append(f"  and {len(details) - MAX_LINES} more: plr status {status.peer.name} --json")
@@ -77,21 +75,23 @@ def _row(status: SidecarStatus) -> tuple[str, ...]:
     )
 
 
-def _details(status: SidecarStatus) -> Iterator[str]:
+def _details(status: SidecarStatus) -> Iterator[tuple[str, bool]]:
+    """Lines, and whether each is about something that is wrong."""
     for name, resource in (("peers", status.peers), ("mapping", status.mapping)):
         if resource.state is SyncState.REJECTED:
-            yield f"{name} {_rejection(resource)}"
+            yield f"{name} {_rejection(resource)}", True
     if status.refused_offers:
-        yield f"REFUSED by the policy: {', '.join(status.refused_offers)} (offered here, told to no robot)"
+        yield f"REFUSED by the policy: {', '.join(status.refused_offers)} (offered here, told to no robot)", True
     for mapping in status.services:
-        yield _mapping(mapping)
+        yield _mapping(mapping), not mapping.assignments
     for use in status.uses:
         if use.fallback_up is not None:
             state = "ready on the robot" if use.fallback_up else "MISSING: its node does not run, or has another type"
-            yield f"{use.name}: fallback {state}"
-    yield from columns([_path(path) for path in status.paths])
+            yield f"{use.name}: fallback {state}", not use.fallback_up
+    lines = columns([_path(path) for path in status.paths])
+    yield from ((line, not path.up) for line, path in zip(lines, status.paths, strict=True))
     for interface in status.down:
-        yield f"{interface} DOWN: it would be used, and is not there, or has no link or no address"
+        yield f"{interface} DOWN: it would be used, and is not there, or has no link or no address", True
 
 
 def _unserved(status: SidecarStatus) -> Iterator[str]:

@@ -26,18 +26,18 @@ class Turns:
     def __init__(self) -> None:
         self._turn = asyncio.Lock()
 
-    async def each(self, items: Iterable[T], work: Callable[[T], R], turn_s: float = TURN_S) -> AsyncIterator[list[R]]:
+    async def each(self, items: Iterable[T], work: Callable[[T], R], times: float = 1.0) -> AsyncIterator[list[R]]:
         """Yield what `work` makes of each item, as lists of what one turn made.
 
-        `turn_s`: processor time of a turn, for somebody who waits for all of it. The items are taken as the turns come:
-        an iterable may follow what happens meanwhile.
+        `times`: a turn of it is so many times as long as the usual one. The items are taken as the turns come: an
+        iterable may follow what happens meanwhile.
         """
         rest = iter(items)
         done = False
         while not done:
             async with self._turn:
                 await asyncio.sleep(0)
-                found, done = _one_turn(rest, work, turn_s)
+                found, done = _one_turn(rest, work, times * TURN_S)
             if found:
                 yield found
 

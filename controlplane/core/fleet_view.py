@@ -29,10 +29,6 @@ if TYPE_CHECKING:
 MAX_VIEWED = 512
 """Paths, and services, of one robot that are looked at."""
 
-MAX_GIVEN_UP = 64
-"""Services of one robot, which it carried and does not carry now, of which is looked at whether they are offered: that
-takes a look at each cloud that offers them."""
-
 
 @dataclass(frozen=True, slots=True)
 class PathView:
@@ -196,8 +192,7 @@ def _paths_of_services(
     told = {mapping.service: len(mapping.assignments) for mapping in sent or ()}
     carries = [use.name for use in sidecar.uses]
     found = {name: told[name] for name in carries[:MAX_VIEWED] if name in told}
-    wanted = islice(sorted(sidecar.carried.difference(carries)), MAX_GIVEN_UP)
-    given_up = [name for name in wanted if not is_offered(name)]
+    given_up = sorted(name for name in sidecar.carried.difference(carries) if not is_offered(name))
     # Who reaches no server at all has a trouble of its own.
     unreached = sidecar.unreached if reaches else ()
     lacks = {name: 0 for name in (*sidecar.unmet, *unreached, *given_up) if name not in found}

@@ -154,11 +154,13 @@ def test_what_a_robot_says_that_it_offers_is_no_hint() -> None:
 def test_what_is_wrong_is_not_cut_off() -> None:
     robot = Peer(NodeName("robot"), Role.ROBOT, SessionId(1), b"", 1)
     mappings = tuple(
-        ServiceMapping(ServiceName(f"/s{number}"), (Assignment(InterfaceName("wlan0"), NodeName("a")),), 0.1, "")
+        ServiceMapping(ServiceName(f"/s{number}"), (Assignment(InterfaceName("wlan0"), NodeName("EDGE-1")),), 0.1, "")
         for number in range(2 * MAX_LINES)
     )
+    nowhere = ServiceMapping(ServiceName("/last"), (), 1.0, "")
     down = (InterfaceName("wwan0"),)
-    text = render([SidecarStatus(robot, True, 1.0, "", services=mappings, unmet=(PLAN,), down=down)])
+    text = render([SidecarStatus(robot, True, 1.0, "", services=(*mappings, nowhere), unmet=(PLAN,), down=down)])
     assert f"UNMET {PLAN}" in text
     assert "wwan0 DOWN" in text
-    assert "/s0: wlan0 -> a" in text
+    assert "/s0: wlan0 -> EDGE-1" in text
+    assert "/last: nowhere" in text
