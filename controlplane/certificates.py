@@ -52,7 +52,7 @@ class CertificateKeeper:
         self._loop = loop
         self._metrics = metrics
         self._unfit = False
-        """The folder's files are whole, but no control plane's or none that TLS takes."""
+        """The folder's files are whole, but none that TLS takes."""
         self._unjudged: dict[NodeName, None] = {}
         """In the order in which they will be."""
         self._something_to_judge = asyncio.Event()
@@ -78,14 +78,6 @@ class CertificateKeeper:
 
     def _take(self, files: TlsFiles) -> None:
         self._unfit = True
-        if files.identity.role is not IdentityRole.CONTROL_PLANE:
-            log.error(
-                "the new certificate is a %s's: the old one stays in use, and the next start fails; copy the control "
-                "plane's own files to %s",
-                files.identity.role.value,
-                files.directory,
-            )
-            return
         self._relay_revocations(files)
         try:
             self._gate.use(files)

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 
 from protos.errors import ConfigError
-from protos.identity import CertificateError, Identity, Trust
+from protos.identity import CertificateError, Identity, IdentityRole, Trust
 from protos.regular_file import open_regular
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class RefusedFiles:
     why: str
     """One line: the file, what is wrong, what to do."""
     start: bool
-    """Whether a program starts with them: the list in use is not known to it then."""
+    """Whether a program starts with them: then it does not know the list in use, nor whose certificate was."""
 
 
 def load_tls_files(directory: Path) -> TlsFiles:
@@ -202,7 +202,8 @@ class TlsWatch:
 
     Call `poll` every `POLL_INTERVAL_S`. Files that do not fit together keep the old ones in force: while they are being
     replaced one by one that is nothing unusual, so it is logged only, and once, when they still do not fit at the next
-    look. A revocation list is replaced by a newer one only. One that came another way counts beside the folder's.
+    look. A certificate is replaced by one of the same node only, a revocation list by a newer one only. A list that
+    came another way counts beside the folder's.
     """
 
     def __init__(self, files: TlsFiles) -> None:
@@ -224,10 +225,8 @@ class TlsWatch:
         except ConfigError as error:
             self._refuse(fingerprint, RefusedFiles(str(error), start=False))
             return None
-        if files.trust.forgets(self.current.trust):
-            path = str(self.current.directory / CRL_FILE)
-            older = ConfigError(path, "", "missing or older than the one in use; copy the newest there")
-            self._refuse(fingerprint, RefusedFiles(str(older), start=True))
+        if refused := self._unlike(files):
+            self._refuse(fingerprint, refused)
             return None
         if self.refused is not None:
             _log.info("the TLS files in %s are good again", self.current.directory)
@@ -235,6 +234,22 @@ class TlsWatch:
         changed = files != self.current
         self.current = files
         return files if changed else None
+
+    def _unlike(self, files: TlsFiles) -> RefusedFiles | None:
+        """What keeps good files from taking the place of those in use."""
+        was, new = self.current.identity, files.identity
+        if new.role is not was.role or (new.name != was.name and was.role is not IdentityRole.CONTROL_PLANE):
+            mine, other = (f"{one.name}, {one.role.value}" for one in (was, new))
+            problem = f"expected the certificate of {mine}, got that of {other}; copy the files of {was.name} there"
+            starts = IdentityRole.CONTROL_PLANE not in (was.role, new.role)
+            return self._refused(CERTIFICATE_FILE, problem, start=starts)
+        if files.trust.forgets(self.current.trust):
+            problem = "missing or older than the one in use; copy the newest there"
+            return self._refused(CRL_FILE, problem, start=True)
+        return None
+
+    def _refused(self, name: str, problem: str, *, start: bool) -> RefusedFiles:
+        return RefusedFiles(str(ConfigError(str(self.current.directory / name), "", problem)), start=start)
 
     def _refuse(self, fingerprint: _Fingerprint, refused: RefusedFiles) -> None:
         if fingerprint == self._broken:

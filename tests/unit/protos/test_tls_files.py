@@ -14,6 +14,7 @@ from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.errors import ConfigError
 from protos.identity import CertificateError, IdentityRole
+from protos.model import NodeName
 from protos.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
 
 if TYPE_CHECKING:
@@ -178,6 +179,42 @@ def test_broken_files_keep_the_old_ones_and_are_logged_once(
     (folder / "key.pem").write_bytes(issued.key_pem)
     assert watch.poll() is not None
     assert refused_by(watch) is None
+
+
+@pytest.mark.audit("ops-14")
+@pytest.mark.parametrize(
+    ("name", "role", "starts"),
+    [
+        ("robot-2", IdentityRole.ROBOT, True),
+        ("edge-1", IdentityRole.CLOUD, True),
+        ("control", IdentityRole.CONTROL_PLANE, False),
+    ],
+)
+def test_a_running_program_becomes_no_other_node(
+    folder: Path, ca: Authority, caplog: pytest.LogCaptureFixture, name: str, role: IdentityRole, starts: bool
+) -> None:
+    files = load_tls_files(folder)
+    watch = TlsWatch(files)
+    write_tls_files(folder, ca.issue(NodeName(name), role), ca.ca_pem, ca.crl_pem())
+    assert [watch.poll() for _ in range(3)] == [None] * 3
+    assert watch.current is files
+    assert watch.refused is not None
+    assert f"expected the certificate of robot-1, robot, got that of {name}, {role.value}; " in watch.refused.why
+    assert watch.refused.start is starts
+    assert "copy the files of robot-1 there" in caplog.text
+    write_tls_files(folder, ca.renew("robot-1"), ca.ca_pem, ca.crl_pem())
+    assert watch.poll() is not None
+    assert refused_by(watch) is None
+
+
+@pytest.mark.audit("ops-14")
+def test_a_control_plane_may_get_another_name(tmp_path: Path, ca: Authority) -> None:
+    ca.write_tls_dir(tmp_path / "tls", "control", IdentityRole.CONTROL_PLANE)
+    watch = TlsWatch(load_tls_files(tmp_path / "tls"))
+    write_tls_files(tmp_path / "tls", ca.issue(NodeName("cp"), IdentityRole.CONTROL_PLANE), ca.ca_pem, ca.crl_pem())
+    taken = watch.poll()
+    assert taken is not None
+    assert taken.identity.name == "cp"
 
 
 def refused_by(watch: TlsWatch) -> RefusedFiles | None:
