@@ -57,7 +57,7 @@ def set_aside() -> None:
 
 
 def look_at_all() -> None:
-    """Look at everything that was set aside too: much may have ended in cycles since. 0.1 s for 1,000 sidecars."""
+    """Look at everything that was set aside too: much may have ended in cycles since. 0.1 s and more."""
     if not gc.isenabled():
         gc.unfreeze()
         gc.collect()
