@@ -11,7 +11,7 @@ from protos.model import NO_REVOCATIONS, RevocationSet, Role
 from protos.status import SyncState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from protos.model import PathReport, ServiceMapping
     from protos.status import ResourceStatus, SidecarStatus
@@ -21,6 +21,13 @@ MAX_LINES = 256
 
 MAX_LINE = 1000
 """Characters of each."""
+
+MAX_HINTED = 100
+"""Characters of a service's name for which a similar one is sought."""
+MAX_CLOSE = 8
+"""Similar names, of which a cloud may offer some itself."""
+MAX_COMPARED = 20_000_000
+"""Pairs of characters that are compared in all, in a second at most: 1,000 names with 50 others of 20 characters."""
 
 _DAY_S = 86_400.0
 
@@ -39,10 +46,10 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
     if not sidecars:
         return "\n".join([*lines, "no sidecars"])
     lines += columns([_HEADER, *(_row(status) for status in sidecars)])
-    offered = sorted({offer.name for one in sidecars if one.peer.role is Role.CLOUD for offer in one.peer.offers})
+    hints = _Hints({offer.name for one in sidecars if one.peer.role is Role.CLOUD for offer in one.peer.offers})
     for status in sidecars:
         details = [*_details(status)]
-        wrong = [*_unmet(status, offered), *_untyped(status), *_unserved(status)]
+        wrong = [*_unmet(status, hints), *_untyped(status), *_unserved(status)]
         wrong += _revocations(status.revocations, of_own, now_wall)
         details += ((line, True) for line in wrong)
         if details:
@@ -101,12 +108,29 @@ def _unserved(status: SidecarStatus) -> Iterator[str]:
         yield f"UNANSWERED {name}: had the last {requests} requests that robots measured, and answered none of them"
 
 
-def _unmet(status: SidecarStatus, offered: Sequence[str]) -> Iterator[str]:
+class _Hints:
+    """Which offered service somebody may mean. Many robots ask for one; and no member makes the operator wait."""
+
+    def __init__(self, offered: Iterable[str]) -> None:
+        self._offered = sorted(name for name in offered if len(name) <= MAX_HINTED)
+        self._found: dict[str, list[str]] = {}
+        self._left = MAX_COMPARED
+
+    def of(self, name: str, but: Collection[str]) -> str:
+        """The closest name that is none of `but`, as the end of a line."""
+        if len(name) > MAX_HINTED:
+            return ""
+        if name not in self._found:
+            self._left -= len(name) * sum(map(len, self._offered))
+            self._found[name] = difflib.get_close_matches(name, self._offered, MAX_CLOSE) if self._left >= 0 else []
+        close = next((other for other in self._found[name] if other not in but), name)
+        return f"; did you mean {close}?" if close != name else ""
+
+
+def _unmet(status: SidecarStatus, hints: _Hints) -> Iterator[str]:
     own = {offer.name for offer in status.peer.offers}
     for name in status.unmet:
-        # A cloud did not mean what it offers anyway.
-        close = difflib.get_close_matches(name, [other for other in offered if other not in own], n=1)
-        hint = f"; did you mean {close[0]}?" if close and close[0] != name else ""
+        hint = hints.of(name, own)  # a cloud did not mean what it offers anyway
         whose = "no server that it knows of" if status.peer.role is Role.ROBOT else "no node there"
         why = "" if status.peer.role is Role.ROBOT else ", or none that can be called; plr doctor there says which"
         yield f"UNMET {name}: configured, and {whose} offers it{hint or why}"

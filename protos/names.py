@@ -18,8 +18,8 @@ KEPT_NAMES = 16_384
 _NODE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 # A region or a carrier: stands in reasons and log lines.
 _DOMAIN_LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.&+-]{0,62}")
-# What Linux allows in an interface's name, less what is not printable ASCII.
-_INTERFACE_NAME = re.compile(r"[!-.0-~]+")
+# What Linux allows in an interface's name (IFNAMSIZ with the NUL), less what is not printable ASCII.
+_INTERFACE_NAME = re.compile(r"[!-.0-~]{1,15}")
 # ROS 2: tokens of letters, digits and underscores that do not start with a digit.
 _SERVICE_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(srv|action|msg)/[A-Za-z][A-Za-z0-9_]*")
@@ -57,7 +57,7 @@ def node_name(value: str, field: str) -> NodeName:
 
 def interface_name(value: str, field: str) -> InterfaceName:
     """Check the name of a network interface."""
-    return InterfaceName(_name(value, field, _INTERFACE_NAME, "the name of an interface"))
+    return InterfaceName(_name(value, field, _INTERFACE_NAME, "the name of an interface, 1 to 15 characters"))
 
 
 def domain_label(value: str, field: str) -> str:

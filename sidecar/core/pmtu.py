@@ -36,6 +36,8 @@ BLACK_HOLE_REPORTS = 2
 HEADERS_V4 = 28
 HEADERS_V6 = 48
 """IP and UDP headers, without options."""
+LEAST_MTU = BASE_BYTES + HEADERS_V4
+"""Of an interface, below which datagrams of BASE_BYTES do not leave."""
 PROBES_REMEMBERED = 2 * MAX_PROBES
 """Probes whose late reply still counts."""
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from typing import TYPE_CHECKING, Any
 
-from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4, HEADERS_V6
+from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4, HEADERS_V6, LEAST_MTU
 from sidecar.doctor.finding import duration, fail, milliseconds, ok, share, warn
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ GOODBYE = "peer closed"
 """Why a path went down to a node that ended as it should."""
 LOSSY = 0.05
 """Of datagrams; more is worth a line."""
+HOPELESS = 0.5
+"""Of a service without a target: a larger prediction of misses is worth a warning."""
 SHARED_ADDRESSES = ip_network("100.64.0.0/10")
 """RFC 6598: behind a carrier's NAT."""
 
@@ -165,7 +167,13 @@ def mtu(state: State) -> Iterator[Finding]:
                 carried[path["max_datagram"] + headers] = carried.get(path["max_datagram"] + headers, 0) + 1
         stuck = [path for path in paths if _is_stuck(path) and takes.get(name, 0) >= 1400]
         shown = ", ".join(f"{size} bytes ({count} paths)" for size, count in sorted(carried.items()))
-        if stuck:
+        if 0 < takes.get(name, 0) < LEAST_MTU:
+            yield fail(
+                "mtu",
+                f"{name}: takes {takes[name]} bytes, and larger requests need {LEAST_MTU}: they do not get through",
+                f"ip link set {name} mtu 1280 or more, if the network carries that",
+            )
+        elif stuck:
             yield warn(
                 "mtu",
                 f"{name}: takes {takes[name]} bytes, but to {_names(stuck)} only the least passes ({BASE_BYTES})",
@@ -359,11 +367,15 @@ def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Fi
         text = f"{one['service']} goes {pairs}; predicted to miss {'unknown' if miss is None else share(miss)}"
         target = targets(one["service"])
         dead = [pair for pair in one["pairs"] if (pair["interface"], pair["server"]) in down]
-        if dead:
+        if not one["pairs"]:
+            yield fail("mapping", text, "no server is reached that offers it: see path above, and plr status")
+        elif dead:
             names = ", ".join(f"{pair['interface']} to {pair['server']}" for pair in dead)
             yield warn("mapping", f"{text}, and {names} is down: others are taken", "see path above")
         elif target is not None and miss is not None and miss > target:
             yield warn("mapping", f"{text}, more than its target {share(target)}", "plr explain tells why")
+        elif target is None and miss is not None and miss > HOPELESS:
+            yield warn("mapping", text, "plr explain tells why")
         else:
             yield ok("mapping", text)
 

@@ -6,6 +6,7 @@ the peers know of it remain good, so that it carries again at once when it is ba
 
 from __future__ import annotations
 
+import logging
 import random
 import time
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ from protos.model import Candidate, CandidateKind
 from sidecar.core.control_ways import families_in_turn
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetCarrier, SetMtu, SetReady
+from sidecar.core.pmtu import LEAST_MTU
 from sidecar.core.stun_client import StunClient
 from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.sockets import BoundTo, open_socket
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
     from sidecar.net.interfaces import Interface
 
 STOP_TIMEOUT_S = 1.0
+
+log = logging.getLogger(__name__)
 
 
 class ManagedInterface:
@@ -59,7 +63,7 @@ class ManagedInterface:
             stun = StunClient(stun_servers, random.SystemRandom(), drops=link.stats.dropped)
             stun.start(time.monotonic())
         self.thread = InterfaceThread(opened.socket, link, stun, owner)
-        self._post(SetMtu(interface.mtu))
+        self._tell_mtu(interface)
 
     @property
     def name(self) -> InterfaceName:
@@ -87,7 +91,7 @@ class ManagedInterface:
         if rebind is not None:
             self._post(rebind)
         if interface.mtu != before.mtu:
-            self._post(SetMtu(interface.mtu))
+            self._tell_mtu(interface)
         changed = was_suspended or rebind is not None
         if changed:
             # Told by an older network; what is true now comes within a round trip.
@@ -95,6 +99,12 @@ class ManagedInterface:
             self.thread.post(lambda stun: stun.start(time.monotonic()))
             self.thread.wake()
         return changed
+
+    def _tell_mtu(self, interface: Interface) -> None:
+        if 0 < interface.mtu < LEAST_MTU:
+            text = "%s: its MTU of %d is below %d: requests of more than some hundred bytes do not get through"
+            log.warning(text, interface.name, interface.mtu, LEAST_MTU)
+        self._post(SetMtu(interface.mtu))
 
     def set_ready(self) -> None:
         """It may be used."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import replace
 
 import pytest
 
-from controlplane.status_table import MAX_LINE, MAX_LINES, render
+from controlplane import status_table
+from controlplane.status_table import MAX_HINTED, MAX_LINE, MAX_LINES, render
 from protos.model import (
     Assignment,
     HeldList,
@@ -18,6 +20,7 @@ from protos.model import (
     Role,
     ServiceMapping,
     ServiceName,
+    ServiceOffer,
     SessionId,
     Version,
 )
@@ -164,3 +167,39 @@ def test_what_is_wrong_is_not_cut_off() -> None:
     assert "wwan0 DOWN" in text
     assert "/s0: wlan0 -> EDGE-1" in text
     assert "/last: nowhere" in text
+
+
+@pytest.mark.audit("ops-5")
+def test_many_that_miss_one_service_cost_one_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: list[str] = []
+    close_matches = difflib.get_close_matches
+
+    def search(name: str, among: list[str], n: int) -> list[str]:
+        searched.append(name)
+        return close_matches(name, among, n)
+
+    monkeypatch.setattr(difflib, "get_close_matches", search)
+    cloud = Peer(
+        NodeName("cloud"), Role.CLOUD, SessionId(1), b"", 1, offers=(ServiceOffer(PLAN, "nav_msgs/srv/GetPlan"),)
+    )
+    wanted = ServiceName(PLAN + "_")
+    robots = [Peer(NodeName(f"robot-{number}"), Role.ROBOT, SessionId(2), b"", 1) for number in range(50)]
+    text = render(
+        [SidecarStatus(cloud, True, 1.0, ""), *(SidecarStatus(r, True, 1.0, "", unmet=(wanted,)) for r in robots)]
+    )
+    assert text.count(f"did you mean {PLAN}?") == 50
+    assert searched == [wanted]
+
+
+@pytest.mark.audit("ops-5")
+def test_long_names_keep_no_operator_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(status_table, "MAX_COMPARED", 10_000)
+    names = [ServiceName(f"/{'x' * 60}{number}") for number in range(64)]
+    long = ServiceName(f"/{'y' * MAX_HINTED}")
+    offers = tuple(ServiceOffer(name, "nav_msgs/srv/GetPlan") for name in (*names[:2], long))
+    cloud = Peer(NodeName("cloud"), Role.CLOUD, SessionId(1), b"", 1, offers=offers)
+    robot = Peer(NodeName("robot"), Role.ROBOT, SessionId(2), b"", 1)
+    unmet = (ServiceName(long + "y"), *(ServiceName(name + "_") for name in names))
+    text = render([SidecarStatus(cloud, True, 1.0, ""), SidecarStatus(robot, True, 1.0, "", unmet=unmet)])
+    assert text.count("UNMET") == len(unmet)
+    assert text.count("did you mean") == 1

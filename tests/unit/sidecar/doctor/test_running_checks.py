@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from sidecar.core.pmtu import LEAST_MTU
 from sidecar.doctor import running_checks
 from sidecar.doctor.finding import Finding, Level
 from sidecar.doctor.running_checks import Pinged
@@ -174,6 +175,15 @@ def test_a_path_that_carries_the_least_only_is_warned_of() -> None:
     assert texts(running_checks.mtu(searching), *BAD) == []
 
 
+@pytest.mark.audit("ops-14")
+def test_an_interface_that_takes_less_than_the_least_fails() -> None:
+    small = state(interfaces=[{**interface("wlan0"), "mtu": LEAST_MTU - 1}, interface("wwan0")])
+    (text,) = texts(running_checks.mtu(small), Level.FAIL)
+    assert text == "wlan0: takes 1227 bytes, and larger requests need 1228: they do not get through"
+    enough = state(interfaces=[{**interface("wlan0"), "mtu": LEAST_MTU}, interface("wwan0")])
+    assert texts(running_checks.mtu(enough), *BAD) == []
+
+
 def test_sockets_and_drivers() -> None:
     odd = state(interfaces=[interface("wlan0", bound_to="address", hangs=2)])
     assert len(texts(running_checks.devices(odd), Level.WARN)) == 2
@@ -235,6 +245,17 @@ def test_the_mapping() -> None:
     paths = [path("wlan0", "cloud-a", "down"), path("wwan0", "cloud-b")]
     (text,) = texts(running_checks.mapping(state(paths=paths), lambda _: None), Level.WARN)
     assert "wlan0 to cloud-a is down" in text
+
+
+@pytest.mark.audit("ops-14")
+def test_a_mapping_that_leads_nowhere_fails_and_a_hopeless_one_is_warned_of() -> None:
+    (mapped,) = state()["mapped"]
+    nowhere = state(mapped=[{**mapped, "pairs": [], "predicted_miss": 1.0}])
+    (text,) = texts(running_checks.mapping(nowhere, lambda _: None), Level.FAIL)
+    assert text.startswith("/plan goes nowhere")
+    hopeless = state(mapped=[{**mapped, "predicted_miss": 0.97}])
+    assert "predicted to miss 97 %" in texts(running_checks.mapping(hopeless, lambda _: None), Level.WARN)[0]
+    assert texts(running_checks.mapping(state(), lambda _: None), *BAD) == []
 
 
 def test_the_control_stream() -> None:

@@ -107,6 +107,16 @@ def test_an_interface_that_lost_its_address_says_so(host: Host, monkeypatch: pyt
 
 
 @pytest.mark.audit("ops-13")
+def test_an_mtu_that_is_too_small_is_warned_of(host: Host, caplog: pytest.LogCaptureFixture) -> None:
+    host.look(replace(LO, mtu=1228))
+    assert caplog.text == ""
+    host.look(replace(LO, mtu=1227))
+    host.look(replace(LO, mtu=1227))
+    (record,) = caplog.records
+    assert record.getMessage().startswith("lo: its MTU of 1227 is below 1228: ")
+
+
+@pytest.mark.audit("ops-13")
 def test_a_wanted_interface_that_carries_nothing_is_told_of_by_name(host: Host) -> None:
     host.look()
     assert list(host.down) == ["lo"], "named by the configuration, and not there at boot"
