@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.standing_queue import StandingQueue
+from sidecar.core.standing_queue import FloorChange, StandingQueue
 from sidecar.core.units import DATAGRAM_BYTES
 
 if TYPE_CHECKING:
@@ -103,8 +103,12 @@ class LossCeiling:
         self._acked += size
         self._note_recent(size)
         if rtt_s:
-            if self._queue.note(rtt_s, rtt, now):
+            change = self._queue.note(rtt_s, rtt, now)
+            if change is FloorChange.FELL:
                 self._usual_bytes = self._usual_lost = 0.0  # learnt with others' queue taken for none
+            elif change is FloorChange.ROSE and self._queue_cut:
+                self.forget()
+                self._queued = self._queue_before = False
             self._queued |= self._queue.is_met_by(rtt_s, rtt)
         if self.bytes is not None:
             self.bytes = self._grown(now - self._at, rtt.smoothed)
@@ -131,6 +135,8 @@ class LossCeiling:
         self._start = self.bytes = max(CUT * before, LEAST_BYTES)
         self._at = now
         self._recent_lost = 0.0
+        if queue:
+            self._queue.on_cut(rtt, now)
         return True
 
     def meets_queue(self, rtt: RttEstimator) -> bool:

@@ -114,8 +114,19 @@ def test_cuts_never_go_below_the_least() -> None:
     world.round(2 * FLOOR_S)
     for _ in range(50):
         world.round(2 * FLOOR_S, lost=1)
+        for _ in range(5):
+            world.round(1.5 * FLOOR_S)  # it gets shorter: it is a queue
+        world.round(2 * FLOOR_S)
     assert world.ceiling.bytes is not None
     assert world.ceiling.bytes >= LEAST_BYTES
+
+
+def test_a_route_that_got_longer_and_lossier_at_one_moment_has_no_ceiling_for_long() -> None:
+    world = World()
+    cuts = [world.round(3 * FLOOR_S, lost=3) for _ in range(100)]
+    assert any(cuts[:5])
+    assert not any(cuts[20:])
+    assert world.ceiling.bytes is None
 
 
 def test_it_grows_back_and_is_forgotten_when_it_no_longer_limits() -> None:

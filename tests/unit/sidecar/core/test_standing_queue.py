@@ -1,7 +1,11 @@
+"""Round trips that are longer than the least: a queue, or a longer route."""
+
 from __future__ import annotations
 
+import pytest
+
 from sidecar.core.rtt import RttEstimator
-from sidecar.core.standing_queue import FLOOR_MEMORY_S, PEAK_MEMORY_S, StandingQueue
+from sidecar.core.standing_queue import FLOOR_MEMORY_S, PEAK_MEMORY_S, FloorChange, StandingQueue
 
 FLOOR_S = 0.050
 
@@ -15,15 +19,15 @@ class World:
         self.now = 0.0
         self.take(FLOOR_S, 1.0)
 
-    def take(self, rtt_s: float, seconds: float = 0.3) -> bool:
-        """Whether any of them lowered the floor."""
-        fell = False
+    def take(self, rtt_s: float, seconds: float = 0.3) -> FloorChange | None:
+        """What they told of the floor last."""
+        told = None
         end = self.now + seconds
         while self.now < end:
             self.now += 0.01
             self.rtt.sample(rtt_s, self.now)
-            fell |= self.queue.note(rtt_s, self.rtt, self.now)
-        return fell
+            told = self.queue.note(rtt_s, self.rtt, self.now) or told
+        return told
 
     def stands(self) -> bool:
         return self.queue.stands(self.rtt)
@@ -70,8 +74,8 @@ def test_an_empty_queue_is_never_full() -> None:
 
 def test_a_clearly_lower_floor_tells_that_the_one_before_was_a_queue() -> None:
     world = World()
-    assert not world.take(0.9 * FLOOR_S)
-    assert world.take(0.5 * FLOOR_S)
+    assert world.take(0.9 * FLOOR_S) is None
+    assert world.take(0.5 * FLOOR_S) is FloorChange.FELL
     world.take(0.9 * FLOOR_S)
     assert world.stands()
 
@@ -80,3 +84,38 @@ def test_a_longer_route_is_the_floor_after_a_while() -> None:
     world = World()
     world.take(2 * FLOOR_S, FLOOR_MEMORY_S + 1.0)
     assert not world.stands()
+
+
+def test_what_stays_when_less_is_sent_is_a_longer_route() -> None:
+    world = World()
+    world.take(3 * FLOOR_S)
+    assert world.stands()
+    world.queue.on_cut(world.rtt, world.now)
+    assert world.take(3 * FLOOR_S, 0.5) is None, "too soon to tell"
+    world.queue.on_cut(world.rtt, world.now)  # what is lost meanwhile does not put it off
+    assert world.take(3 * FLOOR_S, 1.0) is FloorChange.ROSE
+    assert not world.stands()
+    assert world.take(3 * FLOOR_S, 5.0) is None
+    world.take(6 * FLOOR_S)
+    assert world.stands()
+
+
+@pytest.mark.parametrize("left", [1.0, 1.5, 2.2])
+def test_a_queue_that_gets_shorter_when_less_is_sent_is_one(left: float) -> None:
+    world = World()
+    world.take(3 * FLOOR_S)
+    world.queue.on_cut(world.rtt, world.now)
+    world.take(3 * FLOOR_S, 0.2)
+    assert world.take(left * FLOOR_S, 0.8) is None
+    assert world.take(3 * FLOOR_S, 3.0) is None
+    assert world.stands()
+
+
+def test_others_queue_that_was_taken_for_a_route_is_found_out_when_it_gets_shorter() -> None:
+    world = World()
+    world.take(3 * FLOOR_S)
+    world.queue.on_cut(world.rtt, world.now)
+    assert world.take(3 * FLOOR_S, 2.0) is FloorChange.ROSE
+    assert world.take(2 * FLOOR_S) is FloorChange.FELL
+    world.take(3 * FLOOR_S)
+    assert world.stands()
