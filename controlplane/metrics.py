@@ -2,7 +2,7 @@
 
 The exporter serves from a thread of its own: the loop leaves finished values for it, and it never looks into the
 core. The registry is our own, without the interpreter's collectors and `_created` series, which are no base units
-and which `promtool check metrics` complains of.
+and which `promtool check metrics` complains of; those of the process tell of its memory, and when it was started.
 """
 
 from __future__ import annotations
@@ -120,6 +120,7 @@ class Metrics:
             registry=self.registry,
         )
         self.registry.register(self._values)
+        prometheus_client.ProcessCollector(registry=self.registry)
 
     def refused_connection(self, reason: str) -> None:
         """A connection or call was refused or ended; `reason` is one of REFUSAL_REASONS."""

@@ -492,6 +492,7 @@ def test_expressions_use_only_metrics_and_labels_that_exist(expression: str) -> 
     expression = re.sub(RECORDED, "", expression)
     names = {family(name) for name in re.findall(r"\bplr_\w+", expression)}
     assert names <= METRICS.keys()
+    assert set(re.findall(r"\bprocess_\w+", expression)) <= exported_metrics().keys()
     # Also those that label_replace makes, which is by its third argument.
     made = set(re.findall(r',\s*"(\w+)",\s*"[^"]*",\s*"\w*"', expression))
     known = labels.union(made, *(METRICS[name] for name in names))
