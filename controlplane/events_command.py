@@ -89,6 +89,8 @@ def _events(arguments: argparse.Namespace) -> int:
     try:
         found = _ask(arguments, query)
         _show(found, as_json=arguments.json)
+        if not found.events and arguments.node is not None:
+            sys.stderr.write(f"plr: no event of {arguments.node} was found; plr status shows how names are spelled\n")
         if found.left_out and not arguments.json:
             sys.stderr.write(f"plr: {found.left_out} older events are not shown; --last 0 shows all\n")
         while arguments.follow:

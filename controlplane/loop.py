@@ -67,6 +67,7 @@ MAX_SERVICES_LOGGED = 8
 ENDED_LINES_BURST = 20.0
 """Log lines at once on streams that were ended for breaking the rules, and on messages left out, of all members."""
 
+CAPACITY_LINE_EVERY_S = 60.0
 ENDED_LINES_PER_S = 1.0
 """After that."""
 
@@ -169,6 +170,9 @@ class ControlLoop:
         self._quiet_looks = 0
         """Since the loop was last busy; at QUIET_LOOKS the solver is ready."""
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
+        self._exceeded = 0
+        """By how many interfaces capacities are exceeded, as the log has it."""
+        self._exceeded_line_at = 0.0
         self._garbage = Collector()
         self.report_shares = ReportShares()
         self._lines = LineShare()
@@ -473,11 +477,16 @@ class ControlLoop:
             self._core.solving_failed(self._loop.time())
             return
         self._metrics.solve_duration.observe(time.monotonic() - began)
-        relaxed = self._core.plan.relaxed
         self._core.solved(settled, self._loop.time())
-        if self._core.plan.relaxed != relaxed:
-            log.warning("capacities are exceeded by %d interfaces in all", self._core.plan.relaxed)
+        self._tell_of_capacities()
         self._dispatch()
+
+    def _tell_of_capacities(self) -> None:
+        """A fleet that changes all the time has another figure after each solving."""
+        exceeded, now = self._core.plan.relaxed, self._loop.time()
+        if exceeded != self._exceeded and now >= self._exceeded_line_at:
+            self._exceeded, self._exceeded_line_at = exceeded, now + CAPACITY_LINE_EVERY_S
+            log.warning("capacities are exceeded by %d interfaces in all", exceeded)
 
     def _solve_and_settle(self, picture: Picture) -> Settled:
         """On the solver's thread."""

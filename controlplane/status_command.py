@@ -98,10 +98,11 @@ def _status(arguments: argparse.Namespace) -> int:
     except AskError as error:
         sys.stderr.write(f"plr: {error}\n")
         return error.code
-    sys.stdout.write(f"{_json(answer.raw) if answer.raw is not None else text}\n")
+    shown = _json(answer.raw) if answer.raw is not None else text
+    sys.stdout.write(f"{shown}\n" if shown else "")
     missing = set(query.names) - {status.peer.name for status in answer.sidecars}
     for name in sorted(missing):
-        sys.stderr.write(f"plr: {name} is not registered; try: plr events --node {name}\n")
+        sys.stderr.write(f"plr: {name} is not registered; plr status shows who is, plr events --node {name} who was\n")
     return EXIT_FAILED if missing else EXIT_OK
 
 
@@ -129,14 +130,16 @@ def _text(answer: _Answer, names: Sequence[NodeName]) -> str:
         gone = [one for one in gone if one.name in names]
         rest.departed_left_out = 0
         del rest.events[:]
-    lines = [status_table.render(answer.sidecars, own_revocations_from_proto(rest), time.time())]
+    lines = []
+    if answer.sidecars or not names:
+        lines.append(status_table.render(answer.sidecars, own_revocations_from_proto(rest), time.time()))
     for section in (
         event_text.departed(gone, rest.departed_left_out),
         event_text.events(events_from_proto(rest.events), log_state_from_proto(rest.log)),
     ):
         found = list(section)
         if found:
-            lines += ["", *found]
+            lines += ["", *found] if lines else found
     return "\n".join(lines)
 
 

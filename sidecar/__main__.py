@@ -120,7 +120,8 @@ def _parser() -> argparse.ArgumentParser:
 def _warn_of_missing_interfaces(config: SidecarConfig) -> None:
     from sidecar.net.interfaces import list_interfaces, missing_interfaces
 
-    for line in missing_interfaces(list_interfaces(), config.interfaces):
+    described = [network.interface for network in config.networks]
+    for line in missing_interfaces(list_interfaces(), config.interfaces, described):
         sys.stderr.write(f"{PROGRAM}: warning: {line}\n")
 
 

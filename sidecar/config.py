@@ -205,8 +205,9 @@ def parse_config(text: str, source: str, identify: Callable[[Path], Identity] | 
             raise ConfigError(source, "tls_dir", str(error)) from error
         data = _with_identity(data, identify(Path(folder)), source)
     config = validate(SidecarConfig, data, source)
+    whose = f"; by its certificate this node is a {config.role.value}" if config.tls_dir is not None else ""
     for location, problem in _cross_checks(config):
-        raise ConfigError(source, key_path(location), problem)
+        raise ConfigError(source, key_path(location), problem + (whose if " only: " in problem else ""))
     return config
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import time
 from typing import TYPE_CHECKING
 
@@ -243,9 +244,10 @@ class Authority:
         for entry in reversed(self.all_entries()):
             if entry.name == name:
                 return entry
-        raise AuthorityError(
-            f"{name} has no certificate of this CA; do: plr ca issue {name} --role ..., or plr ca sign"
-        )
+        close = difflib.get_close_matches(name, {entry.name for entry in self.all_entries()}, n=1)
+        meant = f"did you mean {close[0]}?" if close else "plr ca list shows those that have one"
+        new = "a new node gets one by plr ca issue or plr ca sign"
+        raise AuthorityError(f"{name} has no certificate of this CA; {meant}; {new}")
 
     def crl_pem(self) -> bytes:
         """Return the revocation lists of this CA and the former ones; each stands as long as its CA.

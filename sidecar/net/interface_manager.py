@@ -111,7 +111,8 @@ class InterfaceManager:
 
     def start(self) -> None:
         """Look once, then keep looking in the background. What is not there yet is used as soon as it comes."""
-        for line in missing_interfaces(list_interfaces(), self._config.interfaces):
+        described = [network.interface for network in self._config.networks]
+        for line in missing_interfaces(list_interfaces(), self._config.interfaces, described):
             log.warning("%s", line)
         try:
             self._watch.subscribe()

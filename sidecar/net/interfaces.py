@@ -133,12 +133,24 @@ def choose(interfaces: Iterable[Interface], wanted: Sequence[str] | None) -> Int
     return InterfaceChoice(tuple(usable), tuple(skipped), missing)
 
 
-def missing_interfaces(interfaces: Sequence[Interface], wanted: Sequence[str] | None) -> list[str]:
-    """Return a line for a person about each wanted interface that is not there: a modem comes late, a name is wrong."""
-    there = ", ".join(interface.name for interface in interfaces)
-    return [
+def missing_interfaces(
+    interfaces: Sequence[Interface], wanted: Sequence[str] | None, described: Sequence[str] = ()
+) -> list[str]:
+    """Return a line for a person about each interface that is not there: a modem comes late, a name is wrong.
+
+    `wanted` as in `choose`; `described`: names and globs of interfaces of which the configuration says something.
+    """
+    names = [interface.name for interface in interfaces]
+    there = ", ".join(names)
+    missing = choose(interfaces, wanted).missing
+    lines = [
         f"{name}: there is no such interface now (there are: {there}); it is used as soon as it comes"
-        for name in choose(interfaces, wanted).missing
+        for name in missing
+    ]
+    return lines + [
+        f"networks: {pattern} matches no interface now (there are: {there})"
+        for pattern in described
+        if pattern not in missing and not fnmatch.filter(names, pattern)
     ]
 
 

@@ -86,6 +86,12 @@ def test_who_is_gone_is_shown_and_explained(alone: ControlPlaneProcess, capsys: 
     assert "lease_expired: silent for longer than its lease" in text
     assert kinds(operator.events("--node", "robot")) == ["connected", "stream_lost", "departed"]
     assert operator.events("--last", "1") == operator.events()[-1:]
+    assert main(["events", "--insecure", "--address", alone.address, "--node", "rbot"]) == 0
+    assert capsys.readouterr() == ("", "plr: no event of rbot was found; plr status shows how names are spelled\n")
+    assert main(["status", "--insecure", "--address", alone.address, "rbot"]) == 1
+    text, told = capsys.readouterr()
+    assert "no sidecars" not in text
+    assert told == "plr: rbot is not registered; plr status shows who is, plr events --node rbot who was\n"
     assert "robot IS GONE" in operator.ask("explain", "robot", "/plan")
     alone.stop_flawless()
 

@@ -150,6 +150,12 @@ def test_name_and_role_come_from_the_certificate() -> None:
         (certificate("al", IdentityRole.OPERATOR), {}, "tls_dir: expected the certificate of a robot or a cloud"),
         (certificate(), {"insecure": True}, "insecure: expected without tls_dir"),
         (certificate(), {"tls_dir": "tls"}, "tls_dir: expected an absolute path, got 'tls'"),
+        (
+            certificate("c", IdentityRole.CLOUD),
+            {},
+            "expected on a robot only: it is the robot's sidecar that decides this; by its certificate this node is a "
+            "cloud",
+        ),
     ],
 )
 def test_what_does_not_fit_the_certificate_is_refused(identity: Identity, keys: dict[str, Any], told: str) -> None:

@@ -96,10 +96,11 @@ def test_renewing_can_keep_the_key(ca: Authority) -> None:
 
 
 def test_what_does_not_exist_is_neither_renewed_nor_revoked(ca: Authority) -> None:
-    with pytest.raises(AuthorityError, match="plr ca issue robot-1"):
+    with pytest.raises(AuthorityError, match="plr ca list shows"):
         ca.renew("robot-1")
-    with pytest.raises(AuthorityError, match="plr ca issue robot-1"):
-        ca.revoke("robot-1")
+    ca.issue("robot-7", IdentityRole.ROBOT)
+    with pytest.raises(AuthorityError, match="did you mean robot-7"):
+        ca.revoke("robt-7")
 
 
 def test_revoking_ends_every_certificate_of_the_name_and_no_other(ca: Authority, clock: Clock) -> None:

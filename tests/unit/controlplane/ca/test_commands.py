@@ -112,7 +112,7 @@ def test_what_is_refused_says_what_to_do(shell: Shell, tmp_path: Path) -> None:
     shell("init", "--no-passphrase", "--days", "10")
     assert "there is a CA already" in shell("init", code=2)
     assert "the CA itself ends" in shell("issue", "robot-1", "--role", "robot", code=1)
-    assert "plr ca issue robot-1" in shell("renew", "robot-1", "--days", "1", code=1)
+    assert "plr ca list shows" in shell("renew", "robot-1", "--days", "1", code=1)
     shell("issue", "robot-1", "--role", "robot", "--days", "1")
     assert "plr ca renew robot-1" in shell("issue", "robot-1", "--role", "cloud", "--days", "1", code=1)
     other = str(tmp_path / "plr-ca/nodes/robot-1")

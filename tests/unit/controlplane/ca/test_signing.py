@@ -132,7 +132,7 @@ def test_at_a_terminal_the_operator_sees_what_a_name_has_already(shell: Shell, t
 
 def test_a_certificate_is_renewed_with_or_without_another_key(shell: Shell, tmp_path: Path, ca: Path) -> None:
     request = asked(shell)
-    assert "plr ca issue robot-1" in shell("sign", request, *ROBOT, "--renew", code=1)
+    assert "plr ca list shows" in shell("sign", request, *ROBOT, "--renew", code=1)
     shell("sign", request, *ROBOT, "--days", "1")
     first = (ca / "nodes/robot-1/cert.pem").read_bytes()
     assert "robot-1 has a certificate; do: plr ca sign --renew" in shell("sign", request, *ROBOT, code=1)

@@ -118,6 +118,16 @@ def test_what_is_missing_is_told_to_people_with_what_there_is() -> None:
     assert line == "wlan1: there is no such interface now (there are: wlan0); it is used as soon as it comes"
 
 
+@pytest.mark.audit("ops-1")
+def test_what_is_said_of_interfaces_that_are_not_there_is_told_once() -> None:
+    lines = missing_interfaces([WLAN], ["wlan0", "wwan0"], ["wlan*", "wwan0", "wwan1", "usb*"])
+    assert lines == [
+        "wwan0: there is no such interface now (there are: wlan0); it is used as soon as it comes",
+        "networks: wwan1 matches no interface now (there are: wlan0)",
+        "networks: usb* matches no interface now (there are: wlan0)",
+    ]
+
+
 def test_an_interface_without_default_route_is_usable() -> None:
     assert choose([replace(WLAN, gateways=())], None).usable
 
