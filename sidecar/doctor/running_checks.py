@@ -318,6 +318,9 @@ def services(state: State) -> Iterator[Finding]:
     for name in told.get("mismatched") or ():
         text = f"{name}: served by a node of this host's ROS domain, with a QoS that does not fit"
         yield warn("service", text, "make the server with the default QoS of services, which is reliable")
+    for name in told.get("silent") or ():
+        text = f"{name}: the process of its server ended, or shows no sign of life"
+        yield fail("service", text, "look at that process: does it hang; if so, start it again")
     for name, servers in sorted((told.get("unreached") or {}).items()):
         text = f"{name}: offered by {servers} servers that this robot knows of, and none of them is reached"
         yield warn("service", text, "see path")

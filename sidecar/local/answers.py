@@ -123,6 +123,7 @@ class _Services(_Entry):
     missing_types: dict[Text, Text] = {}
     unmet: list[Text] = []
     mismatched: list[Text] = []
+    silent: list[Text] = []
     unreached: dict[Text, Whole] = {}
     configured: list[Text] = []
 

@@ -358,6 +358,7 @@ class CloudSide:
         ready = {name: runner for name, runner in self._runners.items() if runner.server.ready}
         self._stats.missing_types = dict(self._missing_types)
         self._stats.mismatched = frozenset(name for name, runner in self._runners.items() if runner.server.mismatched)
+        self._stats.silent = frozenset(name for name, runner in self._runners.items() if runner.server.lost)
         offers = tuple(
             ServiceOffer(name, runner.type.name, rule.capacity, rule.charge)
             for name, runner in sorted(ready.items())

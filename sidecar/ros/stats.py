@@ -56,5 +56,7 @@ class BridgeStats:
     """Services that are not carried because of their type, and that type. Replaced, never changed."""
     mismatched: frozenset[ServiceName] = frozenset()
     """Cloud: services with a server that rmw does not connect with us: its QoS does not fit, or it has just come."""
+    silent: frozenset[ServiceName] = frozenset()
+    """Cloud: services all of whose servers, as the ROS graph shows them, ended or show no sign of life."""
     carried: frozenset[ServiceName] = frozenset()
     """Robot: proxied services that exist. Cloud: services offered to robots."""

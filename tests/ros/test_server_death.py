@@ -170,8 +170,10 @@ def test_a_server_that_stands_still_is_used_again(mesh: Mesh, monkeypatch: pytes
     server.send(signal.SIGSTOP)
     mesh.call("/plan", "--count", "1", "--timeout-s", "1")
     mesh.wait_carried()
+    assert mesh.cloud.stats.silent == {PLAN}
     server.send(signal.SIGCONT)
     mesh.wait_carried("/plan")
+    assert not mesh.cloud.stats.silent
     assert mesh.result(mesh.call("/plan", "--count", "5"))["answered"] == 5
 
 

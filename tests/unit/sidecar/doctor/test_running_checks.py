@@ -258,6 +258,14 @@ def test_a_mapping_that_leads_nowhere_fails_and_a_hopeless_one_is_warned_of() ->
     assert texts(running_checks.mapping(state(), lambda _: None), *BAD) == []
 
 
+@pytest.mark.audit("ops-14")
+def test_a_server_that_stands_still_is_named() -> None:
+    told = {"carried": {"/map": "nav_msgs/srv/GetMap"}, "unmet": [], "silent": ["/plan"]}
+    cloud = {**state()["node"], "role": "cloud"}
+    (text,) = texts(running_checks.services(state(services=told, node=cloud)), Level.FAIL)
+    assert text == "/plan: the process of its server ended, or shows no sign of life"
+
+
 def test_the_control_stream() -> None:
     lost = {"names": ["cp:50051"], "connected": False, "since_s": 90.0, "last_failure": "nothing comes over wlan0"}
     (text,) = texts(running_checks.control(state(control=lost)), Level.WARN)
