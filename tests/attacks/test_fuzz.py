@@ -16,7 +16,7 @@ from tests.attacks.world import ATTACKER, World
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(3600)]
+pytestmark = [pytest.mark.netns, pytest.mark.busy, pytest.mark.ros, pytest.mark.timeout(3600)]
 
 RATE_HZ = 20_000.0
 SEEN = 200

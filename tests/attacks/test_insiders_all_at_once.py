@@ -15,7 +15,7 @@ from bench.insiders.report import show
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.netns, pytest.mark.busy, pytest.mark.ros, pytest.mark.timeout(400)]
 
 ATTACK_S, QUIET_S, CYCLE_S = 22.0, 2.0, 15.0
 IN_EVERY_RUN = {
