@@ -5,9 +5,18 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core.rtt import RttEstimator
-from sidecar.core.standing_queue import FLOOR_MEMORY_S, PEAK_MEMORY_S, FloorChange, StandingQueue
+from sidecar.core.standing_queue import (
+    FLOOR_MEMORY_S,
+    PEAK_MEMORY_S,
+    YIELD_S,
+    YIELD_WINDOWS,
+    FloorChange,
+    StandingQueue,
+)
 
 FLOOR_S = 0.050
+YIELDED_S = YIELD_WINDOWS * YIELD_S
+"""It is told a round trip and a sample or two later."""
 
 
 class World:
@@ -91,9 +100,9 @@ def test_what_stays_when_less_is_sent_is_a_longer_route() -> None:
     world.take(3 * FLOOR_S)
     assert world.stands()
     world.queue.on_cut(world.rtt, world.now)
-    assert world.take(3 * FLOOR_S, 0.5) is None, "too soon to tell"
+    assert world.take(3 * FLOOR_S, YIELDED_S) is None, "too soon to tell"
     world.queue.on_cut(world.rtt, world.now)  # what is lost meanwhile does not put it off
-    assert world.take(3 * FLOOR_S, 1.0) is FloorChange.ROSE
+    assert world.take(3 * FLOOR_S, 0.5) is FloorChange.ROSE
     assert not world.stands()
     assert world.take(3 * FLOOR_S, 5.0) is None
     world.take(6 * FLOOR_S)
@@ -107,7 +116,7 @@ def test_a_queue_that_gets_shorter_when_less_is_sent_is_one(left: float) -> None
     world.queue.on_cut(world.rtt, world.now)
     world.take(3 * FLOOR_S, 0.2)
     assert world.take(left * FLOOR_S, 0.8) is None
-    assert world.take(3 * FLOOR_S, 3.0) is None
+    assert world.take(3 * FLOOR_S, 2 * YIELDED_S) is None
     assert world.stands()
 
 
@@ -115,7 +124,7 @@ def test_others_queue_that_was_taken_for_a_route_is_found_out_when_it_gets_short
     world = World()
     world.take(3 * FLOOR_S)
     world.queue.on_cut(world.rtt, world.now)
-    assert world.take(3 * FLOOR_S, 2.0) is FloorChange.ROSE
+    assert world.take(3 * FLOOR_S, YIELDED_S + 0.5) is FloorChange.ROSE
     assert world.take(2 * FLOOR_S) is FloorChange.FELL
     world.take(3 * FLOOR_S)
     assert world.stands()
