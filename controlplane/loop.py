@@ -13,13 +13,10 @@ from typing import TYPE_CHECKING
 from controlplane.core.claims import check_claims, check_unproven_claims
 from controlplane.core.control import ControlCore, Settled
 from controlplane.core.control_events import (
-    Close,
-    CloseReason,
     CutOffNotice,
     DepartureNotice,
     NackNotice,
     OffersRefusedNotice,
-    Send,
     StreamLostNotice,
     UnmetNotice,
 )
@@ -29,6 +26,7 @@ from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
 from controlplane.core.report_share import ReportShares
+from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.earliest_end import EarliestEnd
 from controlplane.fleet_metrics import MAX_GONE, Fleet
 from controlplane.garbage import Collector

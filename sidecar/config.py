@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from protos.identity import Identity
     from protos.model import InterfaceName
-    from sidecar.core.budgets import Budget
+    from sidecar.core.budget import Budget
 
 DEFAULT_CLOUD_UDP_PORT = 24700
 """Fixed, since a firewall rule has to name it; below Linux' ephemeral ports (32768 and up)."""

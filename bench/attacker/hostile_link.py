@@ -16,7 +16,6 @@ from bench.attacker.spoofing import Spoofer
 from protos.model import Role, ServiceName
 from sidecar.core import frame
 from sidecar.core.datagrams import Batch
-from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.key_schedule import proof_of_offer
 from sidecar.core.link import Link
 from sidecar.core.messages import (
@@ -27,9 +26,8 @@ from sidecar.core.messages import (
     ResponseMessage,
     encode_message,
 )
-from sidecar.core.path_id import PathState
-from sidecar.core.priority import Priority
 from sidecar.core.session import public_key
+from sidecar.core.values import PathState, Priority, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

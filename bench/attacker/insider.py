@@ -31,7 +31,7 @@ from protos.tls_files import load_tls_files
 from sidecar import __main__ as sidecar
 from sidecar import runtime
 from sidecar.core.engine import Engine
-from sidecar.core.events import RejectReason, RequestId
+from sidecar.core.values import RejectReason, RequestId
 from sidecar.net import managed_interface
 from sidecar.net.dataplane import ThreadedDataPlane
 

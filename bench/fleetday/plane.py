@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import (
-    Close,
-    CloseReason,
     CutOffNotice,
     DepartureNotice,
     NackNotice,
     OffersRefusedNotice,
-    Send,
     StreamLostNotice,
     UnmetNotice,
 )
 from controlplane.core.registry import Refusal
+from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.event_log import EventLog
 from controlplane.matcher import Matcher
 from controlplane.remembered import departures

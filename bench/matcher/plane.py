@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 from bench.matcher.feed import REPORT_INTERVAL_S, ROBOT, SERVICE
 from controlplane.core.control import ControlCore
-from controlplane.core.control_events import Send, Settings
+from controlplane.core.control_events import Settings
 from controlplane.core.registry import Refusal
+from controlplane.core.stream_messages import Send
 from controlplane.matcher import Matcher
 from protos.model import (
     PROTOCOL_VERSION,

@@ -13,15 +13,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, assert_never
 
 from controlplane.core.control_events import (
-    Close,
-    CloseReason,
     Counters,
     CutOffNotice,
     DepartureNotice,
     Event,
     NackNotice,
     OffersRefusedNotice,
-    Send,
     Settings,
     StreamLostNotice,
     UnmetNotice,
@@ -51,6 +48,7 @@ from controlplane.core.restlessness import Restlessness
 from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
 from controlplane.core.status import is_met, is_offered, statuses
+from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.core.unanswered import Unanswered
 from controlplane.core.urgency import Urgency
 from protos.errors import DecodeError

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import enum
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from controlplane.core.problem import Objective
+from controlplane.core.stream_messages import Close, Send
 
 if TYPE_CHECKING:
     from controlplane.core.departed import Departure
     from controlplane.core.path_rules import PathRule
     from controlplane.core.policy import Policy
-    from controlplane.core.registry import StreamId
-    from protos.model import ControlMessage, Nack, NodeName, ResourceKind, Role, ServiceName
+    from protos.model import Nack, NodeName, ResourceKind, Role, ServiceName
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,32 +29,6 @@ class Settings:
     stun_servers: tuple[str, ...] = ()
     path_rules: tuple[PathRule, ...] = ()
     policy: Policy | None = None
-
-
-class CloseReason(enum.Enum):
-    """Why the control plane ends a stream."""
-
-    REPLACED = "replaced by a newer stream of this sidecar"
-    LEASE_EXPIRED = "silent for longer than the lease"
-    STOPPING = "the control plane is stopping"
-    REVOKED = "the certificate is revoked"
-    CERTIFICATE_ENDED = "the certificate is not good any more"
-
-
-@dataclass(frozen=True, slots=True)
-class Send:
-    """A message for one stream; a newer one of the same type makes an unsent older one pointless."""
-
-    stream: StreamId
-    message: ControlMessage
-
-
-@dataclass(frozen=True, slots=True)
-class Close:
-    """End this stream."""
-
-    stream: StreamId
-    reason: CloseReason
 
 
 @dataclass(slots=True)

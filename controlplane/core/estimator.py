@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 from controlplane.core.compute import ComputeTimes, ServerTimes
 from controlplane.core.fading import FadedCount, FadedShares
-from controlplane.core.fleet_view import PathView
 from controlplane.core.forgetting import forget_after_s, forget_before
 from controlplane.core.interface_trouble import InterfaceTrouble
 from controlplane.core.late_fate import LateFate
-from controlplane.core.network import RobotNetwork
+from controlplane.core.network import PathView, RobotNetwork
 from controlplane.core.parts import Asked, from_parts, parts_of, slower_than
 from controlplane.core.penalties import Penalties
 from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials

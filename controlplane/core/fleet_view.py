@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from controlplane.core.estimator import Estimator
+    from controlplane.core.network import PathView
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
     from controlplane.core.reached import Reached
@@ -28,19 +29,6 @@ if TYPE_CHECKING:
 
 MAX_VIEWED = 512
 """Paths, and services, of one robot that are looked at."""
-
-
-@dataclass(frozen=True, slots=True)
-class PathView:
-    """One path of a robot, as reported last."""
-
-    interface: InterfaceName
-    server: NodeName
-    up: bool
-    round_trip_s: float
-    """The median, within 2 %; NaN where none is known."""
-    leads_there: bool = True
-    """Whether it ever was up, or nothing ever was over its interface: else its being down tells nothing."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,6 +91,19 @@ class Witness(NamedTuple):
         return (1.0 - self.resent) * prompt + self.resent * self.times.sums_exceed(processing, left - self.resend_s)
 
 
+@dataclass(frozen=True, slots=True)
+class PathView:
+    """One path of a robot, as reported last."""
+
+    interface: InterfaceName
+    server: NodeName
+    up: bool
+    round_trip_s: float
+    """The median, within 2 %; NaN where none is known."""
+    leads_there: bool = True
+    """Whether it ever was up, or nothing ever was over its interface: else its being down tells nothing."""
+
+
 @dataclass(slots=True)
 class PathState:
     """What is known of one path but its requests."""

@@ -24,9 +24,9 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 from controlplane.core import reconcile
-from controlplane.core.control_events import Send
 from controlplane.core.registry import MAX_SIDECARS
 from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
+from controlplane.core.stream_messages import Send
 from controlplane.core.told_peers import ToldPeers
 from controlplane.core.views import KnownPeers, Views
 from protos.model import POLICY_PENDING, ResourceKind, Role, Version

@@ -18,15 +18,13 @@ from itertools import chain, count, islice
 from typing import TYPE_CHECKING
 
 from sidecar.core.backlog import in_groups
-from sidecar.core.copies import is_race
 from sidecar.core.dedup import Waiter
-from sidecar.core.events import RejectReason
 from sidecar.core.messages import RejectionMessage, ResponseMessage, encode_message
-from sidecar.core.path_id import PathState
-from sidecar.core.priority import Priority
+from sidecar.core.request_id import is_race
 from sidecar.core.room import Lane
 from sidecar.core.shares import Shares
 from sidecar.core.timers import first_of
+from sidecar.core.values import PathState, Priority, RejectReason
 from sidecar.core.waiting_line import WaitingLine
 
 if TYPE_CHECKING:
@@ -35,13 +33,12 @@ if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.backlog import Backlog, Step
     from sidecar.core.dedup import Reply
-    from sidecar.core.events import RequestId
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.outbox import Outbox
-    from sidecar.core.path_id import PathId
     from sidecar.core.routes import Routes
     from sidecar.core.rules import Rules
     from sidecar.core.stats import EngineStats
+    from sidecar.core.values import PathId, RequestId
 
 MAX_ANSWERS = 32_768
 """Answers and rejections that wait or are under way; one robot may have half: twice what it may have in flight."""

@@ -17,27 +17,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import InterfaceName, ServiceName
+    from sidecar.core.budget import Budget
     from sidecar.core.stats import EngineStats
 
 MAX_SAVED_BYTES = 32 * 1024 * 1024
 """What a bucket holds: twice the largest request."""
 DAY_S = 86_400.0
-
-
-@dataclass(frozen=True, slots=True)
-class Budget:
-    """The limits of the interfaces whose name matches `pattern` (exact or glob); each has its own."""
-
-    pattern: str
-    extra_load: float | None = None
-    """Bytes of extra copies for each byte of requests answered in time; None: no such limit."""
-    extra_bytes_a_day: int | None = None
-    """Bytes of extra copies in 24 hours, counted from the first one; None: no such limit."""
-
-    @property
-    def limits(self) -> bool:
-        """Whether it has any limit."""
-        return self.extra_load is not None or self.extra_bytes_a_day is not None
 
 
 @dataclass(slots=True)

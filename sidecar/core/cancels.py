@@ -9,8 +9,8 @@ from sidecar.core.shares import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
     from protos.model import NodeName
-    from sidecar.core.events import RequestId
     from sidecar.core.stats import EngineStats
+    from sidecar.core.values import RequestId
 
 MAX_EARLY_CANCELS = 16_384
 """Ids kept; one robot may fill half: 130 requests a second, all overtaken, for REMEMBER_CANCEL_S. What is not kept may

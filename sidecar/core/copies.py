@@ -6,18 +6,13 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
+from sidecar.core.request_id import is_race
+
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
-    from sidecar.core.events import RequestId
     from sidecar.core.outbound import OutboundMessage
-    from sidecar.core.path_id import PathId
     from sidecar.core.rules import ServiceRule
-
-OBSERVED_ONE_IN = 8
-"""One request in so many is a full race: no copy is called off because another won, and all are measured.
-
-At 10 requests a second and the estimator's half-life of 60 s, this leaves the weight of 100 requests for each path,
-where its estimate stands on real requests alone; seven eighths of what losers would waste are saved."""
+    from sidecar.core.values import PathId, RequestId
 
 HEDGE_AT = 0.5
 """At this part of the deadline, a server that has the request alone and is silent makes another one worth asking."""
@@ -205,12 +200,3 @@ class Request:
     def is_race(self) -> bool:
         """Whether all its copies are to be measured."""
         return is_race(self.id)
-
-
-def is_race(request_id: RequestId) -> bool:
-    """Whether a request is one of those of which all copies are to be measured.
-
-    By a hash (the id), so without regard to the outcome, nor in step with anything that the application does every so
-    many requests.
-    """
-    return request_id[-1] % OBSERVED_ONE_IN == 0

@@ -23,9 +23,9 @@ from sidecar.core.frame import (
 )
 from sidecar.core.introduction import INTRODUCTION_BYTES, encode_introduction
 from sidecar.core.path_address import LEAST_CREDIT_BYTES
-from sidecar.core.path_id import PathState
 from sidecar.core.path_table import MAX_PENDING_FRAMES
 from sidecar.core.timers import NEVER
+from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from protos.credential import SessionCredential

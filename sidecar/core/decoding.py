@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName, SessionId
     from sidecar.core.partial import Partial
-    from sidecar.core.path_id import PathId
+    from sidecar.core.values import PathId
 
 MAX_BYTES = 128 * 1024 * 1024
 """What messages in line hold, repair symbols included. One peer may hold half: two of the largest that came as repair

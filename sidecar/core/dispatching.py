@@ -15,17 +15,17 @@ from sidecar.core.budgets import Budgets
 from sidecar.core.copies import HEDGE_AT, Copy, CopyState, Request
 from sidecar.core.exploration import Exploration
 from sidecar.core.messages import RequestMessage, encode_message
-from sidecar.core.path_id import PathState
 from sidecar.core.path_pace import PathPaces
 from sidecar.core.path_records import PathRecords
+from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
     from protos.model import NodeName
     from sidecar.core.messages import Encoded
-    from sidecar.core.path_id import PathId
     from sidecar.core.request_parts import RequestParts
+    from sidecar.core.values import PathId
 
 MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""

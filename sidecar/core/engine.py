@@ -14,14 +14,7 @@ from protos.errors import DecodeError, UnknownKindError
 from protos.model import MAX_PEERS, MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.attention import Attention
 from sidecar.core.backlog import SLICE, Backlog, Step, rest
-from sidecar.core.events import (
-    ApplicationEvent,
-    ExecutionId,
-    OfferService,
-    RejectReason,
-    RequestId,
-    WithdrawService,
-)
+from sidecar.core.events import ApplicationEvent, OfferService, WithdrawService
 from sidecar.core.goodbyes import Goodbyes
 from sidecar.core.inbound import Inbound
 from sidecar.core.link_events import (
@@ -58,7 +51,6 @@ from sidecar.core.messages import (
 )
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
-from sidecar.core.path_id import PathId, PathState
 from sidecar.core.peers import Peers
 from sidecar.core.penalties import Penalties
 from sidecar.core.report_scope import ReportScope
@@ -69,12 +61,13 @@ from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
+from sidecar.core.values import ExecutionId, PathId, PathState, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from protos.model import InterfaceName, NodeName, Peer, ServiceMapping, ServiceName, ServiceOffer, SessionId
-    from sidecar.core.budgets import Budget
+    from sidecar.core.budget import Budget
     from sidecar.core.decoding import Decoding
     from sidecar.core.session import OwnSession
 

@@ -52,7 +52,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
 from protos.model import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, InterfaceId, SessionId
-from sidecar.core import pmtu
 from sidecar.core.aead import NONCE_BYTES, TAG_BYTES
 
 if TYPE_CHECKING:
@@ -72,9 +71,12 @@ CLEAR = struct.Struct(">IQQ")
 MIN_DATAGRAM_BYTES = HEADER_BYTES + 1 + TAG_BYTES
 """One frame of one byte."""
 
-MAX_DATAGRAM_BYTES = pmtu.MAX_BYTES
-"""UDP payload of the longest datagram that is accepted; how long those to a path may be, `pmtu.py` finds out."""
-BASE_FRAMES_BYTES = pmtu.BASE_BYTES - HEADER_BYTES - TAG_BYTES
+BASE_BYTES = 1200
+"""UDP payload that every path of the Internet carries (RFC 9000 section 14; BASE_PLPMTU)."""
+MAX_DATAGRAM_BYTES = 8952
+"""UDP payload of the longest datagram that is accepted: jumbo frames of 9000 bytes less the headers of IPv6 and UDP;
+larger ones gain nothing more. How long those to a path may be, `pmtu.py` finds out."""
+BASE_FRAMES_BYTES = BASE_BYTES - HEADER_BYTES - TAG_BYTES
 """Frames of a datagram that every path carries."""
 
 MAX_MESSAGE_BYTES = 16 * 1024 * 1024 + 1024
@@ -98,7 +100,7 @@ FRAGMENT_HEAD_BYTES = FRAGMENT_HEAD.size
 
 FRAGMENT_OVERHEAD_BYTES = HEADER_BYTES + FRAGMENT_HEAD_BYTES + TAG_BYTES
 """What a datagram that holds nothing but a fragment has beside the symbol."""
-BASE_SYMBOL_BYTES = pmtu.BASE_BYTES - FRAGMENT_OVERHEAD_BYTES
+BASE_SYMBOL_BYTES = BASE_BYTES - FRAGMENT_OVERHEAD_BYTES
 """Symbol that every path carries."""
 MAX_SYMBOL_BYTES = MAX_DATAGRAM_BYTES - FRAGMENT_OVERHEAD_BYTES
 FRAGMENT_DATAGRAM = struct.Struct(">IQQBQIHHI")

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from protos.model import NodeName, SessionId
     from sidecar.core.frame import Fragment
     from sidecar.core.link_events import PathCommand
-    from sidecar.core.path_id import PathId
     from sidecar.core.stats import EngineStats
+    from sidecar.core.values import PathId
 
 
 class Arrived(NamedTuple):

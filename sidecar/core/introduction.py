@@ -34,6 +34,7 @@ from protos.credential import decode_credential
 from protos.errors import DecodeError
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import (
+    BASE_BYTES,
     HEADER_BYTES,
     INTRODUCTION_FLAG,
     NONCE_OFFSET,
@@ -43,7 +44,6 @@ from sidecar.core.frame import (
     encode_header,
 )
 from sidecar.core.key_schedule import expand
-from sidecar.core.pmtu import BASE_BYTES
 
 if TYPE_CHECKING:
     from protos.credential import SessionCredential

@@ -39,12 +39,12 @@ from sidecar.core.link_events import (
 from sidecar.core.link_memory import LinkMemory
 from sidecar.core.link_mtu import LinkMtu
 from sidecar.core.link_reader import LinkReader
-from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.path_table import PathTable
 from sidecar.core.path_view import view_of
 from sidecar.core.stats import PathStats
 from sidecar.core.timers import NEVER, Timers
+from sidecar.core.values import PathId, PathState
 
 if TYPE_CHECKING:
     import random

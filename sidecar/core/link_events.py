@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from sidecar.core.frame import Fragment
     from sidecar.core.key_schedule import PairKeys
     from sidecar.core.outbound import OutboundMessage
-    from sidecar.core.path_id import PathId, PathState
+    from sidecar.core.values import PathId, PathState
 
 
 @dataclass(frozen=True, slots=True)

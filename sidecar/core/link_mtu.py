@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sidecar.core.frame import BASE_BYTES
 from sidecar.core.link_events import FragmentsLost, PathMtuChanged
-from sidecar.core.path_id import PathState
-from sidecar.core.pmtu import BASE_BYTES, payloads
+from sidecar.core.pmtu import payloads
+from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from collections import deque

@@ -30,7 +30,7 @@ from sidecar.core.link_events import (
     PeerClosed,
 )
 from sidecar.core.link_opener import LinkOpener
-from sidecar.core.path_id import PathState
+from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Callable

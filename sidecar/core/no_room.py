@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.copies import Request
     from sidecar.core.dispatching import Dispatching
-    from sidecar.core.events import RequestId
     from sidecar.core.routes import Routes
+    from sidecar.core.values import RequestId
 
     _Group = tuple[Lane, tuple[NodeName, ...]]
 

@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING
 
 from sidecar.core import fec
 from sidecar.core.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, MIN_SYMBOL_BYTES, symbol_count
-from sidecar.core.priority import Priority
 from sidecar.core.timers import NEVER
+from sidecar.core.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import NodeName
-    from sidecar.core.events import RequestId
     from sidecar.core.messages import Encoded
-    from sidecar.core.path_id import PathId
+    from sidecar.core.values import PathId, RequestId
 
 
 class OutboundMessage:

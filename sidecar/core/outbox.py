@@ -18,14 +18,12 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, NodeName
     from sidecar.core.backlog import Step
-    from sidecar.core.events import RequestId
     from sidecar.core.link_events import PathCommand
     from sidecar.core.messages import Encoded
-    from sidecar.core.path_id import PathId
-    from sidecar.core.priority import Priority
     from sidecar.core.redundancy import Redundancy
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
+    from sidecar.core.values import PathId, Priority, RequestId
 
 LOOKED_AT_ONCE = 512
 """Messages looked at in one call of `ask_again`, which has the engine's lock: about a millisecond."""

@@ -11,7 +11,7 @@ from sidecar.core.link_events import (
     PathChanged,
     PeerLied,
 )
-from sidecar.core.path_id import PathState
+from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from sidecar.core import frame

@@ -8,13 +8,13 @@ from sidecar.core.congestion import CongestionController
 from sidecar.core.frame import Finished, encode_ack, encode_finished
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.path_address import PathAddress
-from sidecar.core.path_id import PathId, PathState
 from sidecar.core.pmtu import PathMtu
 from sidecar.core.probing import Probing
 from sidecar.core.recovery import Recovery
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.send_queue import SendQueue
 from sidecar.core.timers import NEVER
+from sidecar.core.values import PathId, PathState
 
 if TYPE_CHECKING:
     import random
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from protos.token_bucket import TokenBucket
     from sidecar.core.frame import KeyAnswer, KeyOffer
     from sidecar.core.path_keys import PathKeys
-    from sidecar.core.pinging import SentPing
+    from sidecar.core.probing import SentPing
 
 DOWN_FACTOR = 4.0
 """An unstable path is down after this many times the silence that made it unstable, or the longest that anybody waits

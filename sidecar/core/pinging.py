@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING
 from protos.token_bucket import TokenBucket
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import HEADER_BYTES
-from sidecar.core.path_id import PathState
+from sidecar.core.probing import SentPing
 from sidecar.core.rtt import LONGEST_ANSWER_S
+from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from sidecar.core.link_events import Ping
-    from sidecar.core.path_id import PathId
     from sidecar.core.paths import Path
+    from sidecar.core.values import PathId
 
 PINGS_PER_S = 20.0
 """Of one link, however many ask: some 30 kB a second of the longest that Ethernet carries, ..."""
@@ -45,19 +46,6 @@ class Pong:
     """From the datagram that left to the one that came, in seconds; 0 with a problem."""
     problem: str = ""
     """Why it was not sent; empty: it was answered."""
-
-
-@dataclass(slots=True)
-class SentPing:
-    """One that waits to leave, or for its answer."""
-
-    id: int
-    """Of its PROBE."""
-    number: int
-    path: PathId
-    size: int
-    """Of its datagram: bytes of UDP payload."""
-    sent_at: float | None = None
 
 
 class Pings:

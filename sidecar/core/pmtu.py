@@ -12,10 +12,8 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-BASE_BYTES = 1200
-"""What every path of the Internet carries (RFC 9000 section 14; BASE_PLPMTU)."""
-MAX_BYTES = 8952
-"""Jumbo frames of 9000 bytes less the headers of IPv6 and UDP; larger ones gain nothing more."""
+from sidecar.core.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
+
 COMMON_MTUS = (1280, 1400, 1420, 1492, 1500, 4096, 9000)
 """MTUs tried, where the interface takes them: IPv6's least, mobile networks, WireGuard, PPPoE, Ethernet, jumbo frames.
 What the interface itself takes is always tried last."""
@@ -44,10 +42,10 @@ PROBES_REMEMBERED = 2 * MAX_PROBES
 
 @lru_cache(maxsize=64)
 def payloads(mtu: int, *, ipv6: bool) -> tuple[int, ...]:
-    """Return what to try on an interface of this MTU (bytes), ascending: all above BASE_BYTES, up to MAX_BYTES."""
+    """Return what to try on an interface of this MTU (bytes), ascending: above BASE_BYTES, up to MAX_DATAGRAM_BYTES."""
     headers = HEADERS_V6 if ipv6 else HEADERS_V4
     sizes = {min(candidate, mtu) - headers for candidate in COMMON_MTUS} | {mtu - headers}
-    return tuple(sorted({min(size, MAX_BYTES) for size in sizes if size > BASE_BYTES}))
+    return tuple(sorted({min(size, MAX_DATAGRAM_BYTES) for size in sizes if size > BASE_BYTES}))
 
 
 class PathMtu:

@@ -7,6 +7,7 @@ is. The other end asks in the datagram with which it answers, and by itself only
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core.rtt import LONGEST_ANSWER_S
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     import random
 
     from protos.model import Address
+    from sidecar.core.values import PathId
 
 IDLE_PROBE_S = 0.5
 """A path that was in use a moment ago is probed this often, which finds a dead one within a second, ..."""
@@ -55,6 +57,19 @@ class Probe(NamedTuple):
     """Where it went, and nowhere else: so the peer is there."""
     sealed: bool
     """With this path's keys, so that the answer confirms those."""
+
+
+@dataclass(slots=True)
+class SentPing:
+    """One that waits to leave, or for its answer."""
+
+    id: int
+    """Of its PROBE."""
+    number: int
+    path: PathId
+    size: int
+    """Of its datagram: bytes of UDP payload."""
+    sent_at: float | None = None
 
 
 class Probing:

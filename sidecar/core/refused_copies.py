@@ -14,8 +14,8 @@ from sidecar.core.shares import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
     from protos.model import NodeName
-    from sidecar.core.events import RejectReason, RequestId
     from sidecar.core.stats import EngineStats
+    from sidecar.core.values import RejectReason, RequestId
 
 MAX_REFUSED_COPIES = 65_536
 """Copies remembered; one robot may fill half: 500 refused copies a second for a minute. What is not remembered may run

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
     from sidecar.core.copies import Copy, Request
-    from sidecar.core.events import RequestId
-    from sidecar.core.path_id import PathId
+    from sidecar.core.values import PathId, RequestId
 
 _Key = TypeVar("_Key")
 _Entry = TypeVar("_Entry")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName
-    from sidecar.core.budgets import Budget
+    from sidecar.core.budget import Budget
     from sidecar.core.events import ApplicationEvent
     from sidecar.core.mapping import MappingTable
     from sidecar.core.measurements import Measurements

@@ -25,14 +25,7 @@ from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Answer, Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.dispatching import MAX_COPIES, Dispatching
-from sidecar.core.events import (
-    DeadlineMissed,
-    RejectReason,
-    RequestFailed,
-    RequestId,
-    ResponseArrived,
-    Unreachable,
-)
+from sidecar.core.events import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
     MAX_PAYLOAD_BYTES,
@@ -40,8 +33,8 @@ from sidecar.core.messages import (
     ResponseMessage,
 )
 from sidecar.core.no_room import NoRoom
-from sidecar.core.path_id import PathId, PathState
 from sidecar.core.timers import first_of
+from sidecar.core.values import PathId, PathState, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator

@@ -17,7 +17,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
 from sidecar.core.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
-from sidecar.core.priority import Priority
+from sidecar.core.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

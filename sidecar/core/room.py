@@ -16,7 +16,7 @@ from sidecar.core.shares import Shares
 if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.outbound import OutboundMessage
-    from sidecar.core.path_id import PathId
+    from sidecar.core.values import PathId
 
 MAX_MESSAGES = 16_384
 """All undelivered messages: one peer may have half of them, as many as requests may be in flight."""

@@ -17,16 +17,14 @@ from itertools import count
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
-from sidecar.core.priority import Priority
 from sidecar.core.turn import Turn
+from sidecar.core.values import SHARE, Priority
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sidecar.core.outbound import OutboundMessage
 
-SHARE = 16
-"""A waiting lower priority gets one symbol for so many of the higher ones."""
 PURGE_AT = 64
 """Entries before the first look for messages that are over; then whenever their number has doubled."""
 BEGUN = float("-inf")

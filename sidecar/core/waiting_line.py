@@ -11,8 +11,7 @@ import heapq
 from itertools import count
 from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
-from sidecar.core.priority import Priority
-from sidecar.core.send_queue import SHARE
+from sidecar.core.values import SHARE, Priority
 
 if TYPE_CHECKING:
     from collections.abc import Hashable

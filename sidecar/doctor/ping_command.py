@@ -25,8 +25,8 @@ from protos.arguments import checked, number, whole
 from protos.errors import ConfigError, DecodeError
 from protos.names import interface_name, node_name
 from protos.printable import escaped
+from sidecar.core.frame import MAX_DATAGRAM_BYTES
 from sidecar.core.pinging import LEAST_BYTES
-from sidecar.core.pmtu import MAX_BYTES
 from sidecar.doctor.examination import connect, read_config
 from sidecar.doctor.finding import share
 from sidecar.doctor.options import parser_of, where_of
@@ -179,7 +179,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "-i", "--interval", type=number(LEAST_INTERVAL_S, 3600), default=1.0, metavar="S", help="seconds between two"
     )
     parser.add_argument(
-        "-s", "--size", type=whole(LEAST_BYTES, MAX_BYTES), default=DEFAULT_BYTES, metavar="BYTES", help="UDP payload"
+        "-s",
+        "--size",
+        type=whole(LEAST_BYTES, MAX_DATAGRAM_BYTES),
+        default=DEFAULT_BYTES,
+        metavar="BYTES",
+        help="UDP payload",
     )
     parser.add_argument(
         "-I", "--interface", type=checked(_interface, "the interface"), metavar="NAME", help="over this interface only"

@@ -18,7 +18,7 @@ from typing import Any
 
 from protos.errors import DecodeError
 from protos.names import node_name
-from sidecar.core.pmtu import MAX_BYTES
+from sidecar.core.frame import MAX_DATAGRAM_BYTES
 
 VERSION = 1
 """Told in the part `node`. A part or key that a client does not know is to be ignored."""
@@ -64,7 +64,9 @@ def decode_request(line: bytes) -> StateRequest | PingRequest:
         case "state":
             return StateRequest(request_id)
         case "ping":
-            return PingRequest(request_id, _peer(request), _interface(request), _whole(request, "size", 0, MAX_BYTES))
+            return PingRequest(
+                request_id, _peer(request), _interface(request), _whole(request, "size", 0, MAX_DATAGRAM_BYTES)
+            )
     raise DecodeError("ask is state or ping")
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from protos.model import Address, InterfaceName
     from sidecar.core.control_session import ControlStats
     from sidecar.core.control_ways import ControlInterface, Way
-    from sidecar.core.path_id import PathState
+    from sidecar.core.values import PathState
 
 log = logging.getLogger(__name__)
 

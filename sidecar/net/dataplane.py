@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.link_events import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
-from sidecar.core.path_id import PathState
 from sidecar.core.pinging import Pong
+from sidecar.core.values import PathState
 from sidecar.net.decoder import Decoder
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
@@ -43,15 +43,14 @@ if TYPE_CHECKING:
         SessionId,
     )
     from sidecar.core.decoding import Decoding
-    from sidecar.core.events import ExecutionId, RejectReason, RequestId
     from sidecar.core.link_events import LinkEvent
     from sidecar.core.path_history import Change
-    from sidecar.core.path_id import PathId
     from sidecar.core.path_view import PathView
     from sidecar.core.report_scope import ReportScope
     from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
+    from sidecar.core.values import ExecutionId, PathId, RejectReason, RequestId
     from sidecar.net.interface_thread import InterfaceThread
     from sidecar.ports import Application
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.core.path_id import PathState
+from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from sidecar.core.link_events import PathChanged
-    from sidecar.core.path_id import PathId
+    from sidecar.core.values import PathId
 
 log = logging.getLogger(__name__)
 

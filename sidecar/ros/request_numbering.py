@@ -8,7 +8,7 @@ from sidecar.core.request_id import make_request_id
 
 if TYPE_CHECKING:
     from protos.model import SessionId
-    from sidecar.core.events import RequestId
+    from sidecar.core.values import RequestId
     from sidecar.ros.rcl import RmwRequestId
 
 

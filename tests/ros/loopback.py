@@ -16,19 +16,18 @@ from sidecar.core.events import (
     AbandonExecution,
     DeadlineMissed,
     ExecuteRequest,
-    ExecutionId,
     OfferService,
     RequestFailed,
     ResponseArrived,
     WithdrawService,
 )
-from sidecar.core.priority import Priority
+from sidecar.core.values import ExecutionId, Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from protos.model import ServiceOffer
-    from sidecar.core.events import RejectReason, RequestId
+    from sidecar.core.values import RejectReason, RequestId
     from sidecar.ports import Application
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,8 @@ import random
 import zlib
 from typing import TYPE_CHECKING
 
-from controlplane.core.control_events import CloseReason, Settings
+from controlplane.core.control_events import Settings
+from controlplane.core.stream_messages import CloseReason
 from protos.model import (
     CandidateSet,
     InterfaceName,

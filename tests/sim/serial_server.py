@@ -6,15 +6,8 @@ from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING
 
-from sidecar.core.events import (
-    AbandonExecution,
-    ApplicationEvent,
-    CancelExecution,
-    ExecuteRequest,
-    ExecutionId,
-    RejectReason,
-    RequestId,
-)
+from sidecar.core.events import AbandonExecution, ApplicationEvent, CancelExecution, ExecuteRequest
+from sidecar.core.values import ExecutionId, RejectReason, RequestId
 from sidecar.ros.request_window import RequestWindow
 
 if TYPE_CHECKING:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import TYPE_CHECKING
 
 from controlplane.core.control_events import Settings
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from protos.model import NodeName, Role, ServiceName, ServiceOffer
-from sidecar.core.events import CallsForbidden, ExecuteRequest, RequestFailed, RequestId, WithdrawService
+from sidecar.core.events import CallsForbidden, ExecuteRequest, RequestFailed, WithdrawService
 from sidecar.core.offers import WITHDRAW_AFTER_S
 from tests.sim.joined_planes import JoinedPlanes, restored
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
+
+if TYPE_CHECKING:
+    from sidecar.core.values import RequestId
 
 SECRET = ServiceName("/secret")
 ANY = ("*",)

@@ -18,7 +18,7 @@ from protos.model import Address, InterfaceName
 from sidecar.core.control_race import ControlRace
 from sidecar.core.control_watch import CHEAPER, KEEPALIVE_S, SILENT, ControlWatch, Seen
 from sidecar.core.control_ways import WELL_S, ControlInterface, ControlWays, Price, Way
-from sidecar.core.path_id import PathState
+from sidecar.core.values import PathState
 
 STEP_S = 0.02
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")

@@ -7,13 +7,14 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.model import Role, ServiceName
-from sidecar.core.events import DeadlineMissed, RequestFailed, RequestId, ResponseArrived, Unreachable
+from sidecar.core.events import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from sidecar.core.fallback import Fallbacks
 from sidecar.core.fallback_rule import FallbackRule
 from tests.sim.mesh import SERVICE, Mesh, rule
 
 if TYPE_CHECKING:
     from sidecar.core.events import ApplicationEvent
+    from sidecar.core.values import RequestId
     from tests.sim.mesh import Node
 
 DEADLINE_S = 0.5

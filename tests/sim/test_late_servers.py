@@ -6,8 +6,9 @@ import pytest
 
 from protos.model import ServiceOffer
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.events import ApplicationEvent, ExecuteRequest, RejectReason, RequestFailed, WithdrawService
+from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestFailed, WithdrawService
 from sidecar.core.offers import WITHDRAW_AFTER_S
+from sidecar.core.values import RejectReason
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 from tests.sim.test_mesh import call_at, mapped
 

@@ -7,8 +7,9 @@ from functools import partial
 import pytest
 
 from protos.model import InterfaceName, NodeName
+from sidecar.core.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 from sidecar.core.link_events import SetMtu
-from sidecar.core.pmtu import BASE_BYTES, MAX_BYTES, RETRY_S
+from sidecar.core.pmtu import RETRY_S
 from tests.sim.mesh import Mesh, Node, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
 
@@ -47,7 +48,7 @@ def found(robot: Node, interface: str) -> int:
 
 def test_each_path_finds_its_own() -> None:
     _, robot, _ = two_paths(1, {"wlan0": 9000, "wwan0": 1400}, "cloud-a", interface_mtu=9000)
-    assert found(robot, "wlan0") == MAX_BYTES
+    assert found(robot, "wlan0") == MAX_DATAGRAM_BYTES
     assert found(robot, "wwan0") == 1372
 
 

@@ -7,7 +7,8 @@ from functools import partial
 import pytest
 
 from sidecar.core.dispatching import MAX_ASKED, MAX_COPIES
-from sidecar.core.events import ApplicationEvent, ExecuteRequest, RejectReason, RequestFailed
+from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestFailed
+from sidecar.core.values import RejectReason
 from tests.sim.mesh import Mesh, rule
 
 

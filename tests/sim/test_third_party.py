@@ -14,10 +14,9 @@ from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, R
 from sidecar.core import frame
 from sidecar.core.messages import RequestMessage, encode_message
 from sidecar.core.path_address import AMPLIFICATION
-from sidecar.core.path_id import PathState
 from sidecar.core.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
-from sidecar.core.priority import Priority
 from sidecar.core.request_id import make_request_id
+from sidecar.core.values import PathState, Priority
 from tests.sim.mesh import SERVICE, TYPE, Mesh, rule
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ import pytest
 
 from protos.model import Role
 from sidecar.core.events import ExecuteRequest
-from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4
-from sidecar.core.priority import Priority
+from sidecar.core.frame import BASE_BYTES
+from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.values import Priority
 from tests.sim.mesh import Mesh, Node, Wire, rule
 from tests.sim.serial_server import SerialServer
 

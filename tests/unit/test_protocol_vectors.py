@@ -39,7 +39,6 @@ from protos.model import (
 )
 from protos.pair_token import pair_token
 from sidecar.core import (
-    copies,
     fec,
     fragments,
     frame,
@@ -51,13 +50,13 @@ from sidecar.core import (
     path_table,
     session,
 )
-from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.frame import Header
 from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.key_schedule import pair_keys
 from sidecar.core.path_keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
 from sidecar.core.peers import RESTART_GAP_S
-from sidecar.core.priority import Priority
+from sidecar.core.request_id import OBSERVED_ONE_IN
+from sidecar.core.values import Priority, RejectReason, RequestId
 from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
 from tests.sessions import seal
 
@@ -475,7 +474,7 @@ def test_the_numbers_on_the_page_are_those_of_the_code() -> None:
         f"up to {fragments.MAX_PEER_MESSAGES} of them",
         f"no symbol for {fragments.MAX_AGE_S:.0f} s",
         f"under a new number, up to {outbox.MAX_GENERATIONS} times",
-        f"last byte is divisible by {copies.OBSERVED_ONE_IN}",
+        f"last byte is divisible by {OBSERVED_ONE_IN}",
     ):
         assert said in " ".join(PAGE.split()), said
     assert RESTART_GAP_S == 1.0  # "one restart a second"

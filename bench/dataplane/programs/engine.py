@@ -40,7 +40,8 @@ from protos.model import (
 from protos.pair_token import pair_token
 from sidecar.config import SidecarConfig
 from sidecar.core.engine import EngineConfig
-from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, RequestId, ResponseArrived
+from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
+from sidecar.core.values import RequestId
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
 from sidecar.start_session import start_session

@@ -15,14 +15,8 @@ from controlplane.config import ControlPlaneConfig
 from controlplane.core.control_events import Settings
 from controlplane.core.departed import Departure
 from controlplane.core.fading import FadedHistogram
-from controlplane.core.fleet_view import (
-    MAX_VIEWED,
-    InterfaceView,
-    MemberView,
-    MissView,
-    PathView,
-    ServedView,
-)
+from controlplane.core.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
+from controlplane.core.network import PathView
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.registry import Refusal
 from controlplane.core.unanswered import LATELY_S

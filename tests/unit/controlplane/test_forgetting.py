@@ -6,10 +6,11 @@ import pytest
 
 from controlplane.core.compute import ComputeTimes
 from controlplane.core.control import ControlCore
-from controlplane.core.control_events import CloseReason, Settings
+from controlplane.core.control_events import Settings
 from controlplane.core.estimator import Estimator
 from controlplane.core.forgetting import FORGET_S, forget_after_s
 from controlplane.core.registry import Refusal
+from controlplane.core.stream_messages import CloseReason
 from protos.model import CandidateSet, InterfaceName, NodeName, OutcomeReport, Report, Role, ServiceName, ServiceSet
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 

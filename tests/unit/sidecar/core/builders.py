@@ -23,8 +23,8 @@ from protos.model import (
 from protos.pair_token import pair_token
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.events import RequestId
 from sidecar.core.frame import (
+    BASE_BYTES,
     HEADER_BYTES,
     INTRODUCTION_FLAG,
     NONCE_OFFSET,
@@ -47,11 +47,10 @@ from sidecar.core.link_events import (
 from sidecar.core.link_memory import LinkMemory
 from sidecar.core.messages import Encoded, RequestMessage
 from sidecar.core.outbound import OutboundMessage
-from sidecar.core.path_id import PathId
 from sidecar.core.path_keys import PathKeys, make_path_keys
-from sidecar.core.pmtu import BASE_BYTES, HEADERS_V4
-from sidecar.core.priority import Priority
+from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.rules import ServiceRule
+from sidecar.core.values import PathId, Priority, RequestId
 from tests.sessions import agree, credential_of, seal, session_of, with_credential
 
 if TYPE_CHECKING:

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.copies import OBSERVED_ONE_IN
-from sidecar.core.events import ApplicationEvent, RejectReason, RequestFailed, RequestId, ResponseArrived
+from sidecar.core.events import ApplicationEvent, RequestFailed, ResponseArrived
 from sidecar.core.link_events import LinkCommand, Send
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
 from sidecar.core.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
-from sidecar.core.path_id import PathId, PathState
-from sidecar.core.priority import Priority
+from sidecar.core.request_id import OBSERVED_ONE_IN
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.stats import EngineStats
+from sidecar.core.values import PathId, PathState, Priority, RejectReason, RequestId
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 
 if TYPE_CHECKING:
     from protos.model import NodeName
-    from sidecar.core.budgets import Budget
+    from sidecar.core.budget import Budget
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
 SERVERS = {A: WLAN_A, B: WWAN_B}

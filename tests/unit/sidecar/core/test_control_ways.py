@@ -21,7 +21,7 @@ from sidecar.core.control_ways import (
     Price,
     Way,
 )
-from sidecar.core.path_id import PathState
+from sidecar.core.values import PathState
 
 WLAN, WWAN, ETH = InterfaceName("wlan0"), InterfaceName("wwan0"), InterfaceName("eth0")
 V4: Address = ("192.0.2.1", 50051)

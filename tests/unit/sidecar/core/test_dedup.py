@@ -18,11 +18,12 @@ from sidecar.core.dedup import (
     Reply,
     Waiter,
 )
-from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest, ExecutionId, RejectReason
+from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
 from sidecar.core.rules import MAX_LIFETIME_S
 from sidecar.core.shares import FORGOTTEN_AT_ONCE
 from sidecar.core.stats import EngineStats
+from sidecar.core.values import ExecutionId, RejectReason
 from tests.unit.sidecar.core.builders import ECHO, path, request
 
 ROBOT = path(peer="robot")

@@ -20,7 +20,7 @@ from protos.model import (
     Version,
 )
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.budgets import Budget
+from sidecar.core.budget import Budget
 from sidecar.core.engine import SWEEP_EVERY_S, Engine, EngineConfig
 from sidecar.core.events import (
     AbandonExecution,
@@ -28,7 +28,6 @@ from sidecar.core.events import (
     CancelExecution,
     ExecuteRequest,
     OfferService,
-    RejectReason,
     RequestFailed,
     ResponseArrived,
 )
@@ -55,9 +54,8 @@ from sidecar.core.messages import (
     decode_message,
     encode_message,
 )
-from sidecar.core.path_id import PathId, PathState
-from sidecar.core.priority import Priority
 from sidecar.core.report_scope import ReportScope
+from sidecar.core.values import PathId, PathState, Priority, RejectReason
 from tests.sessions import credential_of, session_of
 from tests.unit.sidecar.core.builders import (
     ECHO,

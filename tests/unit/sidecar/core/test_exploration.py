@@ -9,7 +9,6 @@ from dataclasses import replace
 import pytest
 
 from protos.model import Assignment, MappingSet, ServiceMapping, Version
-from sidecar.core.events import RejectReason, RequestId
 from sidecar.core.exploration import (
     MAX_PER_S,
     MAX_REQUEST_BYTES,
@@ -18,7 +17,7 @@ from sidecar.core.exploration import (
     MIN_INTERVAL_S,
     ExplorationBudget,
 )
-from sidecar.core.path_id import PathId, PathState
+from sidecar.core.values import PathId, PathState, RejectReason, RequestId
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from typing import TYPE_CHECKING
 
 import pytest
 
 from protos.model import ServiceName
 from sidecar.core import fallback, fallback_queue
-from sidecar.core.events import RequestFailed, RequestId
+from sidecar.core.events import RequestFailed
 from sidecar.core.fallback import Accepted, Fallbacks
 from sidecar.core.fallback_rule import FallbackRule
 from sidecar.core.rules import ServiceRule
 from tests.unit.sidecar.core.builders import request_id
+
+if TYPE_CHECKING:
+    from sidecar.core.values import RequestId
 
 PLAN, LOCAL = ServiceName("/plan"), ServiceName("/plan_locally")
 DEADLINE_S, LIFETIME_S = 1.0, 10.0

@@ -4,16 +4,16 @@ from typing import TYPE_CHECKING
 
 from protos.model import NodeName, ServiceName, ServiceOffer
 from sidecar.core.backlog import Backlog
-from sidecar.core.events import ApplicationEvent, CallsForbidden, ExecuteRequest, RejectReason
+from sidecar.core.events import ApplicationEvent, CallsForbidden, ExecuteRequest
 from sidecar.core.forbidden import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
 from sidecar.core.link_events import PathCommand, Send
 from sidecar.core.messages import RejectionMessage, ResponseMessage, decode_message
 from sidecar.core.outbox import Outbox
-from sidecar.core.path_id import PathState
 from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules
 from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
+from sidecar.core.values import PathState, RejectReason
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, path, request, rule
 
 if TYPE_CHECKING:

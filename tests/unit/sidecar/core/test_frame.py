@@ -4,7 +4,7 @@ import pytest
 
 from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
-from sidecar.core import frame, pmtu
+from sidecar.core import frame
 from sidecar.core.aead import TAG_BYTES
 from sidecar.core.frame import AckFrame, Close, Finished, Fragment, Header, Probe, ProbeReply
 
@@ -41,8 +41,8 @@ def test_the_bytes_of_a_datagram_of_each_kind(kind: str) -> None:
 
 def test_room_is_left_for_the_tag() -> None:
     overhead = frame.HEADER_BYTES + len(frame.encode_fragment_head(1, 1, 256, 0)) + TAG_BYTES
-    assert overhead + frame.BASE_SYMBOL_BYTES == pmtu.BASE_BYTES == 1200
-    assert overhead + frame.MAX_SYMBOL_BYTES == frame.MAX_DATAGRAM_BYTES == pmtu.MAX_BYTES
+    assert overhead + frame.BASE_SYMBOL_BYTES == frame.BASE_BYTES == 1200
+    assert overhead + frame.MAX_SYMBOL_BYTES == frame.MAX_DATAGRAM_BYTES == 8952
 
 
 def test_padding_is_skipped_wherever_it_stands() -> None:

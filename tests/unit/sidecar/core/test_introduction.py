@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from protos.errors import DecodeError
 from protos.model import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.frame import Header, KeyOffer
+from sidecar.core.frame import BASE_BYTES, Header, KeyOffer
 from sidecar.core.introduction import (
     MAX_INTRODUCED_BYTES,
     Introduction,
@@ -18,7 +18,6 @@ from sidecar.core.introduction import (
     open_introduction,
     read_hello_id,
 )
-from sidecar.core.pmtu import BASE_BYTES
 from tests.sessions import credential_of
 
 TOKEN, NAME = bytes(range(16)), NodeName("cloud-a")

@@ -24,10 +24,10 @@ from sidecar.core.link_events import (
     SetPeers,
     SetReady,
 )
-from sidecar.core.path_id import PathId, PathState
 from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S
 from sidecar.core.probing import IDLE_PROBE_S, MAX_PROBE_S
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
+from sidecar.core.values import PathId, PathState
 from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import (
     FIRST,

@@ -15,9 +15,9 @@ from sidecar.core.link_events import (
     PathChanged,
     SetCredential,
 )
-from sidecar.core.path_id import PathId, PathState
 from sidecar.core.path_table import MAX_PATHS_OF_A_PEER, NEW_PATHS, NEW_PATHS_PER_S
 from sidecar.core.probing import FIRST_PROBE_S
+from sidecar.core.values import PathId, PathState
 from tests.unit.sidecar.core.builders import (
     PEER_ADDRESS,
     WLAN,

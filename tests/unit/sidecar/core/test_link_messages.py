@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core import frame, pmtu
+from sidecar.core import frame
 from sidecar.core.frame import AckFrame, Finished, Fragment
 from sidecar.core.link_events import (
     FinishedLost,
@@ -38,7 +38,7 @@ def test_a_message_goes_out_in_numbered_datagrams_and_is_acknowledged() -> None:
     assert [item.symbol_index for item in bench.frames(sent) if isinstance(item, Fragment)] == [0, 1, 2]
     first = numbers(sent)[0]
     assert numbers(sent) == [first, first + 1, first + 2]
-    assert all(len(datagram) <= pmtu.BASE_BYTES for datagram in sent)
+    assert all(len(datagram) <= frame.BASE_BYTES for datagram in sent)
     bench.now += 0.01
     bench.receive(frame.encode_ack([(first, first + 2)], 0.0), frame.encode_finished(Finished(1)))
     assert bytes(outbound.acked) == b"\1\1\1"

@@ -8,9 +8,8 @@ import pytest
 
 from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.messages import Encoded
-from sidecar.core.path_id import PathState
-from sidecar.core.priority import Priority
 from sidecar.core.room import LARGE_ROOM_BYTES, SMALL_BYTES
+from sidecar.core.values import PathState, Priority
 from tests.unit.sidecar.core.builders import ECHO, A, request_id
 from tests.unit.sidecar.core.request_table import WLAN_A, WWAN_B, Table
 

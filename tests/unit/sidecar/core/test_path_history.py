@@ -7,7 +7,7 @@ import pytest
 from protos.model import InterfaceId
 from sidecar.core.link_events import PathChanged
 from sidecar.core.path_history import MAX_REMEMBERED, Change, PathHistory
-from sidecar.core.path_id import PathId, PathState
+from sidecar.core.values import PathId, PathState
 from tests.unit.sidecar.core.builders import WLAN, A
 
 pytestmark = pytest.mark.audit("ops-14")

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from sidecar.core.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 from sidecar.core.pmtu import (
-    BASE_BYTES,
     COMMON_MTUS,
-    MAX_BYTES,
     MAX_PROBES,
     PROBE_TIMEOUT_S,
     PROBES_REMEMBERED,
@@ -74,8 +73,8 @@ class Carrier:
         (1500, True, (1232, 1352, 1372, 1444, 1452)),
         (1430, False, (1252, 1372, 1392, 1402)),
         (1280, True, (1232,)),
-        (9000, False, (1252, 1372, 1392, 1464, 1472, 4068, MAX_BYTES)),
-        (65_536, True, (1232, 1352, 1372, 1444, 1452, 4048, MAX_BYTES)),
+        (9000, False, (1252, 1372, 1392, 1464, 1472, 4068, MAX_DATAGRAM_BYTES)),
+        (65_536, True, (1232, 1352, 1372, 1444, 1452, 4048, MAX_DATAGRAM_BYTES)),
         (1228, False, ()),
         (0, False, ()),
     ],
@@ -88,7 +87,7 @@ def test_what_is_tried_on_an_interface(mtu: int, ipv6: bool, sizes: tuple[int, .
 def test_finds_what_the_interface_takes(mtu: int) -> None:
     carrier = Carrier(takes=mtu, interface=mtu)
     carrier.run(1.0)
-    assert carrier.mtu.size == min(mtu - 28, MAX_BYTES)
+    assert carrier.mtu.size == min(mtu - 28, MAX_DATAGRAM_BYTES)
     assert len(carrier.probes) <= len(COMMON_MTUS)
 
 

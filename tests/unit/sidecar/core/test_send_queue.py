@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
-from sidecar.core.priority import Priority
-from sidecar.core.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SHARE, SendQueue
+from sidecar.core.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SendQueue
 from sidecar.core.timers import NEVER
+from sidecar.core.values import SHARE, Priority
 from tests.unit.sidecar.core.builders import message, path
 
 if TYPE_CHECKING:

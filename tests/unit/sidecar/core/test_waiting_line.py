@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from sidecar.core.priority import Priority
-from sidecar.core.send_queue import SHARE
+from sidecar.core.values import SHARE, Priority
 from sidecar.core.waiting_line import SLACK, WaitingLine
 
 

@@ -37,17 +37,11 @@ from protos.model import (
 from protos.pair_token import pair_token
 from sidecar.core.datagrams import Batch, LinkIdentity
 from sidecar.core.engine import EngineConfig
-from sidecar.core.events import (
-    ApplicationEvent,
-    ExecuteRequest,
-    OfferService,
-    RequestId,
-    ResponseArrived,
-)
+from sidecar.core.events import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
 from sidecar.core.link import Link
 from sidecar.core.link_events import SetReady
-from sidecar.core.path_id import PathState
 from sidecar.core.rules import ServiceRule
+from sidecar.core.values import PathState, RequestId
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
 from tests.sessions import session_of

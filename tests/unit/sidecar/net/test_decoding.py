@@ -17,7 +17,7 @@ from sidecar.core.link_events import FragmentsReceived
 from sidecar.core.messages import RequestMessage, encode_message
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.partial import Partial
-from sidecar.core.priority import Priority
+from sidecar.core.values import Priority
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.decoder import Decoder
 from tests.sessions import session_of

@@ -1,0 +1,37 @@
+"""What leaves the core for one stream: messages, and its end."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from controlplane.core.registry import StreamId
+    from protos.model import ControlMessage
+
+
+class CloseReason(enum.Enum):
+    """Why the control plane ends a stream."""
+
+    REPLACED = "replaced by a newer stream of this sidecar"
+    LEASE_EXPIRED = "silent for longer than the lease"
+    STOPPING = "the control plane is stopping"
+    REVOKED = "the certificate is revoked"
+    CERTIFICATE_ENDED = "the certificate is not good any more"
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """A message for one stream; a newer one of the same type makes an unsent older one pointless."""
+
+    stream: StreamId
+    message: ControlMessage
+
+
+@dataclass(frozen=True, slots=True)
+class Close:
+    """End this stream."""
+
+    stream: StreamId
+    reason: CloseReason
