@@ -36,16 +36,16 @@ from std_srvs.srv import Empty
 
 from protos import interpreter
 from protos.model import NodeName, Role, ServiceName, SessionId
+from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
 from sidecar.core.rules import ServiceRule
-from sidecar.core.values import ExecutionId, Priority
 from sidecar.ros import rcl
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from protos.model import ServiceOffer
-    from sidecar.core.values import RejectReason, RequestId
+    from sidecar.core.base.values import RejectReason, RequestId
     from sidecar.ros.bridge import RosBridge
 
 CALLED_SERVICES = 4

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from protos.plr.v1 import control_pb2
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
+    from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.control_session import ControlSession, ControlStats
-    from sidecar.core.report_scope import ReportScope
     from sidecar.net.control_dialer import ControlDialer, ControlLine
 
     _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from protos.model import MappingSet, PeerSet, Report, Welcome
     from protos.tls_files import TlsFiles
-    from sidecar.core.report_scope import ReportScope
+    from sidecar.core.base.report_scope import ReportScope
 
 
 class ControlHooks(Protocol):

@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from protos.model import ServiceName, ServiceOffer, SessionId
+    from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
     from sidecar.core.events import ApplicationEvent
-    from sidecar.core.values import ExecutionId, RejectReason, RequestId
 
 
 class DataPlane(Protocol):

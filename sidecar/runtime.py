@@ -61,10 +61,10 @@ if TYPE_CHECKING:
     )
     from protos.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
+    from sidecar.core.base.report_scope import ReportScope
+    from sidecar.core.base.values import PathState
     from sidecar.core.pinging import Pong
-    from sidecar.core.report_scope import ReportScope
     from sidecar.core.stun_events import StunEvent
-    from sidecar.core.values import PathState
     from sidecar.stop_request import StopRequest
 
 log = logging.getLogger(__name__)

@@ -23,11 +23,11 @@ from sidecar.config_fields import (
     converted,
     is_glob,
 )
+from sidecar.core.base.values import Priority
 from sidecar.core.budget import Budget
 from sidecar.core.fallback_queue import SPARE
 from sidecar.core.fallback_rule import FallbackRule
 from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule
-from sidecar.core.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

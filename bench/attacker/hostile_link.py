@@ -15,6 +15,7 @@ from bench.attacker.orders import Stage
 from bench.attacker.spoofing import Spoofer
 from protos.model import Role, ServiceName
 from sidecar.core import frame
+from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from sidecar.core.datagrams import Batch
 from sidecar.core.key_schedule import proof_of_offer
 from sidecar.core.link import Link
@@ -27,7 +28,6 @@ from sidecar.core.messages import (
     encode_message,
 )
 from sidecar.core.session import public_key
-from sidecar.core.values import PathState, Priority, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

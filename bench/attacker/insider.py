@@ -30,8 +30,8 @@ from protos.model import ServiceName
 from protos.tls_files import load_tls_files
 from sidecar import __main__ as sidecar
 from sidecar import runtime
+from sidecar.core.base.values import RejectReason, RequestId
 from sidecar.core.engine import Engine
-from sidecar.core.values import RejectReason, RequestId
 from sidecar.net import managed_interface
 from sidecar.net.dataplane import ThreadedDataPlane
 

@@ -19,8 +19,8 @@ from protos.identity import CONTROL_PLANE_DNS
 from protos.model import MappingSet, PeerSet, Role
 from protos.plr.v1 import control_pb2_grpc
 from sidecar.control_channel import REFUSALS
+from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.control_session import Apply, ControlState
-from sidecar.core.report_scope import ReportScope
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -29,8 +29,8 @@ from protos.model import (
     Version,
     Welcome,
 )
+from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.control_session import Apply, ControlSession, ControlState
-from sidecar.core.report_scope import ReportScope
 
 if TYPE_CHECKING:
     import random

@@ -21,7 +21,7 @@ from protos.model import (
     ServiceName,
 )
 from protos.size_class import size_class
-from sidecar.core.request_id import OBSERVED_ONE_IN
+from sidecar.core.base.request_id import OBSERVED_ONE_IN
 
 if TYPE_CHECKING:
     import random

@@ -12,13 +12,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from sidecar.core.values import PathState
+from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
+    from sidecar.core.base.values import PathId
     from sidecar.core.copies import Copy, Request
     from sidecar.core.path_pace import PathPaces
     from sidecar.core.routes import Routes
-    from sidecar.core.values import PathId
 
 LOOKS = 20
 """Looks at a request until its deadline ..."""

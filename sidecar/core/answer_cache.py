@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from protos.model import NodeName
-    from sidecar.core.values import RequestId
+    from sidecar.core.base.values import RequestId
 
 
 class AnswerCache:

@@ -17,28 +17,28 @@ from functools import partial
 from itertools import chain, count, islice
 from typing import TYPE_CHECKING
 
-from sidecar.core.backlog import in_groups
+from sidecar.core.base.fair_share import Shares
+from sidecar.core.base.request_id import is_race
+from sidecar.core.base.slices import in_groups
+from sidecar.core.base.timers import first_of
+from sidecar.core.base.values import PathState, Priority, RejectReason
 from sidecar.core.dedup import Waiter
 from sidecar.core.messages import RejectionMessage, ResponseMessage, encode_message
-from sidecar.core.request_id import is_race
 from sidecar.core.room import Lane
-from sidecar.core.shares import Shares
-from sidecar.core.timers import first_of
-from sidecar.core.values import PathState, Priority, RejectReason
 from sidecar.core.waiting_line import WaitingLine
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from protos.model import NodeName
-    from sidecar.core.backlog import Backlog, Step
+    from sidecar.core.base.slices import Backlog, Step
+    from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.dedup import Reply
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.rules import Rules
     from sidecar.core.stats import EngineStats
-    from sidecar.core.values import PathId, RequestId
 
 MAX_ANSWERS = 32_768
 """Answers and rejections that wait or are under way; one robot may have half: twice what it may have in flight."""

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
+from sidecar.core.base.values import Priority
 from sidecar.core.copies import CopyState
 from sidecar.core.messages import CancelMessage, encode_message
-from sidecar.core.values import Priority
 
 if TYPE_CHECKING:
     from protos.model import NodeName
+    from sidecar.core.base.values import RequestId
     from sidecar.core.copies import Copy, Request
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
-    from sidecar.core.values import RequestId
 
 MAX_CALLED_OFF = 1024
 """Ids of requests whose copies were called off, kept to tell answers that were on their way from strays."""

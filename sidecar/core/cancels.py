@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from sidecar.core.shares import FORGOTTEN_AT_ONCE, Shares
+from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
     from protos.model import NodeName
+    from sidecar.core.base.values import RequestId
     from sidecar.core.stats import EngineStats
-    from sidecar.core.values import RequestId
 
 MAX_EARLY_CANCELS = 16_384
 """Ids kept; one robot may fill half: 130 requests a second, all overtaken, for REMEMBER_CANCEL_S. What is not kept may

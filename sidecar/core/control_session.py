@@ -36,8 +36,8 @@ from protos.model import (
     Welcome,
 )
 from sidecar.core.backoff import Backoff
+from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.peer_assembly import PeerAssembly
-from sidecar.core.report_scope import ReportScope
 
 if TYPE_CHECKING:
     import random

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.values import PathState
+from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from collections import Counter

@@ -6,13 +6,13 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.request_id import is_race
+from sidecar.core.base.request_id import is_race
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
+    from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.rules import ServiceRule
-    from sidecar.core.values import PathId, RequestId
 
 HEDGE_AT = 0.5
 """At this part of the deadline, a server that has the request alone and is silent makes another one worth asking."""

@@ -9,6 +9,8 @@ from protos.model import Role
 from protos.pair_token import pair_token
 from sidecar.core import frame
 from sidecar.core.aead import TAG_BYTES
+from sidecar.core.base.timers import NEVER
+from sidecar.core.base.values import PathState
 from sidecar.core.frame import (
     BASE_FRAMES_BYTES,
     CLEAR,
@@ -24,8 +26,6 @@ from sidecar.core.frame import (
 from sidecar.core.introduction import INTRODUCTION_BYTES, encode_introduction
 from sidecar.core.path_address import LEAST_CREDIT_BYTES
 from sidecar.core.path_table import MAX_PENDING_FRAMES
-from sidecar.core.timers import NEVER
-from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from protos.credential import SessionCredential

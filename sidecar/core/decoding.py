@@ -11,14 +11,14 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from sidecar.core.shares import Shares
+from sidecar.core.base.fair_share import Shares
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from protos.model import NodeName, SessionId
+    from sidecar.core.base.values import PathId
     from sidecar.core.partial import Partial
-    from sidecar.core.values import PathId
 
 MAX_BYTES = 128 * 1024 * 1024
 """What messages in line hold, repair symbols included. One peer may hold half: two of the largest that came as repair

@@ -19,23 +19,23 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core.answer_cache import AnswerCache
+from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
+from sidecar.core.base.timers import first_of
+from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
 from sidecar.core.cancels import EarlyCancels
 from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.rules import MAX_LIFETIME_S
-from sidecar.core.shares import FORGOTTEN_AT_ONCE, Shares
-from sidecar.core.timers import first_of
-from sidecar.core.values import ExecutionId, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
     from protos.model import NodeName, ServiceName
-    from sidecar.core.backlog import Backlog
+    from sidecar.core.base.slices import Backlog
+    from sidecar.core.base.values import PathId, Priority
     from sidecar.core.messages import RequestMessage
     from sidecar.core.stats import EngineStats
-    from sidecar.core.values import PathId, Priority
 
 MAX_RUNNING = 8192
 """Requests that local servers work on at once."""

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError, UnknownKindError
 from protos.model import MAX_PEERS, MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.attention import Attention
-from sidecar.core.backlog import SLICE, Backlog, Step, rest
+from sidecar.core.base.report_scope import ReportScope
+from sidecar.core.base.slices import SLICE, Backlog, Step, rest
+from sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
 from sidecar.core.events import ApplicationEvent, OfferService, WithdrawService
 from sidecar.core.goodbyes import Goodbyes
 from sidecar.core.inbound import Inbound
@@ -53,7 +55,6 @@ from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.peers import Peers
 from sidecar.core.penalties import Penalties
-from sidecar.core.report_scope import ReportScope
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.revocation_exchange import RevocationExchange
@@ -61,7 +62,6 @@ from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
-from sidecar.core.values import ExecutionId, PathId, PathState, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from protos.model import Assignment, InterfaceName, NodeName, ServiceName
-    from sidecar.core.values import ExecutionId, Priority, RequestId
+    from sidecar.core.base.values import ExecutionId, Priority, RequestId
 
 
 @dataclass(frozen=True, slots=True)

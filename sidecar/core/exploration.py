@@ -11,17 +11,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.values import PathState
+from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
     from protos.model import NodeName, ServiceName
+    from sidecar.core.base.values import PathId
     from sidecar.core.copies import Request
     from sidecar.core.mapping import MappingTable
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
-    from sidecar.core.values import PathId
 
 MAX_PER_S = 0.2
 """Such copies of one service: 12 a minute at most, however many requests there are."""

@@ -10,8 +10,8 @@ import enum
 from collections import OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
+from sidecar.core.base.timers import NEVER
 from sidecar.core.partial import Partial
-from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
     from collections import Counter

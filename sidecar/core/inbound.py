@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName, SessionId
+    from sidecar.core.base.values import PathId
     from sidecar.core.frame import Fragment
     from sidecar.core.link_events import PathCommand
     from sidecar.core.stats import EngineStats
-    from sidecar.core.values import PathId
 
 
 class Arrived(NamedTuple):

@@ -9,6 +9,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sidecar.core import frame
+from sidecar.core.base.timers import NEVER, Timers
+from sidecar.core.base.values import PathId, PathState
 from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
 from sidecar.core.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.link_events import (
@@ -43,8 +45,6 @@ from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.path_table import PathTable
 from sidecar.core.path_view import view_of
 from sidecar.core.stats import PathStats
-from sidecar.core.timers import NEVER, Timers
-from sidecar.core.values import PathId, PathState
 
 if TYPE_CHECKING:
     import random

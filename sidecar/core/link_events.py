@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from protos.credential import SessionCredential
     from protos.model import Address, InterfaceId, NodeName, SessionId
+    from sidecar.core.base.values import PathId, PathState
     from sidecar.core.frame import Fragment
     from sidecar.core.key_schedule import PairKeys
     from sidecar.core.outbound import OutboundMessage
-    from sidecar.core.values import PathId, PathState
 
 
 @dataclass(frozen=True, slots=True)

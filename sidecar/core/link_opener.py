@@ -10,13 +10,13 @@ from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
 from sidecar.core import frame
 from sidecar.core.aead import TAG_BYTES
+from sidecar.core.base.values import PathState
 from sidecar.core.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAGRAM_BYTES, NONCE_OFFSET
 from sidecar.core.introduction import UnauthenticError, open_introduction, read_hello_id
 from sidecar.core.key_exchange import TooManyExchangesError
 from sidecar.core.link_events import PeerRenewed, PeerRestarted
 from sidecar.core.path_keys import MAX_FAILED
 from sidecar.core.path_table import MAX_INTRODUCTIONS
-from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from protos.model import Address

@@ -9,6 +9,7 @@ from protos.errors import DecodeError
 from protos.model import Role
 from sidecar.core import frame
 from sidecar.core.aead import TAG_BYTES
+from sidecar.core.base.values import PathState
 from sidecar.core.frame import (
     FRAGMENT_HEAD,
     FRAGMENT_HEAD_BYTES,
@@ -30,7 +31,6 @@ from sidecar.core.link_events import (
     PeerClosed,
 )
 from sidecar.core.link_opener import LinkOpener
-from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Callable

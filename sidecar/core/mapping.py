@@ -10,14 +10,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from protos.model import MappingSet, ServiceMapping, Version
-from sidecar.core.values import PathState
+from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from protos.model import InterfaceName, NodeName, ServiceName
+    from sidecar.core.base.values import PathId
     from sidecar.core.routes import Route, Routes
-    from sidecar.core.values import PathId
 
 
 class MappingTable:

@@ -18,17 +18,17 @@ from protos.model import (
     Report,
 )
 from protos.size_class import size_class
+from sidecar.core.base.report_scope import ReportScope
+from sidecar.core.base.values import PathState
 from sidecar.core.interface_outcomes import JointCounts
-from sidecar.core.report_scope import ReportScope
-from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from protos.model import Assignment, InterfaceName, NodeName, ServiceName
+    from sidecar.core.base.values import PathId
     from sidecar.core.copies import Carried
     from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
     from sidecar.core.link_events import PathMeasured
     from sidecar.core.routes import Routes
-    from sidecar.core.values import PathId
 
 MAX_ANSWER_SIZES = 1024
 """Services whose usual size of an answer is kept: as many as a robot can carry."""

@@ -30,8 +30,8 @@ from protos.errors import DecodeError, UnknownKindError
 from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import ServiceName
 from protos.names import clean_text
-from sidecar.core.request_id import REQUEST_ID_BYTES
-from sidecar.core.values import Priority, RejectReason, RequestId
+from sidecar.core.base.request_id import REQUEST_ID_BYTES
+from sidecar.core.base.values import Priority, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from protos.model import NodeName
+    from sidecar.core.base.values import RequestId
     from sidecar.core.copies import Request
     from sidecar.core.dispatching import Dispatching
     from sidecar.core.routes import Routes
-    from sidecar.core.values import RequestId
 
     _Group = tuple[Lane, tuple[NodeName, ...]]
 

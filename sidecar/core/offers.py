@@ -12,8 +12,8 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceUse
+from sidecar.core.base.fair_share import Shares
 from sidecar.core.events import OfferService, WithdrawService
-from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core import fec
+from sidecar.core.base.timers import NEVER
+from sidecar.core.base.values import Priority
 from sidecar.core.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, MIN_SYMBOL_BYTES, symbol_count
-from sidecar.core.timers import NEVER
-from sidecar.core.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import NodeName
+    from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.messages import Encoded
-    from sidecar.core.values import PathId, RequestId
 
 
 class OutboundMessage:

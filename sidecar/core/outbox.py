@@ -6,7 +6,7 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from sidecar.core.backlog import in_groups
+from sidecar.core.base.slices import in_groups
 from sidecar.core.frame import symbol_count
 from sidecar.core.link_events import FragmentsLost, Resend, Send, SendAbandon
 from sidecar.core.outbound import OutboundMessage
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import InterfaceName, NodeName
-    from sidecar.core.backlog import Step
+    from sidecar.core.base.slices import Step
+    from sidecar.core.base.values import PathId, Priority, RequestId
     from sidecar.core.link_events import PathCommand
     from sidecar.core.messages import Encoded
     from sidecar.core.redundancy import Redundancy
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
-    from sidecar.core.values import PathId, Priority, RequestId
 
 LOOKED_AT_ONCE = 512
 """Messages looked at in one call of `ask_again`, which has the engine's lock: about a millisecond."""

@@ -6,8 +6,8 @@ import mmap
 from typing import TYPE_CHECKING
 
 from sidecar.core import fec
+from sidecar.core.base.timers import NEVER
 from sidecar.core.frame import symbol_count
-from sidecar.core.timers import NEVER
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

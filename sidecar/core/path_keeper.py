@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sidecar.core.base.values import PathState
 from sidecar.core.frame import KEY_ANSWER_TYPE, encode_key_answer
 from sidecar.core.link_events import (
     FinishedLost,
@@ -11,7 +12,6 @@ from sidecar.core.link_events import (
     PathChanged,
     PeerLied,
 )
-from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
     from sidecar.core import frame

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
+    from sidecar.core.base.values import PathId
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
-    from sidecar.core.values import PathId
 
 MAX_PACES = 4096
 """Pairs remembered, each for one service; then the one that was used longest ago goes."""

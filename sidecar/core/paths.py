@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sidecar.core.base.timers import NEVER
+from sidecar.core.base.values import PathId, PathState
 from sidecar.core.congestion import CongestionController
 from sidecar.core.frame import Finished, encode_ack, encode_finished
 from sidecar.core.link_events import PathMeasured
@@ -13,8 +15,6 @@ from sidecar.core.probing import Probing
 from sidecar.core.recovery import Recovery
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.send_queue import SendQueue
-from sidecar.core.timers import NEVER
-from sidecar.core.values import PathId, PathState
 
 if TYPE_CHECKING:
     import random

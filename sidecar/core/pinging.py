@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 
 from protos.token_bucket import TokenBucket
 from sidecar.core.aead import TAG_BYTES
+from sidecar.core.base.values import PathState
 from sidecar.core.frame import HEADER_BYTES
 from sidecar.core.probing import SentPing
 from sidecar.core.rtt import LONGEST_ANSWER_S
-from sidecar.core.values import PathState
 
 if TYPE_CHECKING:
+    from sidecar.core.base.values import PathId
     from sidecar.core.link_events import Ping
     from sidecar.core.paths import Path
-    from sidecar.core.values import PathId
 
 PINGS_PER_S = 20.0
 """Of one link, however many ask: some 30 kB a second of the longest that Ethernet carries, ..."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import random
 
     from protos.model import Address
-    from sidecar.core.values import PathId
+    from sidecar.core.base.values import PathId
 
 IDLE_PROBE_S = 0.5
 """A path that was in use a moment ago is probed this often, which finds a dead one within a second, ..."""

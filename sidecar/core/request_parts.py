@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from sidecar.core.backlog import Backlog
+from sidecar.core.base.slices import Backlog
 from sidecar.core.penalties import Penalties
 from sidecar.core.request_index import RequestIndex
 

@@ -20,7 +20,9 @@ from typing import TYPE_CHECKING
 from protos.histogram import Histogram
 from protos.model import Assignment
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.backlog import GROUP, rest
+from sidecar.core.base.slices import GROUP, rest
+from sidecar.core.base.timers import first_of
+from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Answer, Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
@@ -33,14 +35,12 @@ from sidecar.core.messages import (
     ResponseMessage,
 )
 from sidecar.core.no_room import NoRoom
-from sidecar.core.timers import first_of
-from sidecar.core.values import PathId, PathState, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
     from protos.model import NodeName, ServiceName
-    from sidecar.core.backlog import Step
+    from sidecar.core.base.slices import Step
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.request_parts import RequestParts
     from sidecar.core.rules import ServiceRule

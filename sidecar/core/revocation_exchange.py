@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
+from sidecar.core.base.values import Priority
 from sidecar.core.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
-from sidecar.core.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

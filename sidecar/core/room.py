@@ -10,13 +10,13 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
+from sidecar.core.base.fair_share import Shares
 from sidecar.core.frame import BASE_SYMBOL_BYTES
-from sidecar.core.shares import Shares
 
 if TYPE_CHECKING:
     from protos.model import NodeName
+    from sidecar.core.base.values import PathId
     from sidecar.core.outbound import OutboundMessage
-    from sidecar.core.values import PathId
 
 MAX_MESSAGES = 16_384
 """All undelivered messages: one peer may have half of them, as many as requests may be in flight."""

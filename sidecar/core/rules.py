@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from protos.preferences import EVERY_INTERFACE, Copies
 from protos.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
-from sidecar.core.values import Priority
+from sidecar.core.base.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

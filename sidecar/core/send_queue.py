@@ -16,9 +16,9 @@ import heapq
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
+from sidecar.core.base.values import SHARE, Priority
 from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.turn import Turn
-from sidecar.core.values import SHARE, Priority
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

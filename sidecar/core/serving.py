@@ -8,24 +8,24 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from sidecar.core.answers import Answers
-from sidecar.core.backlog import in_groups
+from sidecar.core.base.slices import in_groups
+from sidecar.core.base.values import RejectReason
 from sidecar.core.dedup import ExecutionTable, Reply, Waiter
 from sidecar.core.events import ExecuteRequest
 from sidecar.core.forbidden import ForbiddenCalls
 from sidecar.core.rules import MAX_LIFETIME_S, Rules
-from sidecar.core.values import RejectReason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
 
     from protos.model import NodeName, ServiceName, ServiceOffer
-    from sidecar.core.backlog import Backlog, Step
+    from sidecar.core.base.slices import Backlog, Step
+    from sidecar.core.base.values import ExecutionId, PathId, RequestId
     from sidecar.core.events import ApplicationEvent
     from sidecar.core.messages import CancelMessage, RequestMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
-    from sidecar.core.values import ExecutionId, PathId, RequestId
 
 
 @dataclass(frozen=True, slots=True)

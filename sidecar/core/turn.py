@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from sidecar.core.timers import NEVER
+from sidecar.core.base.timers import NEVER
 
 if TYPE_CHECKING:
     from sidecar.core.outbound import OutboundMessage

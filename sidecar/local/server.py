@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sidecar.core.values import PathId
+    from sidecar.core.base.values import PathId
 
 log = logging.getLogger(__name__)
 

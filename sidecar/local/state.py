@@ -15,7 +15,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from protos.certificate_term import term_problem
-from sidecar.core.values import PathState
+from sidecar.core.base.values import PathState
 from sidecar.local.protocol import VERSION
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from protos.tls_files import TlsWatch
     from sidecar.config import SidecarConfig
     from sidecar.control_client import ControlView
-    from sidecar.core.values import PathId
+    from sidecar.core.base.values import PathId
     from sidecar.net.dataplane import ThreadedDataPlane
     from sidecar.net.interface_manager import InterfaceView
     from sidecar.ros.stats import BridgeStats

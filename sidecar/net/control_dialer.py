@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
     from protos.model import Address, InterfaceName
+    from sidecar.core.base.values import PathState
     from sidecar.core.control_session import ControlStats
     from sidecar.core.control_ways import ControlInterface, Way
-    from sidecar.core.values import PathState
 
 log = logging.getLogger(__name__)
 

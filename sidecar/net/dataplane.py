@@ -17,10 +17,10 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
+from sidecar.core.base.values import PathState
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.link_events import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
 from sidecar.core.pinging import Pong
-from sidecar.core.values import PathState
 from sidecar.net.decoder import Decoder
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
@@ -42,15 +42,15 @@ if TYPE_CHECKING:
         ServiceUse,
         SessionId,
     )
+    from sidecar.core.base.report_scope import ReportScope
+    from sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
     from sidecar.core.decoding import Decoding
     from sidecar.core.link_events import LinkEvent
     from sidecar.core.path_history import Change
     from sidecar.core.path_view import PathView
-    from sidecar.core.report_scope import ReportScope
     from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
-    from sidecar.core.values import ExecutionId, PathId, RejectReason, RequestId
     from sidecar.net.interface_thread import InterfaceThread
     from sidecar.ports import Application
 

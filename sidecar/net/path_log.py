@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.core.values import PathState
+from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
+    from sidecar.core.base.values import PathId
     from sidecar.core.link_events import PathChanged
-    from sidecar.core.values import PathId
 
 log = logging.getLogger(__name__)
 

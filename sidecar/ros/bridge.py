@@ -12,8 +12,8 @@ import time
 from typing import TYPE_CHECKING, Protocol
 
 from protos.model import Role
+from sidecar.core.base.values import RejectReason
 from sidecar.core.events import ExecuteRequest
-from sidecar.core.values import RejectReason
 from sidecar.ros.cloud_side import CloudSide
 from sidecar.ros.event_queue import EventQueue
 from sidecar.ros.graph import sidecar_node_name

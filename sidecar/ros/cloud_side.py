@@ -7,10 +7,10 @@ import time
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceOffer
+from sidecar.core.base.fair_share import Shares
+from sidecar.core.base.values import RejectReason
 from sidecar.core.events import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
 from sidecar.core.rules import Rules
-from sidecar.core.shares import Shares
-from sidecar.core.values import RejectReason
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.node_names import NodeNames
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
 
     from protos.model import ServiceName
+    from sidecar.core.base.values import ExecutionId
     from sidecar.core.events import ApplicationEvent
     from sidecar.core.rules import ServiceRule
-    from sidecar.core.values import ExecutionId
     from sidecar.ports import DataPlane
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.ros_loop import RosLoop

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from protos.model import ServiceName
+    from sidecar.core.base.values import RequestId
     from sidecar.core.events import RequestFailed
     from sidecar.core.fallback import FallbackCall
     from sidecar.core.rules import ServiceRule
-    from sidecar.core.values import RequestId
     from sidecar.ros.graph import NameOf, Served
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.ros_loop import RosLoop

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.request_id import make_request_id
+from sidecar.core.base.request_id import make_request_id
 
 if TYPE_CHECKING:
     from protos.model import SessionId
-    from sidecar.core.values import RequestId
+    from sidecar.core.base.values import RequestId
     from sidecar.ros.rcl import RmwRequestId
 
 

@@ -29,7 +29,7 @@ from sidecar.ros.shared_queue import SharedQueue
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator
 
-    from sidecar.core.values import Priority
+    from sidecar.core.base.values import Priority
 
 STALL_TIMES = 3.0
 """A silence lasts so many times what the server's requests usually take ..."""

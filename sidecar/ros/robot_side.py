@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from protos.model import ServiceName
+    from sidecar.core.base.values import RequestId
     from sidecar.core.events import ApplicationEvent
     from sidecar.core.rules import ServiceRule
-    from sidecar.core.values import RequestId
     from sidecar.ports import DataPlane
     from sidecar.ros.fallback_caller import FallbackAnswer
     from sidecar.ros.log_limit import LimitedLog

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName, ServiceName
-    from sidecar.core.values import ExecutionId, Priority
+    from sidecar.core.base.values import ExecutionId, Priority
     from sidecar.ros.graph import NameOf
     from sidecar.ros.rcl import Message
     from sidecar.ros.types import ServiceType

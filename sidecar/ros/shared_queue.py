@@ -16,7 +16,7 @@ from sidecar.ros.request_queue import RequestQueue
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
-    from sidecar.core.values import Priority
+    from sidecar.core.base.values import Priority
 
 SHARED_ONE_IN = 4
 """Every so many turns one goes by robots."""

@@ -11,6 +11,7 @@ from protos.model import Role, ServiceName
 from sidecar.core import frame
 from sidecar.core.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
 from sidecar.core.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
+from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from sidecar.core.dedup import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
 from sidecar.core.fragments import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
 from sidecar.core.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
@@ -25,7 +26,6 @@ from sidecar.core.messages import (
 from sidecar.core.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
 from sidecar.core.refused_copies import MAX_REFUSED_COPIES
 from sidecar.core.room import MAX_MESSAGES
-from sidecar.core.values import PathState, Priority, RejectReason, RequestId
 from tests.sessions import seal
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from protos.errors import DecodeError
 from protos.model import ServiceName
 from protos.names import clean_text
+from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.messages import (
     MAX_NAME_BYTES,
     CancelMessage,
@@ -22,7 +23,6 @@ from sidecar.core.messages import (
     decode_message,
     encode_message,
 )
-from sidecar.core.values import Priority, RejectReason, RequestId
 
 ids = st.binary(min_size=16, max_size=16).map(RequestId)
 u8, u32 = st.integers(0, 255), st.integers(0, 2**32 - 1)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from protos.tls_files import TlsFiles
-    from sidecar.core.report_scope import ReportScope
+    from sidecar.core.base.report_scope import ReportScope
 
 
 class Engine:

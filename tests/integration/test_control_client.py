@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from protos.tls_files import TlsFiles
-    from sidecar.core.report_scope import ReportScope
+    from sidecar.core.base.report_scope import ReportScope
 
 WELCOME = Welcome(lease_s=0.6, report_interval_s=0.1, stun_servers=("192.0.2.9:3478",))
 CANDIDATE = Candidate(InterfaceId(0), InterfaceName("wlan0"), CandidateKind.HOST, ("192.0.2.2", 9))

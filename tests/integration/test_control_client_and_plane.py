@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     import pytest
 
     from protos.tls_files import TlsFiles
-    from sidecar.core.report_scope import ReportScope
+    from sidecar.core.base.report_scope import ReportScope
 
 ROOT = Path(__file__).parents[2]
 PLAN = ServiceName("/plan_path")

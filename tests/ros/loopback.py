@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from protos.model import Assignment, InterfaceName, NodeName, ServiceName, SessionId
+from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.events import (
     AbandonExecution,
     DeadlineMissed,
@@ -21,13 +22,12 @@ from sidecar.core.events import (
     ResponseArrived,
     WithdrawService,
 )
-from sidecar.core.values import ExecutionId, Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from protos.model import ServiceOffer
-    from sidecar.core.values import RejectReason, RequestId
+    from sidecar.core.base.values import RejectReason, RequestId
     from sidecar.ports import Application
 
 log = logging.getLogger(__name__)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import NodeName, ServiceName, SessionId
+from sidecar.core.base.values import RejectReason
 from sidecar.core.events import OfferService
 from sidecar.core.rules import ServiceRule
-from sidecar.core.values import RejectReason
 from sidecar.ros.rcl import RmwRequestId
 from sidecar.ros.request_numbering import RequestNumbering
 from tests.ros.mesh import wait_until

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import Role
-from sidecar.core.values import RejectReason
+from sidecar.core.base.values import RejectReason
 from sidecar.ros.bridge import RosBridge
 from tests.ros.mesh import wait_until
 from tests.ros.processes import Program

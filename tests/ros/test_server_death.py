@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import ServiceName
-from sidecar.core.values import RejectReason
+from sidecar.core.base.values import RejectReason
 from sidecar.ros import dds_id, graph, process_finder, server_processes
 from sidecar.ros.cloud_side import SILENCE_S
 from sidecar.ros.process_finder import has_ended, open_process, wants_processor

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import ServiceName
-from sidecar.core.values import RejectReason
+from sidecar.core.base.values import RejectReason
 from sidecar.ros import graph
 from tests.ros.mesh import no_name, wait_until
 

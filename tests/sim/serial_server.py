@@ -6,8 +6,8 @@ from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING
 
+from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
 from sidecar.core.events import AbandonExecution, ApplicationEvent, CancelExecution, ExecuteRequest
-from sidecar.core.values import ExecutionId, RejectReason, RequestId
 from sidecar.ros.request_window import RequestWindow
 
 if TYPE_CHECKING:

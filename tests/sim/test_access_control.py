@@ -15,7 +15,7 @@ from tests.sim.joined_planes import JoinedPlanes, restored
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.values import RequestId
+    from sidecar.core.base.values import RequestId
 
 SECRET = ServiceName("/secret")
 ANY = ("*",)

@@ -6,8 +6,8 @@ import pytest
 
 from protos.model import InterfaceName, NodeName
 from sidecar.core import copies
-from sidecar.core.request_id import OBSERVED_ONE_IN
-from sidecar.core.values import PathState
+from sidecar.core.base.request_id import OBSERVED_ONE_IN
+from sidecar.core.base.values import PathState
 from tests.sim.mesh import SERVICE, Mesh, Node
 from tests.sim.serial_server import SerialServer
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped, two_by_two

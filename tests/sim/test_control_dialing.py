@@ -15,10 +15,10 @@ from itertools import pairwise
 import pytest
 
 from protos.model import Address, InterfaceName
+from sidecar.core.base.values import PathState
 from sidecar.core.control_race import ControlRace
 from sidecar.core.control_watch import CHEAPER, KEEPALIVE_S, SILENT, ControlWatch, Seen
 from sidecar.core.control_ways import WELL_S, ControlInterface, ControlWays, Price, Way
-from sidecar.core.values import PathState
 
 STEP_S = 0.02
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")

@@ -13,8 +13,8 @@ from sidecar.core.fallback_rule import FallbackRule
 from tests.sim.mesh import SERVICE, Mesh, rule
 
 if TYPE_CHECKING:
+    from sidecar.core.base.values import RequestId
     from sidecar.core.events import ApplicationEvent
-    from sidecar.core.values import RequestId
     from tests.sim.mesh import Node
 
 DEADLINE_S = 0.5

@@ -9,9 +9,9 @@ import pytest
 
 from protos.model import Role
 from protos.redundancy_mode import RedundancyMode
+from sidecar.core.base.values import PathState
 from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.probing import IDLE_PROBE_S, IDLE_SPREAD, MAX_IDLE_PROBE_S, WATCH_FACTOR
-from sidecar.core.values import PathState
 from tests.sim.mesh import Mesh, Node, rule
 from tests.sim.test_mesh import assert_each_answered_once, mapped, two_by_two
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from protos.model import NodeName
+from sidecar.core.base.values import PathState
 from sidecar.core.probing import FIRST_PROBE_S
-from sidecar.core.values import PathState
 from tests.sim.mesh import Mesh, rule
 from tests.sim.test_mesh import mapped
 

@@ -11,8 +11,8 @@ from sidecar.core.turn import Turn
 from tests.sim.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
+    from sidecar.core.base.values import ExecutionId, RequestId
     from sidecar.core.congestion import CongestionController
-    from sidecar.core.values import ExecutionId, RequestId
 
 MBIT = 1e6 / 8
 HZ = 10

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import Address
-    from sidecar.core.values import ExecutionId
+    from sidecar.core.base.values import ExecutionId
 
 MBIT = 1e6 / 8
 REQUEST_BYTES = 180_000

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from protos.model import ServiceName, ServiceOffer
-from sidecar.core.values import Priority
+from sidecar.core.base.values import Priority
 from tests.sim.mesh import SERVICE, TYPE, Mesh, rule
 from tests.sim.test_mesh import assert_each_answered_once
 

@@ -6,9 +6,9 @@ from functools import partial
 
 import pytest
 
+from sidecar.core.base.values import RejectReason
 from sidecar.core.dispatching import MAX_ASKED, MAX_COPIES
 from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestFailed
-from sidecar.core.values import RejectReason
 from tests.sim.mesh import Mesh, rule
 
 

@@ -14,10 +14,10 @@ from protos.identity import IdentityRole
 from protos.model import Role
 from protos.tls_files import CRL_FILE, TlsWatch, load_tls_files
 from sidecar.announcement import Announcer
+from sidecar.core.base.values import Priority
 from sidecar.core.link_events import SetCredential
 from sidecar.core.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 from sidecar.core.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
-from sidecar.core.values import Priority
 from sidecar.revocations import Revocations
 from tests.sim.mesh import Mesh, rule
 

@@ -10,7 +10,7 @@ from protos.model import Assignment, InterfaceName, MappingSet, NodeName, Servic
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.values import ExecutionId
+    from sidecar.core.base.values import ExecutionId
 
 HZ = 5
 SIZE = 120_000

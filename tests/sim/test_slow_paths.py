@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from sidecar.core.base.values import PathState
 from sidecar.core.probing import MAX_PROBE_S
-from sidecar.core.values import PathState
 from tests.sim.mesh import Mesh, Node, Wire, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once
 

@@ -15,9 +15,9 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
 from sidecar.core.aead import KEY_BYTES, TAG_BYTES, make_cipher
+from sidecar.core.base.values import PathState
 from sidecar.core.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, decode_header
 from sidecar.core.key_exchange import KeyLimits
-from sidecar.core.values import PathState
 from tests.sessions import private_key
 from tests.sim.mesh import Mesh, Node
 from tests.sim.test_mesh import assert_each_answered_once

@@ -50,13 +50,13 @@ from sidecar.core import (
     path_table,
     session,
 )
+from sidecar.core.base.request_id import OBSERVED_ONE_IN
+from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.frame import Header
 from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.key_schedule import pair_keys
 from sidecar.core.path_keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
 from sidecar.core.peers import RESTART_GAP_S
-from sidecar.core.request_id import OBSERVED_ONE_IN
-from sidecar.core.values import Priority, RejectReason, RequestId
 from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
 from tests.sessions import seal
 

@@ -39,9 +39,9 @@ from protos.model import (
 )
 from protos.pair_token import pair_token
 from sidecar.config import SidecarConfig
+from sidecar.core.base.values import RequestId
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
-from sidecar.core.values import RequestId
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
 from sidecar.start_session import start_session

@@ -11,8 +11,8 @@ import pytest
 
 from protos.log_lines import JournalFormatter, LineFormatter, is_journal, line_formatter
 from protos.printable import escaped
+from sidecar.core.base.values import RejectReason
 from sidecar.core.messages import RejectionMessage, decode_message, encode_message
-from sidecar.core.values import RejectReason
 from tests.unit.sidecar.core.builders import request_id
 
 if TYPE_CHECKING:

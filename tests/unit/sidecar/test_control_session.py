@@ -39,6 +39,7 @@ from protos.model import (
     Version,
     Welcome,
 )
+from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.control_session import (
     MIN_INTERVAL_S,
     PATIENCE_TIMES,
@@ -51,7 +52,6 @@ from sidecar.core.control_session import (
     ControlSession,
     ControlState,
 )
-from sidecar.core.report_scope import ReportScope
 
 WELCOME = Welcome(lease_s=3.0, report_interval_s=0.5, stun_servers=("192.0.2.9:3478",))
 CANDIDATES = CandidateSet((Candidate(InterfaceId(0), InterfaceName("wlan0"), CandidateKind.HOST, ("192.0.2.2", 1)),))

@@ -22,6 +22,7 @@ from protos.model import (
 )
 from protos.pair_token import pair_token
 from sidecar.core.aead import TAG_BYTES
+from sidecar.core.base.values import PathId, Priority, RequestId
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.frame import (
     BASE_BYTES,
@@ -50,7 +51,6 @@ from sidecar.core.outbound import OutboundMessage
 from sidecar.core.path_keys import PathKeys, make_path_keys
 from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.rules import ServiceRule
-from sidecar.core.values import PathId, Priority, RequestId
 from tests.sessions import agree, credential_of, seal, session_of, with_credential
 
 if TYPE_CHECKING:

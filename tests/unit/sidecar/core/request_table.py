@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sidecar.core.base.request_id import OBSERVED_ONE_IN
+from sidecar.core.base.values import PathId, PathState, Priority, RejectReason, RequestId
 from sidecar.core.events import ApplicationEvent, RequestFailed, ResponseArrived
 from sidecar.core.link_events import LinkCommand, Send
 from sidecar.core.mapping import MappingTable
@@ -11,13 +13,11 @@ from sidecar.core.measurements import Measurements
 from sidecar.core.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
-from sidecar.core.request_id import OBSERVED_ONE_IN
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.stats import EngineStats
-from sidecar.core.values import PathId, PathState, Priority, RejectReason, RequestId
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from sidecar.core.backlog import SLICE, Backlog
+from sidecar.core.base.slices import SLICE, Backlog
 from sidecar.core.events import RequestFailed
 from tests.sim.mesh import Mesh, rule
 

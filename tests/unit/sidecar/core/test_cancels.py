@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from protos.model import NodeName
+from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
 from sidecar.core.cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
-from sidecar.core.shares import FORGOTTEN_AT_ONCE
 from sidecar.core.stats import EngineStats
 from tests.unit.sidecar.core.builders import request_id
 

@@ -5,6 +5,7 @@ from collections import Counter
 import pytest
 
 from protos.model import InterfaceName
+from sidecar.core.base.values import PathState
 from sidecar.core.control_watch import (
     CHEAPER,
     CONFIRMED_S,
@@ -20,7 +21,6 @@ from sidecar.core.control_watch import (
     Seen,
 )
 from sidecar.core.control_ways import WELL_S, ControlInterface, ControlWays, Price, Way
-from sidecar.core.values import PathState
 
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")
 OVER_WLAN, OVER_WWAN = Way(WLAN, ("192.0.2.1", 1)), Way(WWAN, ("192.0.2.1", 1))

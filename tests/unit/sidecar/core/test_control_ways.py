@@ -5,6 +5,7 @@ from collections import Counter
 import pytest
 
 from protos.model import Address, InterfaceName
+from sidecar.core.base.values import PathState
 from sidecar.core.control_ways import (
     ADDRESSES_FULL,
     FAILED_FIRST_S,
@@ -21,7 +22,6 @@ from sidecar.core.control_ways import (
     Price,
     Way,
 )
-from sidecar.core.values import PathState
 
 WLAN, WWAN, ETH = InterfaceName("wlan0"), InterfaceName("wwan0"), InterfaceName("eth0")
 V4: Address = ("192.0.2.1", 50051)

@@ -6,7 +6,9 @@ import pytest
 
 from protos.model import NodeName, ServiceName
 from sidecar.core import dedup
-from sidecar.core.backlog import Backlog
+from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
+from sidecar.core.base.slices import Backlog
+from sidecar.core.base.values import ExecutionId, RejectReason
 from sidecar.core.dedup import (
     MAX_CACHED_BYTES,
     MAX_RUNNING,
@@ -21,9 +23,7 @@ from sidecar.core.dedup import (
 from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
 from sidecar.core.rules import MAX_LIFETIME_S
-from sidecar.core.shares import FORGOTTEN_AT_ONCE
 from sidecar.core.stats import EngineStats
-from sidecar.core.values import ExecutionId, RejectReason
 from tests.unit.sidecar.core.builders import ECHO, path, request
 
 ROBOT = path(peer="robot")

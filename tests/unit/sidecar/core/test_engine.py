@@ -20,6 +20,8 @@ from protos.model import (
     Version,
 )
 from protos.redundancy_mode import RedundancyMode
+from sidecar.core.base.report_scope import ReportScope
+from sidecar.core.base.values import PathId, PathState, Priority, RejectReason
 from sidecar.core.budget import Budget
 from sidecar.core.engine import SWEEP_EVERY_S, Engine, EngineConfig
 from sidecar.core.events import (
@@ -54,8 +56,6 @@ from sidecar.core.messages import (
     decode_message,
     encode_message,
 )
-from sidecar.core.report_scope import ReportScope
-from sidecar.core.values import PathId, PathState, Priority, RejectReason
 from tests.sessions import credential_of, session_of
 from tests.unit.sidecar.core.builders import (
     ECHO,

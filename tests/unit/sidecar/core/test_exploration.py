@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from protos.model import Assignment, MappingSet, ServiceMapping, Version
+from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
 from sidecar.core.exploration import (
     MAX_PER_S,
     MAX_REQUEST_BYTES,
@@ -17,7 +18,6 @@ from sidecar.core.exploration import (
     MIN_INTERVAL_S,
     ExplorationBudget,
 )
-from sidecar.core.values import PathId, PathState, RejectReason, RequestId
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 

@@ -17,7 +17,7 @@ from sidecar.core.rules import ServiceRule
 from tests.unit.sidecar.core.builders import request_id
 
 if TYPE_CHECKING:
-    from sidecar.core.values import RequestId
+    from sidecar.core.base.values import RequestId
 
 PLAN, LOCAL = ServiceName("/plan"), ServiceName("/plan_locally")
 DEADLINE_S, LIFETIME_S = 1.0, 10.0

@@ -3,7 +3,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from protos.model import NodeName, ServiceName, ServiceOffer
-from sidecar.core.backlog import Backlog
+from sidecar.core.base.slices import Backlog
+from sidecar.core.base.values import PathState, RejectReason
 from sidecar.core.events import ApplicationEvent, CallsForbidden, ExecuteRequest
 from sidecar.core.forbidden import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
 from sidecar.core.link_events import PathCommand, Send
@@ -13,7 +14,6 @@ from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules
 from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
-from sidecar.core.values import PathState, RejectReason
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, path, request, rule
 
 if TYPE_CHECKING:

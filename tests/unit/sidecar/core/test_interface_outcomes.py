@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.redundancy_mode import RedundancyMode
+from sidecar.core.base.request_id import OBSERVED_ONE_IN
+from sidecar.core.base.values import PathState
 from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.interface_outcomes import interface_outcomes
-from sidecar.core.request_id import OBSERVED_ONE_IN
 from sidecar.core.routes import Routes
 from sidecar.core.rules import ServiceRule
-from sidecar.core.values import PathState
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName
+    from sidecar.core.base.values import PathId
     from sidecar.core.outbound import OutboundMessage
-    from sidecar.core.values import PathId
 
 WLAN_A, WLAN_B, WWAN_A, WWAN_B, ETH_A = (path(*of) for of in ((WLAN, A), (WLAN, B), (WWAN, A), (WWAN, B), ("eth0", A)))
 NO_MESSAGE: OutboundMessage = None  # type: ignore[assignment]  # what is counted does not look at it

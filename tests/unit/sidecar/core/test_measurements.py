@@ -17,13 +17,13 @@ from protos.model import (
     ServiceName,
 )
 from sidecar.core import measurements as measurements_module
+from sidecar.core.base.report_scope import ReportScope
+from sidecar.core.base.values import PathState
 from sidecar.core.copies import Carried
 from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.measurements import Measurements
-from sidecar.core.report_scope import ReportScope
 from sidecar.core.routes import Routes
-from sidecar.core.values import PathState
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 
 ON_WLAN, ON_WWAN = Carried(WLAN, A, ECHO, 0), Carried(WWAN, A, ECHO, 3)

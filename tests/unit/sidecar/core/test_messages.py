@@ -5,6 +5,7 @@ import pytest
 from protos.convert.fields import MAX_CRL_BYTES
 from protos.errors import DecodeError, UnknownKindError
 from protos.model import ServiceName
+from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.messages import (
     MAX_PAYLOAD_BYTES,
     MAX_TEXT_BYTES,
@@ -19,7 +20,6 @@ from sidecar.core.messages import (
     decode_message,
     encode_message,
 )
-from sidecar.core.values import Priority, RejectReason, RequestId
 
 ID = RequestId(bytes(range(16)))
 GOLDENS: dict[str, tuple[Message, str]] = {

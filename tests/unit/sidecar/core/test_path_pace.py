@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core import path_pace
+from sidecar.core.base.values import PathState
 from sidecar.core.path_pace import FADE_S, PathPaces
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
-from sidecar.core.values import PathState
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)

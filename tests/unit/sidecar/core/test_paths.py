@@ -6,6 +6,7 @@ import pytest
 
 from protos.model import Address, InterfaceId, Role, SessionId
 from protos.token_bucket import TokenBucket
+from sidecar.core.base.values import PathState
 from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path_keys import make_path_keys
 from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
@@ -15,7 +16,6 @@ from sidecar.core.probing import (
     MAX_PROBE_S,
 )
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
-from sidecar.core.values import PathState
 from tests.sessions import agree, session_of, with_credential
 from tests.unit.sidecar.core.builders import path, peer
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from protos.model import NodeName
+from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
+from sidecar.core.base.values import RejectReason, RequestId
 from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
-from sidecar.core.shares import FORGOTTEN_AT_ONCE
 from sidecar.core.stats import EngineStats
-from sidecar.core.values import RejectReason, RequestId
 
 ROBOT = NodeName("robot")
 

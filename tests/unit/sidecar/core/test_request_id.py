@@ -3,7 +3,7 @@ from __future__ import annotations
 import itertools
 
 from protos.model import SessionId
-from sidecar.core.request_id import REQUEST_ID_BYTES, make_request_id
+from sidecar.core.base.request_id import REQUEST_ID_BYTES, make_request_id
 
 
 def test_every_part_of_the_identity_counts() -> None:

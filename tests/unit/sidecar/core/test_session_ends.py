@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from protos.model import PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
+from sidecar.core.base.values import ExecutionId, PathState
 from sidecar.core.events import CancelExecution, ResponseArrived, WithdrawService
 from sidecar.core.link_events import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
 from sidecar.core.messages import ResponseMessage
 from sidecar.core.offers import WITHDRAW_AFTER_S
-from sidecar.core.values import ExecutionId, PathState
 from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import ECHO, A, peer, request, request_id
 from tests.unit.sidecar.core.test_engine import ROBOT, Sidecar, cloud, robot

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import NodeName
-from sidecar.core.shares import Shares
+from sidecar.core.base.fair_share import Shares
 from tests.unit.sidecar.core.builders import A, B
 
 

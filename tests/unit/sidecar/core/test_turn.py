@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.timers import NEVER
+from sidecar.core.base.timers import NEVER
 from sidecar.core.turn import PATIENCE, SMALL, Turn
 from tests.unit.sidecar.core.builders import message, path
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sidecar.core.values import SHARE, Priority
+from sidecar.core.base.values import SHARE, Priority
 from sidecar.core.waiting_line import SLACK, WaitingLine
 
 

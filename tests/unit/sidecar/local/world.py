@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from protos.model import InterfaceId, InterfaceName, NodeName
+from sidecar.core.base.values import PathId
 from sidecar.core.pinging import Pong
-from sidecar.core.values import PathId
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -15,10 +15,10 @@ import pytest
 
 from protos.model import InterfaceName
 from sidecar.core import control_ways
+from sidecar.core.base.values import PathState
 from sidecar.core.control_session import ControlStats
 from sidecar.core.control_watch import CHEAPER, GONE, SILENT, Leave, Seen
 from sidecar.core.control_ways import STRANGER, ControlInterface, Price, Way
-from sidecar.core.values import PathState
 from sidecar.net import control_attempts, control_dialer, control_sockets
 from sidecar.net.control_dialer import ControlDialer
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import InterfaceName, PeerSet, Role, ServiceOffer, SessionId, Version
+from sidecar.core.base.values import Priority
 from sidecar.core.decoding import Decoding
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest
@@ -17,7 +18,6 @@ from sidecar.core.link_events import FragmentsReceived
 from sidecar.core.messages import RequestMessage, encode_message
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.partial import Partial
-from sidecar.core.values import Priority
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.decoder import Decoder
 from tests.sessions import session_of

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import TYPE_CHECKING
 
-from sidecar.core.values import Priority
+from sidecar.core.base.values import Priority
 from sidecar.ros.request_window import RequestWindow
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import NodeName, ServiceName
+from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest, WithdrawService
-from sidecar.core.values import ExecutionId, Priority
 from sidecar.ros.event_queue import EventQueue
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from sidecar.core.values import Priority
+from sidecar.core.base.values import Priority
 from sidecar.ros.request_queue import REMOVED_SLACK, RequestQueue
 
 

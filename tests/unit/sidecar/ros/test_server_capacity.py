@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.values import Priority
+from sidecar.core.base.values import Priority
 from sidecar.ros.request_overlap import LOST_AFTER, REMEMBERED
 from sidecar.ros.request_window import RequestWindow
 from sidecar.ros.server_capacity import MOST_AT_ONCE, SAFE_SIZE, ServerCapacity

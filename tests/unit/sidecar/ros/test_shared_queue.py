@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.values import Priority
+from sidecar.core.base.values import Priority
 from sidecar.ros.request_window import RequestWindow
 from sidecar.ros.shared_queue import SHARED_ONE_IN, SharedQueue
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from typing import TYPE_CHECKING
 
-from sidecar.core.values import RequestId
+from sidecar.core.base.values import RequestId
 
 if TYPE_CHECKING:
     from protos.model import SessionId
