@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from sidecar.core import aead
+from sidecar.core.crypto import aead
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cryptography.utils import Buffer
 
     from protos.credential import Aead
-    from sidecar.core.aead import Cipher
+    from sidecar.core.crypto.aead import Cipher
 
 
 class NullCipher:

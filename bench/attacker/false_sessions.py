@@ -13,13 +13,13 @@ from protos.credential import decode_credential, session_number
 from protos.model import InterfaceId, Role
 from protos.pair_token import pair_token
 from sidecar.core import frame
-from sidecar.core.aead import TAG_BYTES
+from sidecar.core.crypto.aead import TAG_BYTES
+from sidecar.core.crypto.key_schedule import pair_keys
+from sidecar.core.crypto.session import public_key
 from sidecar.core.frame import HEADER_BYTES, NONCE_OFFSET, Header
 from sidecar.core.introduction import encode_introduction
 from sidecar.core.key_exchange import DEFAULT_LIMITS
-from sidecar.core.key_schedule import pair_keys
 from sidecar.core.path_keys import make_path_keys
-from sidecar.core.session import public_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec
 
     from protos.credential import SessionCredential
+    from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.datagrams import LinkIdentity
-    from sidecar.core.key_schedule import PairKeys
     from sidecar.core.link_events import LinkPeer
     from sidecar.core.path_keys import SealingKeys
     from sidecar.core.paths import Path

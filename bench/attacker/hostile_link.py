@@ -16,8 +16,9 @@ from bench.attacker.spoofing import Spoofer
 from protos.model import Role, ServiceName
 from sidecar.core import frame
 from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
+from sidecar.core.crypto.key_schedule import proof_of_offer
+from sidecar.core.crypto.session import public_key
 from sidecar.core.datagrams import Batch
-from sidecar.core.key_schedule import proof_of_offer
 from sidecar.core.link import Link
 from sidecar.core.messages import (
     CancelMessage,
@@ -27,7 +28,6 @@ from sidecar.core.messages import (
     ResponseMessage,
     encode_message,
 )
-from sidecar.core.session import public_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

@@ -17,7 +17,7 @@ from protos.model import MAX_CANDIDATES_OF_INTERFACE
 
 if TYPE_CHECKING:
     from protos.model import Candidate, InterfaceId, NodeName, Peer
-    from sidecar.core.session import OwnSession
+    from sidecar.core.crypto.session import OwnSession
 
 MAX_REMEMBERED = 8192
 """Peers whose newest announcement is remembered; twice those of a view, so that it is the absent ones that go."""

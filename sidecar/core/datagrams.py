@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from protos.model import Role
 from protos.pair_token import pair_token
 from sidecar.core import frame
-from sidecar.core.aead import TAG_BYTES
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathState
+from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.frame import (
     BASE_FRAMES_BYTES,
     CLEAR,

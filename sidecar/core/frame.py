@@ -52,7 +52,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
 from protos.model import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, InterfaceId, SessionId
-from sidecar.core.aead import NONCE_BYTES, TAG_BYTES
+from sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -32,7 +32,8 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from protos.credential import decode_credential
 from protos.errors import DecodeError
-from sidecar.core.aead import TAG_BYTES
+from sidecar.core.crypto.aead import TAG_BYTES
+from sidecar.core.crypto.key_schedule import expand
 from sidecar.core.frame import (
     BASE_BYTES,
     HEADER_BYTES,
@@ -43,7 +44,6 @@ from sidecar.core.frame import (
     KeyOffer,
     encode_header,
 )
-from sidecar.core.key_schedule import expand
 
 if TYPE_CHECKING:
     from protos.credential import SessionCredential

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
 from protos.errors import DecodeError
+from sidecar.core.crypto.key_schedule import next_root, proof, proof_of_offer
 from sidecar.core.frame import KeyAnswer, KeyOffer
-from sidecar.core.key_schedule import next_root, proof, proof_of_offer
 
 if TYPE_CHECKING:
     import random
 
     from protos.token_bucket import TokenBucket
-    from sidecar.core.key_schedule import PairKeys
+    from sidecar.core.crypto.key_schedule import PairKeys
 
 RENEW_AFTER_S = 120.0
 """Age of a phase at which the next one is offered: as WireGuard does."""

@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from protos.credential import SessionCredential
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.base.values import PathId, PathState
+    from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.frame import Fragment
-    from sidecar.core.key_schedule import PairKeys
     from sidecar.core.outbound import OutboundMessage
 
 

@@ -9,8 +9,8 @@ from cryptography.exceptions import InvalidTag
 from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
 from sidecar.core import frame
-from sidecar.core.aead import TAG_BYTES
 from sidecar.core.base.values import PathState
+from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAGRAM_BYTES, NONCE_OFFSET
 from sidecar.core.introduction import UnauthenticError, open_introduction, read_hello_id
 from sidecar.core.key_exchange import TooManyExchangesError

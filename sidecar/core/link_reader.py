@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, TypeVar
 from protos.errors import DecodeError
 from protos.model import Role
 from sidecar.core import frame
-from sidecar.core.aead import TAG_BYTES
 from sidecar.core.base.values import PathState
+from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.frame import (
     FRAGMENT_HEAD,
     FRAGMENT_HEAD_BYTES,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from cryptography.exceptions import InvalidTag
 
-from sidecar.core import aead as ciphers
+from sidecar.core.crypto import aead as ciphers
 from sidecar.core.frame import PHASE_FLAG, clear_head
 from sidecar.core.key_exchange import KeyExchange
 from sidecar.core.received import ReceivedPackets
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from protos.credential import Aead
     from protos.model import InterfaceId
     from protos.token_bucket import TokenBucket
-    from sidecar.core.aead import Cipher
+    from sidecar.core.crypto.aead import Cipher
+    from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.frame import KeyAnswer, KeyOffer
     from sidecar.core.key_exchange import KeyLimits
-    from sidecar.core.key_schedule import PairKeys
 
 _PHASE = PHASE_FLAG << 16
 """The phase bit in the first four clear bytes as one number."""

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from protos.model import Address, InterfaceId, NodeName, Peer, ServiceName, SessionId
-    from sidecar.core.key_schedule import PairKeys
+    from sidecar.core.crypto.key_schedule import PairKeys
+    from sidecar.core.crypto.session import OwnSession
     from sidecar.core.link_events import PeerRenewed, PeerRestarted
-    from sidecar.core.session import OwnSession
 
 RESTART_GAP_S = 1.0
 """A peer that restarts more often is not believed: every restart costs all links work. What it costs to look at the

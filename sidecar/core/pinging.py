@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.token_bucket import TokenBucket
-from sidecar.core.aead import TAG_BYTES
 from sidecar.core.base.values import PathState
+from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.frame import HEADER_BYTES
 from sidecar.core.probing import SentPing
 from sidecar.core.rtt import LONGEST_ANSWER_S

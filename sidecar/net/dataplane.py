@@ -44,11 +44,11 @@ if TYPE_CHECKING:
     )
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
+    from sidecar.core.crypto.session import OwnSession
     from sidecar.core.decoding import Decoding
     from sidecar.core.link_events import LinkEvent
     from sidecar.core.path_history import Change
     from sidecar.core.path_view import PathView
-    from sidecar.core.session import OwnSession
     from sidecar.core.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.interface_thread import InterfaceThread

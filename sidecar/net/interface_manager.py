@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
     from protos.model import Address
     from sidecar.config import SidecarConfig
+    from sidecar.core.crypto.session import OwnSession
     from sidecar.core.link_memory import LinkMemory
-    from sidecar.core.session import OwnSession
     from sidecar.core.stun_client import StunView
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane

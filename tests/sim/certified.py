@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from protos.credential import SessionCredential
     from protos.tls_files import TlsFiles
-    from sidecar.core.session import OwnSession
+    from sidecar.core.crypto.session import OwnSession
     from tests.sim.mesh import Node
 
 

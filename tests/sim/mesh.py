@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from protos.model import Address
     from sidecar.core.budget import Budget
-    from sidecar.core.session import OwnSession
+    from sidecar.core.crypto.session import OwnSession
 
 SERVICE = ServiceName("/echo")
 IPV6 = ":6"

@@ -14,8 +14,8 @@ import pytest
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-from sidecar.core.aead import KEY_BYTES, TAG_BYTES, make_cipher
 from sidecar.core.base.values import PathState
+from sidecar.core.crypto.aead import KEY_BYTES, TAG_BYTES, make_cipher
 from sidecar.core.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, decode_header
 from sidecar.core.key_exchange import KeyLimits
 from tests.sessions import private_key
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from protos.credential import Aead
     from protos.model import Address, Peer
-    from sidecar.core.key_schedule import PairKeys
+    from sidecar.core.crypto.key_schedule import PairKeys
 
 pytestmark = pytest.mark.audit("sec-9")
 

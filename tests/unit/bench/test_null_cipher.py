@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bench.null_cipher import NullCipher, null_cipher
 from protos.credential import Aead
-from sidecar.core import aead
+from sidecar.core.crypto import aead
 
 ROOT = Path(__file__).parents[3]
 

@@ -24,7 +24,7 @@ from sidecar.start_session import preferred_aead, signed, start_session
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sidecar.core.session import OwnSession
+    from sidecar.core.crypto.session import OwnSession
 
 TOKEN = bytes(16)
 

@@ -21,8 +21,8 @@ from protos.model import (
     SessionId,
 )
 from protos.pair_token import pair_token
-from sidecar.core.aead import TAG_BYTES
 from sidecar.core.base.values import PathId, Priority, RequestId
+from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.frame import (
     BASE_BYTES,

@@ -4,7 +4,7 @@ import pytest
 from cryptography.exceptions import InvalidTag
 
 from protos.credential import Aead
-from sidecar.core.aead import KEY_BYTES, NONCE_BYTES, TAG_BYTES, choose, make_cipher
+from sidecar.core.crypto.aead import KEY_BYTES, NONCE_BYTES, TAG_BYTES, choose, make_cipher
 
 KEY, NONCE, CLEAR = bytes(range(KEY_BYTES)), bytes(range(NONCE_BYTES)), b"clear"
 GOLDENS = {

@@ -5,7 +5,7 @@ import pytest
 from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
 from sidecar.core import frame
-from sidecar.core.aead import TAG_BYTES
+from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.frame import AckFrame, Close, Finished, Fragment, Header, Probe, ProbeReply
 
 HEADER = Header(InterfaceId(1), InterfaceId(2), SessionId(0x0102030405060708), 0x1112131415161718)

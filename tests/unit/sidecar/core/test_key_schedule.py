@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from protos.credential import Aead, SessionCredential
 from protos.model import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.key_schedule import PairKeys, next_root, pair_keys, proof
+from sidecar.core.crypto.key_schedule import PairKeys, next_root, pair_keys, proof
 from tests.sessions import session_of, with_credential
 from tests.unit.sidecar.core.builders import peer
 

@@ -29,9 +29,9 @@ from protos.model import (
     SessionId,
     Version,
 )
+from sidecar.core.crypto.session import OwnSession
 from sidecar.core.link_events import PeerRestarted
 from sidecar.core.peers import RESTART_GAP_S, Peers
-from sidecar.core.session import OwnSession
 from tests.sessions import credential_of, private_key, session_of, with_credential
 from tests.unit.sidecar.core.builders import ECHO, A, B, peer
 

@@ -7,8 +7,8 @@ import pytest
 from protos.credential import SessionCredential, decode_credential
 from protos.errors import DecodeError
 from protos.model import NodeName, Peer, Role, SessionId
-from sidecar.core import session as session_module
-from sidecar.core.session import OwnSession
+from sidecar.core.crypto import session as session_module
+from sidecar.core.crypto.session import OwnSession
 from tests.sessions import credential_of, private_key, session_of
 from tests.unit.sidecar.core.builders import A, B, peer
 

@@ -12,13 +12,13 @@ from protos.credential import SessionCredential, decode_credential
 from protos.errors import DecodeError
 from protos.identity import CertificateError
 from protos.model import Candidate, SessionId
-from sidecar.core.key_schedule import pair_keys
+from sidecar.core.crypto.key_schedule import pair_keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import Peer
-    from sidecar.core.key_schedule import PairKeys
+    from sidecar.core.crypto.key_schedule import PairKeys
 
 MAX_ADMITTED = 8192
 """Credentials, and signed lists of addresses, whose verification is remembered; beyond it all are verified anew."""
