@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from protos.credential import Aead, SessionCredential, session_number, verify
 from protos.errors import ConfigError
 from sidecar.core.crypto.session import OwnSession, public_key
-from sidecar.core.introduction import MAX_INTRODUCED_BYTES
+from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable

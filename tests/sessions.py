@@ -12,7 +12,7 @@ from protos.credential import Aead, SessionCredential
 from protos.model import NodeName, Peer, Role, SessionId
 from sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
 from sidecar.core.crypto.session import OwnSession, public_key
-from sidecar.core.frame import HEADER_BYTES, PHASE_FLAG, Header, encode_header
+from sidecar.core.wire.frame import HEADER_BYTES, PHASE_FLAG, Header, encode_header
 
 if TYPE_CHECKING:
     import random

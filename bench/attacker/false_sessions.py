@@ -12,14 +12,14 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 from protos.credential import decode_credential, session_number
 from protos.model import InterfaceId, Role
 from protos.pair_token import pair_token
-from sidecar.core import frame
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import pair_keys
 from sidecar.core.crypto.session import public_key
-from sidecar.core.frame import HEADER_BYTES, NONCE_OFFSET, Header
-from sidecar.core.introduction import encode_introduction
 from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path_keys import make_path_keys
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import HEADER_BYTES, NONCE_OFFSET, Header
+from sidecar.core.wire.introduction import encode_introduction
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

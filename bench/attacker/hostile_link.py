@@ -14,13 +14,13 @@ from bench.attacker.false_sessions import FalseSessions
 from bench.attacker.orders import Stage
 from bench.attacker.spoofing import Spoofer
 from protos.model import Role, ServiceName
-from sidecar.core import frame
 from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from sidecar.core.crypto.key_schedule import proof_of_offer
 from sidecar.core.crypto.session import public_key
 from sidecar.core.datagrams import Batch
 from sidecar.core.link import Link
-from sidecar.core.messages import (
+from sidecar.core.wire import frame
+from sidecar.core.wire.messages import (
     CancelMessage,
     Message,
     RejectionMessage,

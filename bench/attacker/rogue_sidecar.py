@@ -13,7 +13,7 @@ from typing import Any
 from protos.model import ServiceName
 from sidecar import __main__ as sidecar
 from sidecar.core import dispatching
-from sidecar.core.messages import RequestMessage
+from sidecar.core.wire.messages import RequestMessage
 
 WANTED = ServiceName("/echo")
 

@@ -23,9 +23,9 @@ from sidecar.core.base.slices import in_groups
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import PathState, Priority, RejectReason
 from sidecar.core.dedup import Waiter
-from sidecar.core.messages import RejectionMessage, ResponseMessage, encode_message
 from sidecar.core.room import Lane
 from sidecar.core.waiting_line import WaitingLine
+from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode_message
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import Priority
 from sidecar.core.copies import CopyState
-from sidecar.core.messages import CancelMessage, encode_message
+from sidecar.core.wire.messages import CancelMessage, encode_message
 
 if TYPE_CHECKING:
     from protos.model import NodeName

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from protos.model import Role
 from protos.pair_token import pair_token
-from sidecar.core import frame
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.frame import (
+from sidecar.core.path_address import LEAST_CREDIT_BYTES
+from sidecar.core.path_table import MAX_PENDING_FRAMES
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import (
     BASE_FRAMES_BYTES,
     CLEAR,
     FRAGMENT_DATAGRAM_BYTES,
@@ -23,9 +25,7 @@ from sidecar.core.frame import (
     REPAIR_TYPE,
     Header,
 )
-from sidecar.core.introduction import INTRODUCTION_BYTES, encode_introduction
-from sidecar.core.path_address import LEAST_CREDIT_BYTES
-from sidecar.core.path_table import MAX_PENDING_FRAMES
+from sidecar.core.wire.introduction import INTRODUCTION_BYTES, encode_introduction
 
 if TYPE_CHECKING:
     from protos.credential import SessionCredential

@@ -24,9 +24,9 @@ from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
 from sidecar.core.cancels import EarlyCancels
 from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest
-from sidecar.core.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.rules import MAX_LIFETIME_S
+from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
     from sidecar.core.base.slices import Backlog
     from sidecar.core.base.values import PathId, Priority
-    from sidecar.core.messages import RequestMessage
     from sidecar.core.stats import EngineStats
+    from sidecar.core.wire.messages import RequestMessage
 
 MAX_RUNNING = 8192
 """Requests that local servers work on at once."""

@@ -15,17 +15,17 @@ from sidecar.core.base.values import PathState
 from sidecar.core.budgets import Budgets
 from sidecar.core.copies import HEDGE_AT, Copy, CopyState, Request
 from sidecar.core.exploration import Exploration
-from sidecar.core.messages import RequestMessage, encode_message
 from sidecar.core.path_pace import PathPaces
 from sidecar.core.path_records import PathRecords
+from sidecar.core.wire.messages import RequestMessage, encode_message
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
     from protos.model import NodeName
     from sidecar.core.base.values import PathId
-    from sidecar.core.messages import Encoded
     from sidecar.core.request_parts import RequestParts
+    from sidecar.core.wire.messages import Encoded
 
 MAX_COPIES = 8
 """Copies of one request, those sent in trouble included."""

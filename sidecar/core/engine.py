@@ -42,15 +42,6 @@ from sidecar.core.link_events import (
 )
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
-from sidecar.core.messages import (
-    CancelMessage,
-    RequestMessage,
-    ResponseMessage,
-    RevocationLists,
-    RevocationsHeld,
-    RevocationsWanted,
-    decode_message,
-)
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.peers import Peers
@@ -62,6 +53,15 @@ from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
+from sidecar.core.wire.messages import (
+    CancelMessage,
+    RequestMessage,
+    ResponseMessage,
+    RevocationLists,
+    RevocationsHeld,
+    RevocationsWanted,
+    decode_message,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping

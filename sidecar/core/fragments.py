@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections import Counter
 
     from protos.model import NodeName
-    from sidecar.core.frame import Fragment
+    from sidecar.core.wire.frame import Fragment
 
 MAX_PEER_BYTES = 64 * 1024 * 1024
 """Announced bytes of one peer's unfinished messages: almost four of the largest. A sender keeps below it (`outbox.py`)

@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core.decoding import Decoding, DecodingLine
 from sidecar.core.fragments import OVER_REMEMBERED, Fate, Reassembler
-from sidecar.core.frame import BASE_SYMBOL_BYTES
 from sidecar.core.link_events import SendFinished, SendForgotten
 from sidecar.core.partial import Partial
+from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName, SessionId
     from sidecar.core.base.values import PathId
-    from sidecar.core.frame import Fragment
     from sidecar.core.link_events import PathCommand
     from sidecar.core.stats import EngineStats
+    from sidecar.core.wire.frame import Fragment
 
 
 class Arrived(NamedTuple):

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 
 from protos.errors import DecodeError
 from sidecar.core.crypto.key_schedule import next_root, proof, proof_of_offer
-from sidecar.core.frame import KeyAnswer, KeyOffer
+from sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 if TYPE_CHECKING:
     import random

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from sidecar.core import frame
 from sidecar.core.base.timers import NEVER, Timers
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
@@ -45,6 +44,7 @@ from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.path_table import PathTable
 from sidecar.core.path_view import view_of
 from sidecar.core.stats import PathStats
+from sidecar.core.wire import frame
 
 if TYPE_CHECKING:
     import random

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.base.values import PathId, PathState
     from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.frame import Fragment
     from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.wire.frame import Fragment
 
 
 @dataclass(frozen=True, slots=True)

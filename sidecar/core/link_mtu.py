@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import PathState
-from sidecar.core.frame import BASE_BYTES
 from sidecar.core.link_events import FragmentsLost, PathMtuChanged
 from sidecar.core.pmtu import payloads
+from sidecar.core.wire.frame import BASE_BYTES
 
 if TYPE_CHECKING:
     from collections import deque

@@ -8,21 +8,21 @@ from cryptography.exceptions import InvalidTag
 
 from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
-from sidecar.core import frame
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAGRAM_BYTES, NONCE_OFFSET
-from sidecar.core.introduction import UnauthenticError, open_introduction, read_hello_id
 from sidecar.core.key_exchange import TooManyExchangesError
 from sidecar.core.link_events import PeerRenewed, PeerRestarted
 from sidecar.core.path_keys import MAX_FAILED
 from sidecar.core.path_table import MAX_INTRODUCTIONS
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAGRAM_BYTES, NONCE_OFFSET
+from sidecar.core.wire.introduction import UnauthenticError, open_introduction, read_hello_id
 
 if TYPE_CHECKING:
     from protos.model import Address
-    from sidecar.core.frame import Header
     from sidecar.core.path_table import PathTable
     from sidecar.core.paths import Path
+    from sidecar.core.wire.frame import Header
 
 _OVERHEAD_BYTES = HEADER_BYTES + TAG_BYTES
 

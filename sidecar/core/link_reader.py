@@ -7,10 +7,19 @@ from typing import TYPE_CHECKING, TypeVar
 
 from protos.errors import DecodeError
 from protos.model import Role
-from sidecar.core import frame
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.frame import (
+from sidecar.core.key_exchange import TooManyExchangesError
+from sidecar.core.link_events import (
+    FragmentsReceived,
+    MessageAbandoned,
+    MessageFinished,
+    MessageForgotten,
+    PeerClosed,
+)
+from sidecar.core.link_opener import LinkOpener
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import (
     FRAGMENT_HEAD,
     FRAGMENT_HEAD_BYTES,
     FRAGMENT_TYPE,
@@ -22,15 +31,6 @@ from sidecar.core.frame import (
     Fragment,
     is_repair_index,
 )
-from sidecar.core.key_exchange import TooManyExchangesError
-from sidecar.core.link_events import (
-    FragmentsReceived,
-    MessageAbandoned,
-    MessageFinished,
-    MessageForgotten,
-    PeerClosed,
-)
-from sidecar.core.link_opener import LinkOpener
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,11 +7,11 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.slices import in_groups
-from sidecar.core.frame import symbol_count
 from sidecar.core.link_events import FragmentsLost, Resend, Send, SendAbandon
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.redundancy import repair_symbols, worth_a_copy
 from sidecar.core.room import Room
+from sidecar.core.wire.frame import symbol_count
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from sidecar.core.base.slices import Step
     from sidecar.core.base.values import PathId, Priority, RequestId
     from sidecar.core.link_events import PathCommand
-    from sidecar.core.messages import Encoded
     from sidecar.core.redundancy import Redundancy
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
+    from sidecar.core.wire.messages import Encoded
 
 LOOKED_AT_ONCE = 512
 """Messages looked at in one call of `ask_again`, which has the engine's lock: about a millisecond."""

@@ -5,21 +5,21 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import PathState
-from sidecar.core.frame import KEY_ANSWER_TYPE, encode_key_answer
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
     PathChanged,
     PeerLied,
 )
+from sidecar.core.wire.frame import KEY_ANSWER_TYPE, encode_key_answer
 
 if TYPE_CHECKING:
-    from sidecar.core import frame
     from sidecar.core.link_mtu import LinkMtu
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.path_table import PathTable
     from sidecar.core.paths import Path
     from sidecar.core.sent import Sent
+    from sidecar.core.wire import frame
 
 
 class PathKeeper:

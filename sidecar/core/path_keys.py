@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 from cryptography.exceptions import InvalidTag
 
 from sidecar.core.crypto import aead as ciphers
-from sidecar.core.frame import PHASE_FLAG, clear_head
 from sidecar.core.key_exchange import KeyExchange
 from sidecar.core.received import ReceivedPackets
+from sidecar.core.wire.frame import PHASE_FLAG, clear_head
 
 if TYPE_CHECKING:
     import random
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from protos.token_bucket import TokenBucket
     from sidecar.core.crypto.aead import Cipher
     from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.frame import KeyAnswer, KeyOffer
     from sidecar.core.key_exchange import KeyLimits
+    from sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 _PHASE = PHASE_FLAG << 16
 """The phase bit in the first four clear bytes as one number."""

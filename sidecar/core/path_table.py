@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 from protos.model import Role
 from protos.token_bucket import TokenBucket
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.introduction import hello_id
 from sidecar.core.key_exchange import EXCHANGES_AT_ONCE, EXCHANGES_PER_S
 from sidecar.core.link_memory import LinkMemory
 from sidecar.core.path_keys import make_path_keys
 from sidecar.core.paths import Path
 from sidecar.core.pinging import Pings
 from sidecar.core.stats import LinkStats
+from sidecar.core.wire.introduction import hello_id
 
 if TYPE_CHECKING:
     import random

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.congestion import CongestionController
-from sidecar.core.frame import Finished, encode_ack, encode_finished
 from sidecar.core.link_events import PathMeasured
 from sidecar.core.path_address import PathAddress
 from sidecar.core.pmtu import PathMtu
@@ -15,6 +14,7 @@ from sidecar.core.probing import Probing
 from sidecar.core.recovery import Recovery
 from sidecar.core.rtt import RttEstimator
 from sidecar.core.send_queue import SendQueue
+from sidecar.core.wire.frame import Finished, encode_ack, encode_finished
 
 if TYPE_CHECKING:
     import random
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from protos.token_bucket import TokenBucket
-    from sidecar.core.frame import KeyAnswer, KeyOffer
     from sidecar.core.path_keys import PathKeys
     from sidecar.core.probing import SentPing
+    from sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 DOWN_FACTOR = 4.0
 """An unstable path is down after this many times the silence that made it unstable, or the longest that anybody waits

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sidecar.core.frame import MAX_ACK_RANGES
+from sidecar.core.wire.frame import MAX_ACK_RANGES
 
 MAX_ACK_DELAY_S = 0.005
 """A lone datagram's acknowledgement may wait this long for something to travel with."""

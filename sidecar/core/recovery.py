@@ -17,8 +17,8 @@ from sidecar.core.sent import Sent
 if TYPE_CHECKING:
     import random
 
-    from sidecar.core.frame import AckFrame
     from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.wire.frame import AckFrame
 
 PTO_DATAGRAMS = 2
 """How many of the oldest datagrams a probe timeout gives up (RFC 9002 section 6.2.4 allows two probes)."""

@@ -6,7 +6,7 @@ import math
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from sidecar.core import fec
+from sidecar.core.wire import fec
 
 if TYPE_CHECKING:
     from sidecar.core.loss_estimate import Loss

@@ -28,13 +28,8 @@ from sidecar.core.copies import Answer, Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.dispatching import MAX_COPIES, Dispatching
 from sidecar.core.events import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
-from sidecar.core.messages import (
-    MAX_NAME_BYTES,
-    MAX_PAYLOAD_BYTES,
-    RejectionMessage,
-    ResponseMessage,
-)
 from sidecar.core.no_room import NoRoom
+from sidecar.core.wire.messages import MAX_NAME_BYTES, MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator

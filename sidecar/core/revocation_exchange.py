@@ -17,17 +17,17 @@ from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
 from sidecar.core.base.values import Priority
-from sidecar.core.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
+from sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from protos.model import NodeName
-    from sidecar.core.messages import Encoded, RevocationMessage
     from sidecar.core.outbound import OutboundMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
+    from sidecar.core.wire.messages import Encoded, RevocationMessage
 
 ASK_AFTER_S = 0.5
 """From hearing of a newer list until we ask for it: the control plane's own copy may be on its way."""

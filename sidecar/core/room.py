@@ -11,7 +11,7 @@ import enum
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.fair_share import Shares
-from sidecar.core.frame import BASE_SYMBOL_BYTES
+from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 
 if TYPE_CHECKING:
     from protos.model import NodeName

@@ -17,8 +17,8 @@ from itertools import count
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from sidecar.core.base.values import SHARE, Priority
-from sidecar.core.frame import FRAGMENT_OVERHEAD_BYTES
 from sidecar.core.turn import Turn
+from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from sidecar.core.base.slices import Backlog, Step
     from sidecar.core.base.values import ExecutionId, PathId, RequestId
     from sidecar.core.events import ApplicationEvent
-    from sidecar.core.messages import CancelMessage, RequestMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
+    from sidecar.core.wire.messages import CancelMessage, RequestMessage
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ from protos.arguments import checked, number, whole
 from protos.errors import ConfigError, DecodeError
 from protos.names import interface_name, node_name
 from protos.printable import escaped
-from sidecar.core.frame import MAX_DATAGRAM_BYTES
 from sidecar.core.pinging import LEAST_BYTES
+from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 from sidecar.doctor.examination import connect, read_config
 from sidecar.doctor.finding import share
 from sidecar.doctor.options import parser_of, where_of

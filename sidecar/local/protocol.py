@@ -18,7 +18,7 @@ from typing import Any
 
 from protos.errors import DecodeError
 from protos.names import node_name
-from sidecar.core.frame import MAX_DATAGRAM_BYTES
+from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 
 VERSION = 1
 """Told in the part `node`. A part or key that a client does not know is to be ignored."""

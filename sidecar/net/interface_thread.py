@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Protocol
 
 from sidecar.core.base.values import PathState
 from sidecar.core.datagrams import Batch
-from sidecar.core.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
 from sidecar.core.link_events import PathChanged, Rebind
 from sidecar.core.path_history import PathHistory
+from sidecar.core.wire.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
 from sidecar.net.batch_socket import RECEIVE_CALLS, BatchSocket
 from sidecar.net.path_log import PathLog
 from sidecar.net.sources import Sources

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.frame import HEADER_BYTES
+from sidecar.core.wire.frame import HEADER_BYTES
 from tests.attacks.world import CLOUDS, World, is_ours
 from tests.netns.calling import Call, assert_flawless
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
-from sidecar.core import frame
-from sidecar.core.frame import AckFrame, Finished, Fragment, Header, Probe, ProbeReply
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import AckFrame, Finished, Fragment, Header, Probe, ProbeReply
 
 u8, u16, u32, u64 = (st.integers(0, 2**bits - 1) for bits in (8, 16, 32, 64))
 headers = st.builds(

@@ -15,7 +15,7 @@ import pytest
 
 from bench.attacker.junk import flipped, headed, mangled, noise
 from protos.model import InterfaceName
-from sidecar.core.frame import HEADER_BYTES
+from sidecar.core.wire.frame import HEADER_BYTES
 from tests.fuzz.test_engine_fuzz import ATTACKS, Rogue, arena, assert_bounded
 from tests.sim.mesh import Mesh, Node
 

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.model import InterfaceId, SessionId
-from sidecar.core import frame
 from sidecar.core.base.values import PathId
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
 from sidecar.core.link_events import FragmentsReceived, Send
 from sidecar.core.path_table import MAX_PATHS_OF_A_PEER, MAX_PENDING_FRAMES
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
 from tests.unit.sidecar.core.builders import (
     OUR_TOKEN,
     PEER_ADDRESS,

@@ -10,7 +10,7 @@ from protos.errors import DecodeError
 from protos.model import ServiceName
 from protos.names import clean_text
 from sidecar.core.base.values import Priority, RejectReason, RequestId
-from sidecar.core.messages import (
+from sidecar.core.wire.messages import (
     MAX_NAME_BYTES,
     CancelMessage,
     Message,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from sidecar.core import frame
+from sidecar.core.wire import frame
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once
 from tests.sim.test_sealing import dropped, pair
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.frame import BASE_BYTES
+from sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.mesh import IPV6, Mesh, Node
 
 if TYPE_CHECKING:

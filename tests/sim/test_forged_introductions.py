@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import InterfaceId, InterfaceName, NodeName, PeerSet, Role
-from sidecar.core.frame import Header
-from sidecar.core.introduction import encode_introduction
+from sidecar.core.wire.frame import Header
+from sidecar.core.wire.introduction import encode_introduction
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.mesh import Mesh, rule
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core import datagrams, fragments, frame
-from sidecar.core.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, MIN_SYMBOL_BYTES
+from sidecar.core import datagrams, fragments
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, MIN_SYMBOL_BYTES
 from tests.fuzz.test_engine_fuzz import Rogue, arena, assert_bounded
 
 if TYPE_CHECKING:

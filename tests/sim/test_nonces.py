@@ -10,11 +10,11 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
 from protos.credential import Aead
 from protos.model import PeerSet, Version
-from sidecar.core import introduction
 from sidecar.core.crypto import aead
 from sidecar.core.key_exchange import KeyLimits
 from sidecar.core.link import Link
 from sidecar.core.link_events import ResetPaths, SetPeers, SetReady
+from sidecar.core.wire import introduction
 from tests.sim.mesh import Mesh, Node
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from protos.tls_files import CRL_FILE, TlsWatch, load_tls_files
 from sidecar.announcement import Announcer
 from sidecar.core.base.values import Priority
 from sidecar.core.link_events import SetCredential
-from sidecar.core.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 from sidecar.core.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
+from sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 from sidecar.revocations import Revocations
 from tests.sim.mesh import Mesh, rule
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from protos.credential import SessionCredential
     from protos.model import NodeName
-    from sidecar.core.messages import RevocationMessage
+    from sidecar.core.wire.messages import RevocationMessage
     from tests.sim.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-12")

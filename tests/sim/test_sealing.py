@@ -11,9 +11,9 @@ import pytest
 from protos.credential import Aead
 from protos.errors import DecodeError
 from protos.model import InterfaceId, PeerSet, Version
-from sidecar.core import frame
-from sidecar.core.introduction import encode_introduction
 from sidecar.core.key_exchange import KeyLimits
+from sidecar.core.wire import frame
+from sidecar.core.wire.introduction import encode_introduction
 from tests.sessions import credential_of
 from tests.sim.mesh import Mesh, Node
 from tests.sim.test_mesh import assert_each_answered_once

@@ -9,8 +9,8 @@ import pytest
 from protos.model import Role
 from sidecar.core.base.values import Priority
 from sidecar.core.events import ExecuteRequest
-from sidecar.core.frame import BASE_BYTES
 from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.mesh import Mesh, Node, Wire, rule
 from tests.sim.serial_server import SerialServer
 

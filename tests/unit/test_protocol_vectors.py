@@ -38,16 +38,17 @@ from protos.model import (
     ServiceName,
 )
 from protos.pair_token import pair_token
-from sidecar.core import fec, fragments, frame, introduction, key_exchange, messages, outbox, path_address, path_table
+from sidecar.core import fragments, key_exchange, outbox, path_address, path_table
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.crypto import session
 from sidecar.core.crypto.key_schedule import pair_keys
-from sidecar.core.frame import Header
 from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path_keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
 from sidecar.core.peers import RESTART_GAP_S
 from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
+from sidecar.core.wire import fec, frame, introduction, messages
+from sidecar.core.wire.frame import Header
 from tests.sessions import seal
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import pytest
 from bench.attacker.junk import JunkKind, flipped, headed, make_junk, mangled
 from bench.attacker.send_many import BATCH, Volley, flood
 from bench.attacker.wire import Captured, parse
-from sidecar.core.frame import HEADER_BYTES, MAX_DATAGRAM_BYTES
+from sidecar.core.wire.frame import HEADER_BYTES, MAX_DATAGRAM_BYTES
 
 REAL = [bytes(range(100)), bytes(range(200))]
 

@@ -12,7 +12,7 @@ import pytest
 from protos.log_lines import JournalFormatter, LineFormatter, is_journal, line_formatter
 from protos.printable import escaped
 from sidecar.core.base.values import RejectReason
-from sidecar.core.messages import RejectionMessage, decode_message, encode_message
+from sidecar.core.wire.messages import RejectionMessage, decode_message, encode_message
 from tests.unit.sidecar.core.builders import request_id
 
 if TYPE_CHECKING:

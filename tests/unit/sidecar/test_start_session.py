@@ -18,7 +18,7 @@ from protos.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, Certifica
 from protos.model import Peer, Role, SessionId
 from protos.tls_files import TlsFiles, load_tls_files
 from sidecar import start_session as module
-from sidecar.core.introduction import MAX_INTRODUCED_BYTES
+from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
 from sidecar.start_session import preferred_aead, signed, start_session
 
 if TYPE_CHECKING:

@@ -24,17 +24,6 @@ from protos.pair_token import pair_token
 from sidecar.core.base.values import PathId, Priority, RequestId
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.frame import (
-    BASE_BYTES,
-    HEADER_BYTES,
-    INTRODUCTION_FLAG,
-    NONCE_OFFSET,
-    Frame,
-    Header,
-    decode_frames,
-    decode_header,
-)
-from sidecar.core.introduction import Introduction, encode_introduction, open_introduction
 from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.link import Link
 from sidecar.core.link_events import (
@@ -46,11 +35,22 @@ from sidecar.core.link_events import (
     SetReady,
 )
 from sidecar.core.link_memory import LinkMemory
-from sidecar.core.messages import Encoded, RequestMessage
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.path_keys import PathKeys, make_path_keys
 from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.rules import ServiceRule
+from sidecar.core.wire.frame import (
+    BASE_BYTES,
+    HEADER_BYTES,
+    INTRODUCTION_FLAG,
+    NONCE_OFFSET,
+    Frame,
+    Header,
+    decode_frames,
+    decode_header,
+)
+from sidecar.core.wire.introduction import Introduction, encode_introduction, open_introduction
+from sidecar.core.wire.messages import Encoded, RequestMessage
 from tests.sessions import agree, credential_of, seal, session_of, with_credential
 
 if TYPE_CHECKING:

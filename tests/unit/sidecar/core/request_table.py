@@ -10,7 +10,6 @@ from sidecar.core.events import ApplicationEvent, RequestFailed, ResponseArrived
 from sidecar.core.link_events import LinkCommand, Send
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
-from sidecar.core.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
 from sidecar.core.offers import Offers
 from sidecar.core.outbox import Outbox
 from sidecar.core.request_parts import RequestParts
@@ -18,6 +17,7 @@ from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules, ServiceRule
 from sidecar.core.stats import EngineStats
+from sidecar.core.wire.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 
 if TYPE_CHECKING:

@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import NodeName, SessionId
-from sidecar.core import decoding, fec
+from sidecar.core import decoding
 from sidecar.core.decoding import MAX_BYTES, Decoding, DecodingLine
-from sidecar.core.fec import MAX_BLOCK, decoding_cost
 from sidecar.core.fragments import Reassembler
-from sidecar.core.frame import Fragment, symbol_count
 from sidecar.core.inbound import Inbound
 from sidecar.core.link_events import SendFinished, SendForgotten
-from sidecar.core.messages import Encoded
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.partial import SLICE_OPERATIONS, Partial
 from sidecar.core.stats import EngineStats
+from sidecar.core.wire import fec
+from sidecar.core.wire.fec import MAX_BLOCK, decoding_cost
+from sidecar.core.wire.frame import Fragment, symbol_count
+from sidecar.core.wire.messages import Encoded
 from tests.unit.sidecar.core.builders import WLAN, A, path
 
 if TYPE_CHECKING:

@@ -34,7 +34,6 @@ from sidecar.core.events import (
     ResponseArrived,
 )
 from sidecar.core.fragments import OVER_REMEMBERED
-from sidecar.core.frame import BASE_SYMBOL_BYTES, Fragment
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsReceived,
@@ -47,7 +46,8 @@ from sidecar.core.link_events import (
     SendFinished,
     SetPeers,
 )
-from sidecar.core.messages import (
+from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, Fragment
+from sidecar.core.wire.messages import (
     CancelMessage,
     Message,
     RejectionMessage,

@@ -8,16 +8,16 @@ from sidecar.core.base.values import PathState, RejectReason
 from sidecar.core.events import ApplicationEvent, CallsForbidden, ExecuteRequest
 from sidecar.core.forbidden import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
 from sidecar.core.link_events import PathCommand, Send
-from sidecar.core.messages import RejectionMessage, ResponseMessage, decode_message
 from sidecar.core.outbox import Outbox
 from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules
 from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.stats import EngineStats
+from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, path, request, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.messages import Message
+    from sidecar.core.wire.messages import Message
 
 ROBOT, OTHER = NodeName("robot"), NodeName("robot-2")
 SECRET = ServiceName("/secret")

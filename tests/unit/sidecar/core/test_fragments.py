@@ -15,10 +15,10 @@ from sidecar.core.fragments import (
     Reassembled,
     Reassembler,
 )
-from sidecar.core.frame import MAX_MESSAGE_BYTES, Fragment, symbol_count
-from sidecar.core.messages import Encoded
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.partial import Partial
+from sidecar.core.wire.frame import MAX_MESSAGE_BYTES, Fragment, symbol_count
+from sidecar.core.wire.messages import Encoded
 from tests.unit.sidecar.core.builders import A, path
 
 SYMBOL = 256

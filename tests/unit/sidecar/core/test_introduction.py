@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from protos.errors import DecodeError
 from protos.model import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.frame import BASE_BYTES, Header, KeyOffer
-from sidecar.core.introduction import (
+from sidecar.core.wire.frame import BASE_BYTES, Header, KeyOffer
+from sidecar.core.wire.introduction import (
     MAX_INTRODUCED_BYTES,
     Introduction,
     UnauthenticError,

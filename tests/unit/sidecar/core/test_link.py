@@ -5,10 +5,7 @@ import random
 import pytest
 
 from protos.model import InterfaceId, InterfaceName, NodeName, Role, SessionId
-from sidecar.core import frame
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.frame import Probe, ProbeReply
-from sidecar.core.introduction import Introduction
 from sidecar.core.link import Link
 from sidecar.core.link_events import (
     CheckPaths,
@@ -28,6 +25,9 @@ from sidecar.core.link_events import (
 from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S
 from sidecar.core.probing import IDLE_PROBE_S, MAX_PROBE_S
 from sidecar.core.rtt import UNSTABLE_FLOOR_S
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import Probe, ProbeReply
+from sidecar.core.wire.introduction import Introduction
 from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import (
     FIRST,

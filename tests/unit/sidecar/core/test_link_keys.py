@@ -10,15 +10,15 @@ import pytest
 
 from protos.errors import DecodeError
 from protos.model import InterfaceId, NodeName, Role, SessionId
-from sidecar.core import frame
 from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Probe, ProbeReply
-from sidecar.core.introduction import encode_introduction
 from sidecar.core.key_exchange import DEFAULT_LIMITS, EXCHANGES_AT_ONCE
 from sidecar.core.link import Link
 from sidecar.core.link_events import LinkPeer, SetMtu, SetPeers, SetReady
 from sidecar.core.path_keys import make_path_keys
 from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Probe, ProbeReply
+from sidecar.core.wire.introduction import encode_introduction
 from tests.sessions import credential_of, seal, session_of
 from tests.unit.sidecar.core.builders import OUR_ID, OUR_TOKEN, PEER_ADDRESS, WLAN, Bench, peer
 from tests.unit.sidecar.core.test_link import PROBE, fragment, up

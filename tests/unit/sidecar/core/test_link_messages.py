@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core import frame
-from sidecar.core.frame import AckFrame, Finished, Fragment
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsLost,
@@ -15,9 +13,11 @@ from sidecar.core.link_events import (
     SendFinished,
     SetCarrier,
 )
-from sidecar.core.messages import Encoded
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.received import MAX_ACK_DELAY_S
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import AckFrame, Finished, Fragment
+from sidecar.core.wire.messages import Encoded
 from tests.unit.sidecar.core.builders import (
     PEER_SESSION,
     A,

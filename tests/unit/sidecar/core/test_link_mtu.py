@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core import frame
-from sidecar.core.frame import BASE_BYTES, Probe, ProbeReply
 from sidecar.core.link_events import FragmentsLost, PathMtuChanged, Send, SetMtu
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.pmtu import PROBE_TIMEOUT_S
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
 from tests.unit.sidecar.core.builders import PEER_ADDRESS, Bench, message, path
 from tests.unit.sidecar.core.test_link import up
 

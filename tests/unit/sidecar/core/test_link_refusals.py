@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 
 from protos.model import InterfaceId
-from sidecar.core import frame
-from sidecar.core.frame import ProbeReply
-from sidecar.core.introduction import Introduction
 from sidecar.core.link_events import (
     Send,
 )
 from sidecar.core.probing import FIRST_PROBE_S
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import ProbeReply
+from sidecar.core.wire.introduction import Introduction
 from tests.unit.sidecar.core.builders import (
     Bench,
     message,

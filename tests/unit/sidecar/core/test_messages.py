@@ -6,7 +6,7 @@ from protos.convert.fields import MAX_CRL_BYTES
 from protos.errors import DecodeError, UnknownKindError
 from protos.model import ServiceName
 from sidecar.core.base.values import Priority, RejectReason, RequestId
-from sidecar.core.messages import (
+from sidecar.core.wire.messages import (
     MAX_PAYLOAD_BYTES,
     MAX_TEXT_BYTES,
     CancelMessage,

@@ -4,9 +4,9 @@ import random
 
 import pytest
 
-from sidecar.core import fec
-from sidecar.core.messages import Encoded
 from sidecar.core.outbound import OutboundMessage
+from sidecar.core.wire import fec
+from sidecar.core.wire.messages import Encoded
 from tests.unit.sidecar.core.builders import A, message, path
 
 

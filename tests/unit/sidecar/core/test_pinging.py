@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from protos.model import InterfaceId
-from sidecar.core import frame
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.frame import BASE_BYTES, Probe, ProbeReply
-from sidecar.core.introduction import Introduction
 from sidecar.core.link_events import Ping, SetCarrier
 from sidecar.core.pinging import LEAST_BYTES, MAX_PINGS_OUT, PINGS_AT_ONCE, PINGS_PER_S, Pong
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
+from sidecar.core.wire.introduction import Introduction
 from tests.unit.sidecar.core.builders import WLAN, A, Bench
 
 pytestmark = pytest.mark.audit("ops-14")

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from sidecar.core.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 from sidecar.core.pmtu import (
     COMMON_MTUS,
     MAX_PROBES,
@@ -18,6 +17,7 @@ from sidecar.core.pmtu import (
     PathMtu,
     payloads,
 )
+from sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 
 RTT_S = 0.05
 ETHERNET, JUMBO = payloads(1500, ipv6=False), payloads(9000, ipv6=False)

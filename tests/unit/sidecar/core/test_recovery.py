@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core import frame
-from sidecar.core.frame import AckFrame
 from sidecar.core.received import MAX_ACK_DELAY_S, ReceivedPackets
 from sidecar.core.recovery import PTO_DATAGRAMS, Recovery
 from sidecar.core.reordering import PACKET_THRESHOLD
+from sidecar.core.wire import frame
+from sidecar.core.wire.frame import AckFrame
 from tests.unit.sidecar.core.builders import message
 
 if TYPE_CHECKING:

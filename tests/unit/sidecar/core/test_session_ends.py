@@ -8,8 +8,8 @@ from protos.model import PeerSet, RemovalReason, RemovedPeer, Role, SessionId, V
 from sidecar.core.base.values import ExecutionId, PathState
 from sidecar.core.events import CancelExecution, ResponseArrived, WithdrawService
 from sidecar.core.link_events import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
-from sidecar.core.messages import ResponseMessage
 from sidecar.core.offers import WITHDRAW_AFTER_S
+from sidecar.core.wire.messages import ResponseMessage
 from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import ECHO, A, peer, request, request_id
 from tests.unit.sidecar.core.test_engine import ROBOT, Sidecar, cloud, robot

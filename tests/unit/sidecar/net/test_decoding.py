@@ -13,11 +13,11 @@ from sidecar.core.base.values import Priority
 from sidecar.core.decoding import Decoding
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest
-from sidecar.core.frame import Fragment
 from sidecar.core.link_events import FragmentsReceived
-from sidecar.core.messages import RequestMessage, encode_message
 from sidecar.core.outbound import OutboundMessage
 from sidecar.core.partial import Partial
+from sidecar.core.wire.frame import Fragment
+from sidecar.core.wire.messages import RequestMessage, encode_message
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.decoder import Decoder
 from tests.sessions import session_of

@@ -34,7 +34,7 @@ from protos.credential import decode_credential
 from protos.errors import DecodeError
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import expand
-from sidecar.core.frame import (
+from sidecar.core.wire.frame import (
     BASE_BYTES,
     HEADER_BYTES,
     INTRODUCTION_FLAG,
