@@ -32,7 +32,7 @@ from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sidecar.core.redundancy import Redundancy
+    from sidecar.core.message.repair import Redundancy
 
 MAX_DEADLINE_MS = 60_000
 """Where the latency histogram ends: a miss of a longer deadline could not be predicted."""

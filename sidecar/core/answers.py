@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sidecar.core.base.slices import Backlog, Step
     from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.dedup import Reply
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.rules import Rules

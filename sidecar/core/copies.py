@@ -11,7 +11,7 @@ from sidecar.core.base.request_id import is_race
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId, RequestId
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.rules import ServiceRule
 
 HEDGE_AT = 0.5

@@ -30,7 +30,7 @@ from sidecar.core.wire.introduction import INTRODUCTION_BYTES, encode_introducti
 if TYPE_CHECKING:
     from protos.credential import SessionCredential
     from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.paths import Path
     from sidecar.core.send_queue import Run
     from sidecar.core.stats import LinkStats

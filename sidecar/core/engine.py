@@ -69,7 +69,7 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, Peer, ServiceMapping, ServiceName, ServiceOffer, SessionId
     from sidecar.core.budget import Budget
     from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.decoding import Decoding
+    from sidecar.core.message.decoding import Decoding
 
 SWEEP_EVERY_S = 1.0
 """How often old messages and half messages are looked for."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.decoding import Decoding, DecodingLine
-from sidecar.core.fragments import OVER_REMEMBERED, Fate, Reassembler
 from sidecar.core.link_events import SendFinished, SendForgotten
-from sidecar.core.partial import Partial
+from sidecar.core.message.decoding import Decoding, DecodingLine
+from sidecar.core.message.partial import Partial
+from sidecar.core.message.reassembly import OVER_REMEMBERED, Fate, Reassembler
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 
 if TYPE_CHECKING:

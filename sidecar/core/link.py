@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from protos.model import Address, NodeName
     from sidecar.core.datagrams import LinkIdentity
     from sidecar.core.link_events import LinkPeer
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.path_view import PathView
     from sidecar.core.paths import Path
     from sidecar.core.pinging import Pong

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.base.values import PathId, PathState
     from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.wire.frame import Fragment
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.slices import in_groups
 from sidecar.core.link_events import FragmentsLost, Resend, Send, SendAbandon
-from sidecar.core.outbound import OutboundMessage
-from sidecar.core.redundancy import repair_symbols, worth_a_copy
+from sidecar.core.message.outbound import OutboundMessage
+from sidecar.core.message.repair import repair_symbols, worth_a_copy
 from sidecar.core.room import Room
 from sidecar.core.wire.frame import symbol_count
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sidecar.core.base.slices import Step
     from sidecar.core.base.values import PathId, Priority, RequestId
     from sidecar.core.link_events import PathCommand
-    from sidecar.core.redundancy import Redundancy
+    from sidecar.core.message.repair import Redundancy
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats
     from sidecar.core.wire.messages import Encoded

@@ -15,7 +15,7 @@ from sidecar.core.wire.frame import KEY_ANSWER_TYPE, encode_key_answer
 
 if TYPE_CHECKING:
     from sidecar.core.link_mtu import LinkMtu
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.path_table import PathTable
     from sidecar.core.paths import Path
     from sidecar.core.sent import Sent

@@ -17,7 +17,7 @@ from sidecar.core.sent import Sent
 if TYPE_CHECKING:
     import random
 
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.wire.frame import AckFrame
 
 PTO_DATAGRAMS = 2

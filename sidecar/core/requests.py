@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName, ServiceName
     from sidecar.core.base.slices import Step
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.request_parts import RequestParts
     from sidecar.core.rules import ServiceRule
 

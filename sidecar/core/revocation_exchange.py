@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from protos.model import NodeName
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.stats import EngineStats

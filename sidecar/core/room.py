@@ -16,7 +16,7 @@ from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.base.values import PathId
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
 
 MAX_MESSAGES = 16_384
 """All undelivered messages: one peer may have half of them, as many as requests may be in flight."""

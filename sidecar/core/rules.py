@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
     from sidecar.core.fallback_rule import FallbackRule
-    from sidecar.core.redundancy import Redundancy
+    from sidecar.core.message.repair import Redundancy
 
 MAX_LIFETIME_S = 300.0
 """A request that may wait longer is a job, not a call; a server remembers every request for longer than this."""

@@ -23,7 +23,7 @@ from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
 
 PURGE_AT = 64
 """Entries before the first look for messages that are over; then whenever their number has doubled."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.base.timers import NEVER
 
 if TYPE_CHECKING:
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
 
 HASTE = 1.25
 """A message that has not begun to leave is late when this many times its sending time does not fit any more: what is

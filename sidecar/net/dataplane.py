@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
     from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.decoding import Decoding
     from sidecar.core.link_events import LinkEvent
+    from sidecar.core.message.decoding import Decoding
     from sidecar.core.path_history import Change
     from sidecar.core.path_view import PathView
     from sidecar.core.stats import EngineStats, LinkStats

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core import datagrams, fragments
+from sidecar.core import datagrams
+from sidecar.core.message import reassembly
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, MIN_SYMBOL_BYTES
 from tests.fuzz.test_engine_fuzz import Rogue, arena, assert_bounded
@@ -107,7 +108,7 @@ def measured() -> int:
 def test_a_flood_costs_bounded_memory_and_harms_nobody(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(datagrams, "MAX_RUNS_IN_FLIGHT", CAP // frame.MAX_FRAMES)
     for name in ("MAX_PEER_MESSAGES", "OVER_REMEMBERED"):
-        monkeypatch.setattr(fragments, name, CAP)
+        monkeypatch.setattr(reassembly, name, CAP)
     mesh, honest, node, cloud = arena(1)
     rogue = Rogue(mesh, node, cloud)
     node.alive = False  # it says nothing but this, hears nothing, acknowledges nothing

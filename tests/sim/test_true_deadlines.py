@@ -16,7 +16,7 @@ from tests.sim.serial_server import SerialServer
 
 if TYPE_CHECKING:
     from sidecar.core.events import ApplicationEvent
-    from sidecar.core.redundancy import Redundancy
+    from sidecar.core.message.repair import Redundancy
 
 MBIT = 1e6 / 8
 DEADLINE_S, LIFETIME_S = 0.5, 10.0

@@ -38,12 +38,13 @@ from protos.model import (
     ServiceName,
 )
 from protos.pair_token import pair_token
-from sidecar.core import fragments, key_exchange, outbox, path_address, path_table
+from sidecar.core import key_exchange, outbox, path_address, path_table
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.crypto import session
 from sidecar.core.crypto.key_schedule import pair_keys
 from sidecar.core.key_exchange import DEFAULT_LIMITS
+from sidecar.core.message import reassembly
 from sidecar.core.path_keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
 from sidecar.core.peers import RESTART_GAP_S
 from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
@@ -461,9 +462,9 @@ def test_the_numbers_on_the_page_are_those_of_the_code() -> None:
         f"at most {path_table.NEW_PATHS} paths at once in this way, and {path_table.NEW_PATHS_PER_S:.0f} a second",
         f"It has at most {path_table.MAX_PATHS_OF_A_PEER} there",
         f"go {path_table.UNPROVEN_BYTES} bytes in all and {path_table.UNPROVEN_BYTES_PER_S:.0f} bytes a second",
-        f"up to {fragments.MAX_PEER_BYTES >> 20} MiB of one peer's half messages",
-        f"up to {fragments.MAX_PEER_MESSAGES} of them",
-        f"no symbol for {fragments.MAX_AGE_S:.0f} s",
+        f"up to {reassembly.MAX_PEER_BYTES >> 20} MiB of one peer's half messages",
+        f"up to {reassembly.MAX_PEER_MESSAGES} of them",
+        f"no symbol for {reassembly.MAX_AGE_S:.0f} s",
         f"under a new number, up to {outbox.MAX_GENERATIONS} times",
         f"last byte is divisible by {OBSERVED_ONE_IN}",
     ):

@@ -35,7 +35,7 @@ from sidecar.core.link_events import (
     SetReady,
 )
 from sidecar.core.link_memory import LinkMemory
-from sidecar.core.outbound import OutboundMessage
+from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.path_keys import PathKeys, make_path_keys
 from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.rules import ServiceRule

@@ -23,7 +23,7 @@ from tests.unit.sidecar.core.builders import ECHO, path, request_id, rule
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.wire.messages import Message
 
 pytestmark = pytest.mark.audit("dp-1")

@@ -17,7 +17,7 @@ from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path,
 if TYPE_CHECKING:
     from protos.model import Report
     from sidecar.core.base.values import PathId
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
 
 ETH_A, WLAN_A, WWAN_A, WWAN_B = path("eth0", A), path(WLAN, A), path(WWAN, A), path(WWAN, B)
 NO_MESSAGE: OutboundMessage = None  # type: ignore[assignment]  # what is counted does not look at it

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import NodeName, SessionId
-from sidecar.core import decoding
-from sidecar.core.decoding import MAX_BYTES, Decoding, DecodingLine
-from sidecar.core.fragments import Reassembler
 from sidecar.core.inbound import Inbound
 from sidecar.core.link_events import SendFinished, SendForgotten
-from sidecar.core.outbound import OutboundMessage
-from sidecar.core.partial import SLICE_OPERATIONS, Partial
+from sidecar.core.message import decoding
+from sidecar.core.message.decoding import MAX_BYTES, Decoding, DecodingLine
+from sidecar.core.message.outbound import OutboundMessage
+from sidecar.core.message.partial import SLICE_OPERATIONS, Partial
+from sidecar.core.message.reassembly import Reassembler
 from sidecar.core.stats import EngineStats
 from sidecar.core.wire import fec
 from sidecar.core.wire.fec import MAX_BLOCK, decoding_cost

@@ -33,7 +33,6 @@ from sidecar.core.events import (
     RequestFailed,
     ResponseArrived,
 )
-from sidecar.core.fragments import OVER_REMEMBERED
 from sidecar.core.link_events import (
     FinishedLost,
     FragmentsReceived,
@@ -46,6 +45,7 @@ from sidecar.core.link_events import (
     SendFinished,
     SetPeers,
 )
+from sidecar.core.message.reassembly import OVER_REMEMBERED
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, Fragment
 from sidecar.core.wire.messages import (
     CancelMessage,

@@ -6,7 +6,9 @@ from collections import Counter
 
 import pytest
 
-from sidecar.core.fragments import (
+from sidecar.core.message.outbound import OutboundMessage
+from sidecar.core.message.partial import Partial
+from sidecar.core.message.reassembly import (
     MAX_AGE_S,
     MAX_PEER_BYTES,
     MAX_PEER_MESSAGES,
@@ -15,8 +17,6 @@ from sidecar.core.fragments import (
     Reassembled,
     Reassembler,
 )
-from sidecar.core.outbound import OutboundMessage
-from sidecar.core.partial import Partial
 from sidecar.core.wire.frame import MAX_MESSAGE_BYTES, Fragment, symbol_count
 from sidecar.core.wire.messages import Encoded
 from tests.unit.sidecar.core.builders import A, path

@@ -18,7 +18,7 @@ from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path,
 if TYPE_CHECKING:
     from protos.model import InterfaceName
     from sidecar.core.base.values import PathId
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
 
 WLAN_A, WLAN_B, WWAN_A, WWAN_B, ETH_A = (path(*of) for of in ((WLAN, A), (WLAN, B), (WWAN, A), (WWAN, B), ("eth0", A)))
 NO_MESSAGE: OutboundMessage = None  # type: ignore[assignment]  # what is counted does not look at it

@@ -13,7 +13,7 @@ from sidecar.core.link_events import (
     SendFinished,
     SetCarrier,
 )
-from sidecar.core.outbound import OutboundMessage
+from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import AckFrame, Finished, Fragment

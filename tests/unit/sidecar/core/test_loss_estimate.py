@@ -4,8 +4,8 @@ import random
 
 import pytest
 
-from sidecar.core.loss_estimate import MAX_DISPERSION, LossEstimate
-from sidecar.core.redundancy import FLOOR
+from sidecar.core.message.loss_estimate import MAX_DISPERSION, LossEstimate
+from sidecar.core.message.repair import FLOOR
 
 
 def measured(rng: random.Random, share: float, windows: int, *, burst: int = 1, size: int = 130) -> LossEstimate:

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from sidecar.core.outbound import OutboundMessage
+from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.wire import fec
 from sidecar.core.wire.messages import Encoded
 from tests.unit.sidecar.core.builders import A, message, path

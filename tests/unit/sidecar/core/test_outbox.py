@@ -3,10 +3,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import PathState, Priority, RequestId
-from sidecar.core.fragments import MAX_PEER_BYTES
 from sidecar.core.link_events import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
+from sidecar.core.message.reassembly import MAX_PEER_BYTES
+from sidecar.core.message.repair import MAX_COPIES
 from sidecar.core.outbox import MAX_GENERATIONS, Outbox
-from sidecar.core.redundancy import MAX_COPIES
 from sidecar.core.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
 from sidecar.core.routes import Routes
 from sidecar.core.stats import EngineStats
@@ -17,7 +17,7 @@ from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
 if TYPE_CHECKING:
     from sidecar.core.base.slices import Step
     from sidecar.core.base.values import PathId
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
 
 SMALL = Encoded(b"", b"x")
 OVER_WLAN, OVER_WWAN, TO_B = path(WLAN), path(WWAN), path(WLAN, B)

@@ -4,8 +4,16 @@ import random
 
 import pytest
 
-from sidecar.core.loss_estimate import Loss
-from sidecar.core.redundancy import FAILURES, FLOOR, MAX_COPIES, MAX_RATIO, WORTH_A_COPY, repair_symbols, worth_a_copy
+from sidecar.core.message.loss_estimate import Loss
+from sidecar.core.message.repair import (
+    FAILURES,
+    FLOOR,
+    MAX_COPIES,
+    MAX_RATIO,
+    WORTH_A_COPY,
+    repair_symbols,
+    worth_a_copy,
+)
 from sidecar.core.wire import fec
 
 COUNTS = (1, 2, 3, 5, 20, 128, 129, 132, 1000, 14_700)

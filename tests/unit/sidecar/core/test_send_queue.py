@@ -11,7 +11,7 @@ from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 from tests.unit.sidecar.core.builders import message, path
 
 if TYPE_CHECKING:
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
 
 ONE = 1
 """A budget for one symbol."""

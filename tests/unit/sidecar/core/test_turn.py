@@ -9,7 +9,7 @@ from sidecar.core.turn import PATIENCE, SMALL, Turn
 from tests.unit.sidecar.core.builders import message, path
 
 if TYPE_CHECKING:
-    from sidecar.core.outbound import OutboundMessage
+    from sidecar.core.message.outbound import OutboundMessage
 
 SIZE, PACE, ROUND_TRIP_S = 100_000, 200_000.0, 0.1
 """Half a second to send, 0.6 s to the answer."""

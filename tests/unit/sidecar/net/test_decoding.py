@@ -10,12 +10,12 @@ import pytest
 
 from protos.model import InterfaceName, PeerSet, Role, ServiceOffer, SessionId, Version
 from sidecar.core.base.values import Priority
-from sidecar.core.decoding import Decoding
 from sidecar.core.engine import EngineConfig
 from sidecar.core.events import ExecuteRequest
 from sidecar.core.link_events import FragmentsReceived
-from sidecar.core.outbound import OutboundMessage
-from sidecar.core.partial import Partial
+from sidecar.core.message.decoding import Decoding
+from sidecar.core.message.outbound import OutboundMessage
+from sidecar.core.message.partial import Partial
 from sidecar.core.wire.frame import Fragment
 from sidecar.core.wire.messages import RequestMessage, encode_message
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane

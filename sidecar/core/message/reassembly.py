@@ -11,7 +11,7 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
 from sidecar.core.base.timers import NEVER
-from sidecar.core.partial import Partial
+from sidecar.core.message.partial import Partial
 
 if TYPE_CHECKING:
     from collections import Counter

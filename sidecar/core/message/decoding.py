@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName, SessionId
     from sidecar.core.base.values import PathId
-    from sidecar.core.partial import Partial
+    from sidecar.core.message.partial import Partial
 
 MAX_BYTES = 128 * 1024 * 1024
 """What messages in line hold, repair symbols included. One peer may hold half: two of the largest that came as repair

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.wire import fec
 
 if TYPE_CHECKING:
-    from sidecar.core.loss_estimate import Loss
+    from sidecar.core.message.loss_estimate import Loss
 
 Redundancy = float | None
 """Repair symbols for each source symbol (0 to 1), or None: as many as the measured loss asks for."""

@@ -1,0 +1,1 @@
+"""One message in symbols: sent, put together, repaired. Imports `base` and `wire`."""
