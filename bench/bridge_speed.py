@@ -37,8 +37,8 @@ from std_srvs.srv import Empty
 from protos import interpreter
 from protos.model import NodeName, Role, ServiceName, SessionId
 from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
 from sidecar.ros import rcl
 
 if TYPE_CHECKING:

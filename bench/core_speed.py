@@ -35,10 +35,10 @@ from protos.pair_token import pair_token
 from sidecar.core.base.values import RequestId
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.events import ExecuteRequest, RequestFailed, ResponseArrived
 from sidecar.core.link import Link
-from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import ExecuteRequest, RequestFailed, ResponseArrived
+from sidecar.core.seam.links import SetReady
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, symbol_count
 from sidecar.start_session import start_session
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from protos.identity import Identity
     from protos.model import InterfaceName, ServiceName
     from sidecar.core.control_session import ControlStats
-    from sidecar.core.stats import EngineStats, LinkStats
+    from sidecar.core.seam.stats import EngineStats, LinkStats
     from sidecar.revocations import RevocationState
     from sidecar.ros.stats import BridgeStats
 

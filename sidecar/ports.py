@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName, ServiceOffer, SessionId
     from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
-    from sidecar.core.events import ApplicationEvent
+    from sidecar.core.seam.application import ApplicationEvent
 
 
 class DataPlane(Protocol):

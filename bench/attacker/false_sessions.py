@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from protos.credential import SessionCredential
     from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.datagrams import LinkIdentity
-    from sidecar.core.link_events import LinkPeer
     from sidecar.core.path_keys import SealingKeys
     from sidecar.core.paths import Path
+    from sidecar.core.seam.links import LinkPeer
 
 PHANTOMS = range(200, 231)
 """Numbers of interfaces that no host here has: with its own one as many as a peer may introduce."""

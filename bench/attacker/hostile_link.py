@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from bench.attacker.hostile_means import Means
-    from sidecar.core.link_events import LinkPeer
     from sidecar.core.paths import Path
+    from sidecar.core.seam.links import LinkPeer
 
 SYMBOL = 1024
 ESCAPES = "\x1b[2J\x1b]0;owned\x07\r\n2026-01-01T00:00:00.000Z INFO runtime: all is well \u202e\x00\x9b31m"

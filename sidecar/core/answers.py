@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
     from sidecar.core.rules import Rules
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
 
 MAX_ANSWERS = 32_768
 """Answers and rejections that wait or are under way; one robot may have half: twice what it may have in flight."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, ServiceName
     from sidecar.core.budget import Budget
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
 
 MAX_SAVED_BYTES = 32 * 1024 * 1024
 """What a bucket holds: twice the largest request."""

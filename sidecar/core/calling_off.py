@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sidecar.core.copies import Copy, Request
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
 
 MAX_CALLED_OFF = 1024
 """Ids of requests whose copies were called off, kept to tell answers that were on their way from strays."""

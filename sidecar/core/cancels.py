@@ -10,7 +10,7 @@ from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.base.values import RequestId
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
 
 MAX_EARLY_CANCELS = 16_384
 """Ids kept; one robot may fill half: 130 requests a second, all overtaken, for REMEMBER_CANCEL_S. What is not kept may

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.paths import Path
+    from sidecar.core.seam.stats import LinkStats
     from sidecar.core.send_queue import Run
-    from sidecar.core.stats import LinkStats
 
 BURST_DATAGRAMS = 64
 """Datagrams built in one go before the driver looks at the socket again (about 70 kB, some milliseconds)."""

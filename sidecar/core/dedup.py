@@ -23,9 +23,9 @@ from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
 from sidecar.core.cancels import EarlyCancels
-from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.rules import MAX_LIFETIME_S
+from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
     from sidecar.core.base.slices import Backlog
     from sidecar.core.base.values import PathId, Priority
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
     from sidecar.core.wire.messages import RequestMessage
 
 MAX_RUNNING = 8192

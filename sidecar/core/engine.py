@@ -16,10 +16,21 @@ from sidecar.core.attention import Attention
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.slices import SLICE, Backlog, Step, rest
 from sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
-from sidecar.core.events import ApplicationEvent, OfferService, WithdrawService
 from sidecar.core.goodbyes import Goodbyes
 from sidecar.core.inbound import Inbound
-from sidecar.core.link_events import (
+from sidecar.core.mapping import MappingTable
+from sidecar.core.measurements import Measurements
+from sidecar.core.offers import Offers
+from sidecar.core.outbox import Outbox
+from sidecar.core.peers import Peers
+from sidecar.core.penalties import Penalties
+from sidecar.core.request_parts import RequestParts
+from sidecar.core.requests import RequestTable
+from sidecar.core.revocation_exchange import RevocationExchange
+from sidecar.core.routes import Routes
+from sidecar.core.rules import Rules, ServiceRule
+from sidecar.core.seam.application import ApplicationEvent, OfferService, WithdrawService
+from sidecar.core.seam.links import (
     Attend,
     FinishedLost,
     FragmentsLost,
@@ -40,19 +51,8 @@ from sidecar.core.link_events import (
     Seek,
     SetPeers,
 )
-from sidecar.core.mapping import MappingTable
-from sidecar.core.measurements import Measurements
-from sidecar.core.offers import Offers
-from sidecar.core.outbox import Outbox
-from sidecar.core.peers import Peers
-from sidecar.core.penalties import Penalties
-from sidecar.core.request_parts import RequestParts
-from sidecar.core.requests import RequestTable
-from sidecar.core.revocation_exchange import RevocationExchange
-from sidecar.core.routes import Routes
-from sidecar.core.rules import Rules, ServiceRule
+from sidecar.core.seam.stats import EngineStats
 from sidecar.core.serving import Serving, ServingParts
-from sidecar.core.stats import EngineStats
 from sidecar.core.wire.messages import (
     CancelMessage,
     RequestMessage,

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sidecar.core.base.values import RequestId
-    from sidecar.core.events import RequestFailed
     from sidecar.core.rules import ServiceRule
+    from sidecar.core.seam.application import RequestFailed
 
 MAX_WANTED = 64
 """Requests that wait for one fallback; a longer queue helps nobody."""

@@ -14,8 +14,8 @@ from sidecar.core.fallback_times import FallbackTimes
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import RequestId
-    from sidecar.core.events import RequestFailed
     from sidecar.core.fallback_rule import FallbackRule
+    from sidecar.core.seam.application import RequestFailed
 
 MAX_CALLED = 2
 """Requests at one fallback at once: one runs, the next lies ready. With more, those that can still be in time would

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.events import CallsForbidden
+from sidecar.core.seam.application import CallsForbidden
 
 if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName

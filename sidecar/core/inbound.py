@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.link_events import SendFinished, SendForgotten
 from sidecar.core.message.decoding import Decoding, DecodingLine
 from sidecar.core.message.partial import Partial
 from sidecar.core.message.reassembly import OVER_REMEMBERED, Fate, Reassembler
+from sidecar.core.seam.links import SendFinished, SendForgotten
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 
 if TYPE_CHECKING:
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName, SessionId
     from sidecar.core.base.values import PathId
-    from sidecar.core.link_events import PathCommand
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.links import PathCommand
+    from sidecar.core.seam.stats import EngineStats
     from sidecar.core.wire.frame import Fragment
 
 

@@ -12,7 +12,13 @@ from sidecar.core.base.timers import NEVER, Timers
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
 from sidecar.core.key_exchange import DEFAULT_LIMITS, KeyLimits
-from sidecar.core.link_events import (
+from sidecar.core.link_memory import LinkMemory
+from sidecar.core.link_mtu import LinkMtu
+from sidecar.core.link_reader import LinkReader
+from sidecar.core.path_keeper import PathKeeper
+from sidecar.core.path_table import PathTable
+from sidecar.core.path_view import view_of
+from sidecar.core.seam.links import (
     Attend,
     CheckPaths,
     FinishedLost,
@@ -37,13 +43,7 @@ from sidecar.core.link_events import (
     SetPeers,
     SetReady,
 )
-from sidecar.core.link_memory import LinkMemory
-from sidecar.core.link_mtu import LinkMtu
-from sidecar.core.link_reader import LinkReader
-from sidecar.core.path_keeper import PathKeeper
-from sidecar.core.path_table import PathTable
-from sidecar.core.path_view import view_of
-from sidecar.core.stats import PathStats
+from sidecar.core.seam.stats import PathStats
 from sidecar.core.wire import frame
 
 if TYPE_CHECKING:
@@ -53,11 +53,11 @@ if TYPE_CHECKING:
 
     from protos.model import Address, NodeName
     from sidecar.core.datagrams import LinkIdentity
-    from sidecar.core.link_events import LinkPeer
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.path_view import PathView
     from sidecar.core.paths import Path
     from sidecar.core.pinging import Pong
+    from sidecar.core.seam.links import LinkPeer
 
 MAX_FINISHED_DELAY_S = 0.003
 """How long FINISHED of a small request waits for its answer, and the acknowledgement with it: less than

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import PathState
-from sidecar.core.link_events import FragmentsLost, PathMtuChanged
 from sidecar.core.pmtu import payloads
+from sidecar.core.seam.links import FragmentsLost, PathMtuChanged
 from sidecar.core.wire.frame import BASE_BYTES
 
 if TYPE_CHECKING:
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import Address
-    from sidecar.core.link_events import LinkEvent
     from sidecar.core.paths import Path
+    from sidecar.core.seam.links import LinkEvent
     from sidecar.core.sent import Sent
 
 DEFAULT_MTU = 1500

@@ -11,9 +11,9 @@ from protos.model import InterfaceId, SessionId
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.key_exchange import TooManyExchangesError
-from sidecar.core.link_events import PeerRenewed, PeerRestarted
 from sidecar.core.path_keys import MAX_FAILED
 from sidecar.core.path_table import MAX_INTRODUCTIONS
+from sidecar.core.seam.links import PeerRenewed, PeerRestarted
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAGRAM_BYTES, NONCE_OFFSET
 from sidecar.core.wire.introduction import UnauthenticError, open_introduction, read_hello_id

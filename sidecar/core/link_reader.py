@@ -10,14 +10,8 @@ from protos.model import Role
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.key_exchange import TooManyExchangesError
-from sidecar.core.link_events import (
-    FragmentsReceived,
-    MessageAbandoned,
-    MessageFinished,
-    MessageForgotten,
-    PeerClosed,
-)
 from sidecar.core.link_opener import LinkOpener
+from sidecar.core.seam.links import FragmentsReceived, MessageAbandoned, MessageFinished, MessageForgotten, PeerClosed
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import (
     FRAGMENT_HEAD,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import ServiceUse
 from sidecar.core.base.fair_share import Shares
-from sidecar.core.events import OfferService, WithdrawService
+from sidecar.core.seam.application import OfferService, WithdrawService
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from protos.model import NodeName, Peer, ServiceName
     from sidecar.core.routes import Routes
     from sidecar.core.rules import Rules
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
 
 MAX_TYPES = 2048
 """Services whose type in use is remembered, the one noted longest ago goes: peers invent names under a glob."""

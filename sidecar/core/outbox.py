@@ -7,10 +7,10 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.slices import in_groups
-from sidecar.core.link_events import FragmentsLost, Resend, Send, SendAbandon
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.message.repair import repair_symbols, worth_a_copy
 from sidecar.core.room import Room
+from sidecar.core.seam.links import FragmentsLost, Resend, Send, SendAbandon
 from sidecar.core.wire.frame import symbol_count
 
 if TYPE_CHECKING:
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName
     from sidecar.core.base.slices import Step
     from sidecar.core.base.values import PathId, Priority, RequestId
-    from sidecar.core.link_events import PathCommand
     from sidecar.core.message.repair import Redundancy
     from sidecar.core.routes import Routes
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.links import PathCommand
+    from sidecar.core.seam.stats import EngineStats
     from sidecar.core.wire.messages import Encoded
 
 LOOKED_AT_ONCE = 512

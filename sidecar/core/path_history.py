@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from collections import Counter
 
     from sidecar.core.base.values import PathId, PathState
-    from sidecar.core.link_events import PathChanged
+    from sidecar.core.seam.links import PathChanged
 
 MAX_REMEMBERED = 4096
 """Paths of one interface, those of peers that left included; then the one that changed longest ago goes."""

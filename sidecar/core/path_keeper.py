@@ -5,12 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import PathState
-from sidecar.core.link_events import (
-    FinishedLost,
-    FragmentsLost,
-    PathChanged,
-    PeerLied,
-)
+from sidecar.core.seam.links import FinishedLost, FragmentsLost, PathChanged, PeerLied
 from sidecar.core.wire.frame import KEY_ANSWER_TYPE, encode_key_answer
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
     from sidecar.core.routes import Routes
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
 
 MAX_PACES = 4096
 """Pairs remembered, each for one service; then the one that was used longest ago goes."""

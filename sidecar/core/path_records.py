@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
     from sidecar.core.copies import Copy, Request
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
 
 WINDOW = 128
 """Copies remembered for each pair: enough for a quantile of 0.99, see `quantile_s`."""

@@ -13,7 +13,7 @@ from sidecar.core.link_memory import LinkMemory
 from sidecar.core.path_keys import make_path_keys
 from sidecar.core.paths import Path
 from sidecar.core.pinging import Pings
-from sidecar.core.stats import LinkStats
+from sidecar.core.seam.stats import LinkStats
 from sidecar.core.wire.introduction import hello_id
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.datagrams import LinkIdentity
     from sidecar.core.key_exchange import KeyLimits
-    from sidecar.core.link_events import LinkEvent, LinkPeer
+    from sidecar.core.seam.links import LinkEvent, LinkPeer
 
 MAX_PENDING_FRAMES = 256
 """Control frames waiting on one path besides FINISHED; a peer that makes us owe more is not honest."""

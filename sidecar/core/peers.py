@@ -22,7 +22,7 @@ from protos.errors import DecodeError
 from protos.identity import CertificateError
 from protos.model import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
 from sidecar.core.announced import Announced
-from sidecar.core.link_events import LinkPeer
+from sidecar.core.seam.links import LinkPeer
 from sidecar.core.verification_budget import VerificationBudget
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from protos.model import Address, InterfaceId, NodeName, Peer, ServiceName, SessionId
     from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.link_events import PeerRenewed, PeerRestarted
+    from sidecar.core.seam.links import PeerRenewed, PeerRestarted
 
 RESTART_GAP_S = 1.0
 """A peer that restarts more often is not believed: every restart costs all links work. What it costs to look at the

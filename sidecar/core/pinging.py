@@ -20,8 +20,8 @@ from sidecar.core.wire.frame import HEADER_BYTES
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
-    from sidecar.core.link_events import Ping
     from sidecar.core.paths import Path
+    from sidecar.core.seam.links import Ping
 
 PINGS_PER_S = 20.0
 """Of one link, however many ask: some 30 kB a second of the longest that Ethernet carries, ..."""

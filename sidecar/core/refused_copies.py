@@ -15,7 +15,7 @@ from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.base.values import RejectReason, RequestId
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
 
 MAX_REFUSED_COPIES = 65_536
 """Copies remembered; one robot may fill half: 500 refused copies a second for a minute. What is not remembered may run

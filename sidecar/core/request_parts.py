@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName
     from sidecar.core.budget import Budget
-    from sidecar.core.events import ApplicationEvent
     from sidecar.core.mapping import MappingTable
     from sidecar.core.measurements import Measurements
     from sidecar.core.offers import Offers
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.application import ApplicationEvent
+    from sidecar.core.seam.stats import EngineStats
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,8 @@ from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.copies import Answer, Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.dispatching import MAX_COPIES, Dispatching
-from sidecar.core.events import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from sidecar.core.no_room import NoRoom
+from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from sidecar.core.wire.messages import MAX_NAME_BYTES, MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 
 if TYPE_CHECKING:

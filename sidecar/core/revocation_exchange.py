@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.stats import EngineStats
     from sidecar.core.wire.messages import Encoded, RevocationMessage
 
 ASK_AFTER_S = 0.5

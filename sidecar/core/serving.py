@@ -11,9 +11,9 @@ from sidecar.core.answers import Answers
 from sidecar.core.base.slices import in_groups
 from sidecar.core.base.values import RejectReason
 from sidecar.core.dedup import ExecutionTable, Reply, Waiter
-from sidecar.core.events import ExecuteRequest
 from sidecar.core.forbidden import ForbiddenCalls
 from sidecar.core.rules import MAX_LIFETIME_S, Rules
+from sidecar.core.seam.application import ExecuteRequest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName, ServiceOffer
     from sidecar.core.base.slices import Backlog, Step
     from sidecar.core.base.values import ExecutionId, PathId, RequestId
-    from sidecar.core.events import ApplicationEvent
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
-    from sidecar.core.stats import EngineStats
+    from sidecar.core.seam.application import ApplicationEvent
+    from sidecar.core.seam.stats import EngineStats
     from sidecar.core.wire.messages import CancelMessage, RequestMessage
 
 

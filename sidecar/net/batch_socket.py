@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import Address
-    from sidecar.core.stats import LinkStats
+    from sidecar.core.seam.stats import LinkStats
 
     _SockAddr = tuple[str, int] | tuple[str, int, int, int]
 

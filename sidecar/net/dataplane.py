@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from sidecar.core.base.values import PathState
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link_events import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
 from sidecar.core.pinging import Pong
+from sidecar.core.seam.links import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
 from sidecar.net.decoder import Decoder
 from sidecar.net.timerfd import Timer
 from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
@@ -45,11 +45,11 @@ if TYPE_CHECKING:
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
     from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.link_events import LinkEvent
     from sidecar.core.message.decoding import Decoding
     from sidecar.core.path_history import Change
     from sidecar.core.path_view import PathView
-    from sidecar.core.stats import EngineStats, LinkStats
+    from sidecar.core.seam.links import LinkEvent
+    from sidecar.core.seam.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.interface_thread import InterfaceThread
     from sidecar.ports import Application

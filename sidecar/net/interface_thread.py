@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Protocol
 
 from sidecar.core.base.values import PathState
 from sidecar.core.datagrams import Batch
-from sidecar.core.link_events import PathChanged, Rebind
 from sidecar.core.path_history import PathHistory
+from sidecar.core.seam.links import PathChanged, Rebind
 from sidecar.core.wire.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
 from sidecar.net.batch_socket import RECEIVE_CALLS, BatchSocket
 from sidecar.net.path_log import PathLog
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceName
     from sidecar.core.link import Link
-    from sidecar.core.link_events import LinkCommand, LinkEvent
     from sidecar.core.pinging import Pong
+    from sidecar.core.seam.links import LinkCommand, LinkEvent
     from sidecar.core.stun_client import StunClient
     from sidecar.core.stun_events import StunEvent
 

@@ -16,7 +16,7 @@ from pyroute2 import IPRoute, NetlinkError
 
 from protos.model import InterfaceName
 from sidecar.config_fields import is_glob
-from sidecar.core.link_events import Rebind
+from sidecar.core.seam.links import Rebind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

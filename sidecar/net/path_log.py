@@ -9,7 +9,7 @@ from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
-    from sidecar.core.link_events import PathChanged
+    from sidecar.core.seam.links import PathChanged
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from protos.model import Role
 from sidecar.core.base.values import RejectReason
-from sidecar.core.events import ExecuteRequest
+from sidecar.core.seam.application import ExecuteRequest
 from sidecar.ros.cloud_side import CloudSide
 from sidecar.ros.event_queue import EventQueue
 from sidecar.ros.graph import sidecar_node_name
@@ -26,8 +26,8 @@ from sidecar.ros.stats import BridgeStats
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sidecar.core.events import ApplicationEvent
     from sidecar.core.rules import ServiceRule
+    from sidecar.core.seam.application import ApplicationEvent
     from sidecar.ports import Application, DataPlane
 
 DRAIN_S = 0.005

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from protos.model import ServiceOffer
 from sidecar.core.base.fair_share import Shares
 from sidecar.core.base.values import RejectReason
-from sidecar.core.events import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
 from sidecar.core.rules import Rules
+from sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.node_names import NodeNames
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
     from sidecar.core.base.values import ExecutionId
-    from sidecar.core.events import ApplicationEvent
     from sidecar.core.rules import ServiceRule
+    from sidecar.core.seam.application import ApplicationEvent
     from sidecar.ports import DataPlane
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.ros_loop import RosLoop

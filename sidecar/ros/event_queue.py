@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from typing import TYPE_CHECKING
 
-from sidecar.core.events import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
+from sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
 
 if TYPE_CHECKING:
     from protos.model import NodeName
-    from sidecar.core.events import ApplicationEvent
+    from sidecar.core.seam.application import ApplicationEvent
 
 
 class EventQueue:

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
     from sidecar.core.base.values import RequestId
-    from sidecar.core.events import RequestFailed
     from sidecar.core.fallback import FallbackCall
     from sidecar.core.rules import ServiceRule
+    from sidecar.core.seam.application import RequestFailed
     from sidecar.ros.graph import NameOf, Served
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.ros_loop import RosLoop

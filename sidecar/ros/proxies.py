@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from protos.model import ServiceName
-    from sidecar.core.events import OfferService, WithdrawService
     from sidecar.core.rules import ServiceRule
+    from sidecar.core.seam.application import OfferService, WithdrawService
     from sidecar.ros.rcl import RmwRequestId
     from sidecar.ros.ros_loop import RosLoop
     from sidecar.ros.stats import BridgeStats

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.events import (
+from sidecar.core.seam.application import (
     DeadlineMissed,
     OfferService,
     RequestFailed,
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
     from sidecar.core.base.values import RequestId
-    from sidecar.core.events import ApplicationEvent
     from sidecar.core.rules import ServiceRule
+    from sidecar.core.seam.application import ApplicationEvent
     from sidecar.ports import DataPlane
     from sidecar.ros.fallback_caller import FallbackAnswer
     from sidecar.ros.log_limit import LimitedLog

@@ -38,10 +38,10 @@ from protos.model import (
 from sidecar.core.base.values import RequestId
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import EngineConfig
-from sidecar.core.events import ApplicationEvent, OfferService, RequestFailed, ResponseArrived
 from sidecar.core.link import Link
-from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import ApplicationEvent, OfferService, RequestFailed, ResponseArrived
+from sidecar.core.seam.links import SetReady
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import InterfaceThread
 from tests.sessions import session_of

@@ -26,7 +26,7 @@ from protos.identity import Identity, IdentityRole, RevocationList
 from protos.model import NodeName, Role
 from sidecar.config import SidecarConfig, load_config
 from sidecar.core.control_session import ControlStats
-from sidecar.core.stats import EngineStats
+from sidecar.core.seam.stats import EngineStats
 from sidecar.metrics import MetricSources, SidecarCollector
 from sidecar.revocations import RevocationState
 from tests.free_ports import free_port

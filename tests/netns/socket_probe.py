@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from protos.model import InterfaceName
 from sidecar.core.datagrams import Batch
-from sidecar.core.stats import LinkStats
+from sidecar.core.seam.stats import LinkStats
 from sidecar.net.batch_socket import BatchSocket
 from sidecar.net.interfaces import Interface, choose, list_interfaces
 from sidecar.net.sockets import DataSocket, normalise, open_socket, to_sockaddr

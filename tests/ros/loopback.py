@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import Assignment, InterfaceName, NodeName, ServiceName, SessionId
 from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.events import (
+from sidecar.core.seam.application import (
     AbandonExecution,
     DeadlineMissed,
     ExecuteRequest,

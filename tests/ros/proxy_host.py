@@ -8,8 +8,8 @@ import sys
 import threading
 
 from protos.model import Role, ServiceName
-from sidecar.core.events import OfferService
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import OfferService
 from sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Loopback
 from tests.ros.mesh import wait_until

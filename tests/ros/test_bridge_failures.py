@@ -13,7 +13,7 @@ import pytest
 
 from protos.model import ServiceName
 from sidecar.core.base.values import RejectReason
-from sidecar.core.events import AbandonExecution, CancelExecution
+from sidecar.core.seam.application import AbandonExecution, CancelExecution
 from sidecar.ros import graph
 from tests.ros.loopback import ROBOT
 from tests.ros.mesh import no_name, wait_until

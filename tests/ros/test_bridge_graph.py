@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from protos.model import Role, ServiceName
-from sidecar.core.events import OfferService
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import OfferService
 from sidecar.ros import graph
 from sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Loopback

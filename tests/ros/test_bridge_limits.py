@@ -8,8 +8,8 @@ import pytest
 
 from protos.model import NodeName, ServiceName, SessionId
 from sidecar.core.base.values import RejectReason
-from sidecar.core.events import OfferService
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import OfferService
 from sidecar.ros.rcl import RmwRequestId
 from sidecar.ros.request_numbering import RequestNumbering
 from tests.ros.mesh import wait_until

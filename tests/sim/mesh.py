@@ -31,12 +31,12 @@ from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import RequestId
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.events import ApplicationEvent, ExecuteRequest, ResponseArrived
 from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.link import Link
-from sidecar.core.link_events import SetReady
 from sidecar.core.pmtu import HEADERS_V4
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, ResponseArrived
+from sidecar.core.seam.links import SetReady
 from tests.sessions import session_of
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
-from sidecar.core.events import AbandonExecution, ApplicationEvent, CancelExecution, ExecuteRequest
+from sidecar.core.seam.application import AbandonExecution, ApplicationEvent, CancelExecution, ExecuteRequest
 from sidecar.ros.request_window import RequestWindow
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.identity import EXPIRED, CertificateError
-from sidecar.core.link_events import SetCredential
+from sidecar.core.seam.links import SetCredential
 from tests.sim.test_sealing import pair
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ import pytest
 from protos.model import InterfaceName, PeerSet, RemovalReason, RemovedPeer, ServiceName, ServiceOffer, Version
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.engine import Engine
-from sidecar.core.events import RequestFailed
-from sidecar.core.link_events import SetCarrier
+from sidecar.core.seam.application import RequestFailed
+from sidecar.core.seam.links import SetCarrier
 from tests.sim.mesh import TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:

@@ -7,14 +7,14 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.model import Role, ServiceName
-from sidecar.core.events import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from sidecar.core.fallback import Fallbacks
 from sidecar.core.fallback_rule import FallbackRule
+from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from tests.sim.mesh import SERVICE, Mesh, rule
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import RequestId
-    from sidecar.core.events import ApplicationEvent
+    from sidecar.core.seam.application import ApplicationEvent
     from tests.sim.mesh import Node
 
 DEADLINE_S = 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core import datagrams
-from sidecar.core.link_events import LinkCommand, SendFinished
+from sidecar.core.seam.links import LinkCommand, SendFinished
 from tests.sim.mesh import Mesh, rule
 
 pytestmark = pytest.mark.audit("dp-8")

@@ -8,9 +8,9 @@ from collections import Counter
 import pytest
 
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, Peer, PeerSet, ServiceMapping, Version
-from sidecar.core.events import DeadlineMissed, OfferService, RequestFailed, WithdrawService
 from sidecar.core.paths import DOWN_FLOOR_S
 from sidecar.core.probing import FIRST_PROBE_S
+from sidecar.core.seam.application import DeadlineMissed, OfferService, RequestFailed, WithdrawService
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 
 

@@ -13,7 +13,7 @@ from protos.model import PeerSet, Version
 from sidecar.core.crypto import aead
 from sidecar.core.key_exchange import KeyLimits
 from sidecar.core.link import Link
-from sidecar.core.link_events import ResetPaths, SetPeers, SetReady
+from sidecar.core.seam.links import ResetPaths, SetPeers, SetReady
 from sidecar.core.wire import introduction
 from tests.sim.mesh import Mesh, Node
 

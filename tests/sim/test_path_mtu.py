@@ -7,8 +7,8 @@ from functools import partial
 import pytest
 
 from protos.model import InterfaceName, NodeName
-from sidecar.core.link_events import SetMtu
 from sidecar.core.pmtu import RETRY_S
+from sidecar.core.seam.links import SetMtu
 from sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 from tests.sim.mesh import Mesh, Node, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped

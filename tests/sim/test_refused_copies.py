@@ -8,7 +8,7 @@ import pytest
 
 from sidecar.core.base.values import RejectReason
 from sidecar.core.dispatching import MAX_ASKED, MAX_COPIES
-from sidecar.core.events import ApplicationEvent, ExecuteRequest, RequestFailed
+from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed
 from tests.sim.mesh import Mesh, rule
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.events import RequestFailed
 from sidecar.core.room import Lane
+from sidecar.core.seam.application import RequestFailed
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 
 pytestmark = pytest.mark.audit("dp-7")

@@ -8,15 +8,15 @@ import pytest
 
 from protos.model import Role
 from sidecar.core.base.values import Priority
-from sidecar.core.events import ExecuteRequest
 from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.seam.application import ExecuteRequest
 from sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.mesh import Mesh, Node, Wire, rule
 from tests.sim.serial_server import SerialServer
 
 if TYPE_CHECKING:
-    from sidecar.core.events import ApplicationEvent
     from sidecar.core.message.repair import Redundancy
+    from sidecar.core.seam.application import ApplicationEvent
 
 MBIT = 1e6 / 8
 DEADLINE_S, LIFETIME_S = 0.5, 10.0

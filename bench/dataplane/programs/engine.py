@@ -41,7 +41,7 @@ from protos.pair_token import pair_token
 from sidecar.config import SidecarConfig
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine import EngineConfig
-from sidecar.core.events import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
+from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
 from sidecar.start_session import start_session
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from protos.credential import SessionCredential
-    from sidecar.core.events import ApplicationEvent
+    from sidecar.core.seam.application import ApplicationEvent
 
 SERVICE = ServiceName("/bench")
 TYPE = "bench/srv/Bytes"

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathId, PathState, Priority, RejectReason, RequestId
-from sidecar.core.events import ApplicationEvent, RequestFailed, ResponseArrived
-from sidecar.core.link_events import LinkCommand, Send
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
 from sidecar.core.offers import Offers
@@ -16,7 +14,9 @@ from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
 from sidecar.core.rules import Rules, ServiceRule
-from sidecar.core.stats import EngineStats
+from sidecar.core.seam.application import ApplicationEvent, RequestFailed, ResponseArrived
+from sidecar.core.seam.links import LinkCommand, Send
+from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 

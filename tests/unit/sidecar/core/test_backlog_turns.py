@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 from sidecar.core.base.slices import SLICE, Backlog
-from sidecar.core.events import RequestFailed
+from sidecar.core.seam.application import RequestFailed
 from tests.sim.mesh import Mesh, rule
 
 pytestmark = pytest.mark.audit("dp-10")

@@ -10,13 +10,13 @@ import pytest
 
 from protos.model import NodeName, SessionId
 from sidecar.core.inbound import Inbound
-from sidecar.core.link_events import SendFinished, SendForgotten
 from sidecar.core.message import decoding
 from sidecar.core.message.decoding import MAX_BYTES, Decoding, DecodingLine
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.message.partial import SLICE_OPERATIONS, Partial
 from sidecar.core.message.reassembly import Reassembler
-from sidecar.core.stats import EngineStats
+from sidecar.core.seam.links import SendFinished, SendForgotten
+from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire import fec
 from sidecar.core.wire.fec import MAX_BLOCK, decoding_cost
 from sidecar.core.wire.frame import Fragment, symbol_count
@@ -24,7 +24,7 @@ from sidecar.core.wire.messages import Encoded
 from tests.unit.sidecar.core.builders import WLAN, A, path
 
 if TYPE_CHECKING:
-    from sidecar.core.link_events import PathCommand
+    from sidecar.core.seam.links import PathCommand
 
 pytestmark = pytest.mark.audit("dp-10")
 

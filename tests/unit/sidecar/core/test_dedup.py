@@ -20,9 +20,9 @@ from sidecar.core.dedup import (
     Reply,
     Waiter,
 )
-from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.rules import MAX_LIFETIME_S
-from sidecar.core.stats import EngineStats
+from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
+from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
 from tests.unit.sidecar.core.builders import ECHO, path, request
 

@@ -24,7 +24,8 @@ from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathId, PathState, Priority, RejectReason
 from sidecar.core.budget import Budget
 from sidecar.core.engine import SWEEP_EVERY_S, Engine, EngineConfig
-from sidecar.core.events import (
+from sidecar.core.message.reassembly import OVER_REMEMBERED
+from sidecar.core.seam.application import (
     AbandonExecution,
     ApplicationEvent,
     CancelExecution,
@@ -33,7 +34,7 @@ from sidecar.core.events import (
     RequestFailed,
     ResponseArrived,
 )
-from sidecar.core.link_events import (
+from sidecar.core.seam.links import (
     FinishedLost,
     FragmentsReceived,
     LinkCommand,
@@ -45,7 +46,6 @@ from sidecar.core.link_events import (
     SendFinished,
     SetPeers,
 )
-from sidecar.core.message.reassembly import OVER_REMEMBERED
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, Fragment
 from sidecar.core.wire.messages import (
     CancelMessage,

@@ -10,10 +10,10 @@ import pytest
 
 from protos.model import ServiceName
 from sidecar.core import fallback, fallback_queue
-from sidecar.core.events import RequestFailed
 from sidecar.core.fallback import Accepted, Fallbacks
 from sidecar.core.fallback_rule import FallbackRule
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import RequestFailed
 from tests.unit.sidecar.core.builders import request_id
 
 if TYPE_CHECKING:

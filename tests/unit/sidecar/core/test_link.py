@@ -7,7 +7,10 @@ import pytest
 from protos.model import InterfaceId, InterfaceName, NodeName, Role, SessionId
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.link import Link
-from sidecar.core.link_events import (
+from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S
+from sidecar.core.probing import IDLE_PROBE_S, MAX_PROBE_S
+from sidecar.core.rtt import UNSTABLE_FLOOR_S
+from sidecar.core.seam.links import (
     CheckPaths,
     FragmentsLost,
     PathChanged,
@@ -22,9 +25,6 @@ from sidecar.core.link_events import (
     SetPeers,
     SetReady,
 )
-from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S
-from sidecar.core.probing import IDLE_PROBE_S, MAX_PROBE_S
-from sidecar.core.rtt import UNSTABLE_FLOOR_S
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import Probe, ProbeReply
 from sidecar.core.wire.introduction import Introduction

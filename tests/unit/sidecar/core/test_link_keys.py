@@ -13,9 +13,9 @@ from protos.model import InterfaceId, NodeName, Role, SessionId
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.key_exchange import DEFAULT_LIMITS, EXCHANGES_AT_ONCE
 from sidecar.core.link import Link
-from sidecar.core.link_events import LinkPeer, SetMtu, SetPeers, SetReady
 from sidecar.core.path_keys import make_path_keys
 from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.seam.links import LinkPeer, SetMtu, SetPeers, SetReady
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Probe, ProbeReply
 from sidecar.core.wire.introduction import encode_introduction

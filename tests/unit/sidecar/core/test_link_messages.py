@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.link_events import (
+from sidecar.core.message.outbound import OutboundMessage
+from sidecar.core.received import MAX_ACK_DELAY_S
+from sidecar.core.seam.links import (
     FinishedLost,
     FragmentsLost,
     FragmentsReceived,
@@ -13,8 +15,6 @@ from sidecar.core.link_events import (
     SendFinished,
     SetCarrier,
 )
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import AckFrame, Finished, Fragment
 from sidecar.core.wire.messages import Encoded

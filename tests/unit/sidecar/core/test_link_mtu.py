@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.link_events import FragmentsLost, PathMtuChanged, Send, SetMtu
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.pmtu import PROBE_TIMEOUT_S
+from sidecar.core.seam.links import FragmentsLost, PathMtuChanged, Send, SetMtu
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
 from tests.unit.sidecar.core.builders import PEER_ADDRESS, Bench, message, path

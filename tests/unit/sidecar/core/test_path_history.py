@@ -6,8 +6,8 @@ import pytest
 
 from protos.model import InterfaceId
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link_events import PathChanged
 from sidecar.core.path_history import MAX_REMEMBERED, Change, PathHistory
+from sidecar.core.seam.links import PathChanged
 from tests.unit.sidecar.core.builders import WLAN, A
 
 pytestmark = pytest.mark.audit("ops-14")

@@ -30,8 +30,8 @@ from protos.model import (
     Version,
 )
 from sidecar.core.crypto.session import OwnSession
-from sidecar.core.link_events import PeerRestarted
 from sidecar.core.peers import RESTART_GAP_S, Peers
+from sidecar.core.seam.links import PeerRestarted
 from tests.sessions import credential_of, private_key, session_of, with_credential
 from tests.unit.sidecar.core.builders import ECHO, A, B, peer
 

@@ -9,7 +9,7 @@ from sidecar.core import refused_copies
 from sidecar.core.base.values import RejectReason
 from sidecar.core.dedup import MIN_REMEMBER_S, Reply, Waiter
 from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
-from sidecar.core.stats import EngineStats
+from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import RejectionMessage
 from tests.unit.sidecar.core.builders import request, request_id
 from tests.unit.sidecar.core.test_dedup import ROBOT, ROBOT_2ND, run, table

@@ -6,9 +6,9 @@ import pytest
 
 from protos.model import PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
 from sidecar.core.base.values import ExecutionId, PathState
-from sidecar.core.events import CancelExecution, ResponseArrived, WithdrawService
-from sidecar.core.link_events import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
 from sidecar.core.offers import WITHDRAW_AFTER_S
+from sidecar.core.seam.application import CancelExecution, ResponseArrived, WithdrawService
+from sidecar.core.seam.links import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
 from sidecar.core.wire.messages import ResponseMessage
 from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import ECHO, A, peer, request, request_id

@@ -12,7 +12,7 @@ import pytest
 
 from protos.model import InterfaceName
 from sidecar.core.datagrams import Batch
-from sidecar.core.stats import LinkStats
+from sidecar.core.seam.stats import LinkStats
 from sidecar.net.batch_socket import ARENA_BYTES, RECEIVE_CALLS, ROOM_BYTES, BatchSocket
 
 if TYPE_CHECKING:

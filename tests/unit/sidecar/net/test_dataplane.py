@@ -38,10 +38,10 @@ from protos.pair_token import pair_token
 from sidecar.core.base.values import PathState, RequestId
 from sidecar.core.datagrams import Batch, LinkIdentity
 from sidecar.core.engine import EngineConfig
-from sidecar.core.events import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
 from sidecar.core.link import Link
-from sidecar.core.link_events import SetReady
 from sidecar.core.rules import ServiceRule
+from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
+from sidecar.core.seam.links import SetReady
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
 from tests.sessions import session_of

@@ -11,11 +11,11 @@ import pytest
 from protos.model import InterfaceName, PeerSet, Role, ServiceOffer, SessionId, Version
 from sidecar.core.base.values import Priority
 from sidecar.core.engine import EngineConfig
-from sidecar.core.events import ExecuteRequest
-from sidecar.core.link_events import FragmentsReceived
 from sidecar.core.message.decoding import Decoding
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.message.partial import Partial
+from sidecar.core.seam.application import ExecuteRequest
+from sidecar.core.seam.links import FragmentsReceived
 from sidecar.core.wire.frame import Fragment
 from sidecar.core.wire.messages import RequestMessage, encode_message
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
@@ -24,7 +24,7 @@ from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import ECHO, TYPE, path, peer, request_id, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.events import ApplicationEvent
+    from sidecar.core.seam.application import ApplicationEvent
 
 PATIENCE_S = 20.0
 """For a loaded machine; nothing here takes long."""

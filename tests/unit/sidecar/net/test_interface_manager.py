@@ -9,8 +9,8 @@ import pytest
 
 from protos.model import InterfaceName, Role
 from sidecar.config import SidecarConfig, StunConfig
-from sidecar.core.link_events import SetCarrier
 from sidecar.core.scan_schedule import RETRY_S
+from sidecar.core.seam.links import SetCarrier
 from sidecar.net import interface_manager as module
 from sidecar.net.interface_manager import InterfaceManager
 from sidecar.net.interfaces import Interface

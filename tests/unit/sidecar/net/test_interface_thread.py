@@ -15,8 +15,8 @@ from tests.sessions import credential_of
 if TYPE_CHECKING:
     import pytest
 
-    from sidecar.core.link_events import LinkEvent
     from sidecar.core.pinging import Pong
+    from sidecar.core.seam.links import LinkEvent
     from sidecar.core.stun_events import StunEvent
 
 PATIENCE_S = 20.0

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from protos.model import InterfaceName
-from sidecar.core.link_events import Rebind
+from sidecar.core.seam.links import Rebind
 from sidecar.net.interfaces import LOOPBACK, Interface, SkippedInterface, choose, list_interfaces, missing_interfaces
 
 WLAN = Interface(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import InterfaceId, InterfaceName, NodeName
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link_events import PathChanged
+from sidecar.core.seam.links import PathChanged
 from sidecar.net.path_log import PathLog
 
 if TYPE_CHECKING:

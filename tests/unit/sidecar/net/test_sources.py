@@ -10,7 +10,7 @@ from protos.model import InterfaceId, InterfaceName, NodeName, Role
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.link import Link
-from sidecar.core.link_events import PathChanged
+from sidecar.core.seam.links import PathChanged
 from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.sources import Sources
 from tests.sessions import credential_of

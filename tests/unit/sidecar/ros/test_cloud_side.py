@@ -11,7 +11,7 @@ import pytest
 from protos.model import NodeName
 from sidecar.core.base.fair_share import Shares
 from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.events import AbandonExecution
+from sidecar.core.seam.application import AbandonExecution
 from sidecar.ros.cloud_side import MAX_EXECUTIONS, SILENCE_S, TRUSTED_S, CloudSide
 from sidecar.ros.request_window import RequestWindow
 from sidecar.ros.service_runner import ServiceRunner

@@ -6,11 +6,11 @@ import pytest
 
 from protos.model import NodeName, ServiceName
 from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.events import AbandonExecution, CancelExecution, ExecuteRequest, WithdrawService
+from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest, WithdrawService
 from sidecar.ros.event_queue import EventQueue
 
 if TYPE_CHECKING:
-    from sidecar.core.events import ApplicationEvent
+    from sidecar.core.seam.application import ApplicationEvent
 
 GREEDY, HONEST = NodeName("greedy"), NodeName("honest")
 GONE = WithdrawService(ServiceName("/plan"), "its server is gone")
