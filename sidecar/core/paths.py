@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.congestion import CongestionController
+from sidecar.core.path.congestion.controller import CongestionController
+from sidecar.core.path.congestion.rtt import RttEstimator
 from sidecar.core.path_address import PathAddress
 from sidecar.core.pmtu import PathMtu
 from sidecar.core.probing import Probing
 from sidecar.core.recovery import Recovery
-from sidecar.core.rtt import RttEstimator
 from sidecar.core.seam.links import PathMeasured
 from sidecar.core.send_queue import SendQueue
 from sidecar.core.wire.frame import Finished, encode_ack, encode_finished

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from protos.token_bucket import TokenBucket
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
+from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 from sidecar.core.probing import SentPing
-from sidecar.core.rtt import LONGEST_ANSWER_S
 from sidecar.core.wire.frame import HEADER_BYTES
 
 if TYPE_CHECKING:

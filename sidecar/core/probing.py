@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.rtt import LONGEST_ANSWER_S
+from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 
 if TYPE_CHECKING:
     import random

@@ -8,10 +8,10 @@ from collections import deque
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from sidecar.core.congestion import RateSample
+from sidecar.core.path.congestion.controller import RateSample
+from sidecar.core.path.congestion.rtt import RttEstimator
 from sidecar.core.received import MAX_ACK_DELAY_S
 from sidecar.core.reordering import Reordering
-from sidecar.core.rtt import RttEstimator
 from sidecar.core.sent import Sent
 
 if TYPE_CHECKING:

@@ -16,12 +16,12 @@ from enum import Enum, auto
 from itertools import takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.rtt import LONGEST_ANSWER_S
+from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from sidecar.core.rtt import RttEstimator
+    from sidecar.core.path.congestion.rtt import RttEstimator
     from sidecar.core.sent import Sent
 
 PACKET_THRESHOLD = 3

@@ -12,7 +12,7 @@ from tests.sim.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import ExecutionId, RequestId
-    from sidecar.core.congestion import CongestionController
+    from sidecar.core.path.congestion.controller import CongestionController
 
 MBIT = 1e6 / 8
 HZ = 10

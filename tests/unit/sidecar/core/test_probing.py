@@ -5,6 +5,7 @@ import random
 
 import pytest
 
+from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 from sidecar.core.probing import (
     FIRST_PROBE_S,
     FREE_ADDRESSES,
@@ -17,7 +18,6 @@ from sidecar.core.probing import (
     WATCH_FACTOR,
     Probing,
 )
-from sidecar.core.rtt import LONGEST_ANSWER_S
 
 RNG = random.Random(1)
 THERE = ("192.0.2.2", 2)

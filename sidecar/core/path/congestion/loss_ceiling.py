@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.standing_queue import FloorChange, StandingQueue
-from sidecar.core.units import DATAGRAM_BYTES
+from sidecar.core.path.congestion.standing_queue import FloorChange, StandingQueue
+from sidecar.core.path.congestion.units import DATAGRAM_BYTES
 
 if TYPE_CHECKING:
-    from sidecar.core.rtt import RttEstimator
+    from sidecar.core.path.congestion.rtt import RttEstimator
 
 CUT = 0.7
 """What a cut leaves (CUBIC's beta, RFC 9438 section 4.6)."""

@@ -16,7 +16,7 @@ import enum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sidecar.core.rtt import RttEstimator
+    from sidecar.core.path.congestion.rtt import RttEstimator
 
 LENGTH_FACTOR = 0.2
 """A round trip that is longer than the floor by this share, and by more than it varies, shows a queue."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from sidecar.core.units import DATAGRAM_BYTES
+from sidecar.core.path.congestion.units import DATAGRAM_BYTES
 
 SUSPECT_LOSS = 0.1
 """Losing this share is worth a trial. Nobody who knows of no policer loses much less to it; radios mostly do."""

@@ -10,14 +10,14 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.bandwidth_search import BandwidthSearch, is_faster
-from sidecar.core.delivery_rate import DeliveryRate
-from sidecar.core.loss_ceiling import LossCeiling
-from sidecar.core.policer import Policer
-from sidecar.core.units import DATAGRAM_BYTES, END_HOST_S
+from sidecar.core.path.congestion.bandwidth_search import BandwidthSearch, is_faster
+from sidecar.core.path.congestion.delivery_rate import DeliveryRate
+from sidecar.core.path.congestion.loss_ceiling import LossCeiling
+from sidecar.core.path.congestion.policer import Policer
+from sidecar.core.path.congestion.units import DATAGRAM_BYTES, END_HOST_S
 
 if TYPE_CHECKING:
-    from sidecar.core.rtt import RttEstimator
+    from sidecar.core.path.congestion.rtt import RttEstimator
 
 INITIAL_WINDOW_BYTES = 32 * 1024
 """May leave at once on a path of which nothing is known: within what browsers do (RFC 6928 says 14 kB for TCP), and
