@@ -17,7 +17,7 @@ from sidecar.core.wire.frame import HEADER_BYTES, PHASE_FLAG, Header, encode_hea
 if TYPE_CHECKING:
     import random
 
-    from sidecar.core.path_keys import PathKeys, SealingKeys
+    from sidecar.core.path.keys import PathKeys, SealingKeys
 
 
 @lru_cache(maxsize=65536)

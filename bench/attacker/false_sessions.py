@@ -15,8 +15,8 @@ from protos.pair_token import pair_token
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import pair_keys
 from sidecar.core.crypto.session import public_key
-from sidecar.core.key_exchange import DEFAULT_LIMITS
-from sidecar.core.path_keys import make_path_keys
+from sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from sidecar.core.path.keys import make_path_keys
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import HEADER_BYTES, NONCE_OFFSET, Header
 from sidecar.core.wire.introduction import encode_introduction
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from protos.credential import SessionCredential
     from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.datagrams import LinkIdentity
-    from sidecar.core.path_keys import SealingKeys
-    from sidecar.core.paths import Path
+    from sidecar.core.path.keys import SealingKeys
+    from sidecar.core.path.path import Path
     from sidecar.core.seam.links import LinkPeer
 
 PHANTOMS = range(200, 231)

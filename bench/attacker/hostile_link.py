@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from bench.attacker.hostile_means import Means
-    from sidecar.core.paths import Path
+    from sidecar.core.path.path import Path
     from sidecar.core.seam.links import LinkPeer
 
 SYMBOL = 1024

@@ -10,7 +10,7 @@ from protos.pair_token import pair_token
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.path_address import LEAST_CREDIT_BYTES
+from sidecar.core.path.address import LEAST_CREDIT_BYTES
 from sidecar.core.path_table import MAX_PENDING_FRAMES
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import (
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from protos.credential import SessionCredential
     from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
     from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.paths import Path
+    from sidecar.core.path.path import Path
+    from sidecar.core.path.send_queue import Run
     from sidecar.core.seam.stats import LinkStats
-    from sidecar.core.send_queue import Run
 
 BURST_DATAGRAMS = 64
 """Datagrams built in one go before the driver looks at the socket again (about 70 kB, some milliseconds)."""

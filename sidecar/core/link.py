@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 from sidecar.core.base.timers import NEVER, Timers
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
-from sidecar.core.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.link_memory import LinkMemory
 from sidecar.core.link_mtu import LinkMtu
 from sidecar.core.link_reader import LinkReader
+from sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
+from sidecar.core.path.view import view_of
 from sidecar.core.path_keeper import PathKeeper
 from sidecar.core.path_table import PathTable
-from sidecar.core.path_view import view_of
 from sidecar.core.seam.links import (
     Attend,
     CheckPaths,
@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     from protos.model import Address, NodeName
     from sidecar.core.datagrams import LinkIdentity
     from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.path_view import PathView
-    from sidecar.core.paths import Path
+    from sidecar.core.path.path import Path
+    from sidecar.core.path.view import PathView
     from sidecar.core.pinging import Pong
     from sidecar.core.seam.links import LinkPeer
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from protos.model import InterfaceId, NodeName, SessionId
-    from sidecar.core.path_keys import PathKeys
+    from sidecar.core.path.keys import PathKeys
 
 MAX_PATHS_OF_A_PEER = 256
 """As many as one session can have to one of our interfaces: an interface's number has 8 bits. So a share never forgets

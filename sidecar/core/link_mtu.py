@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import PathState
-from sidecar.core.pmtu import payloads
+from sidecar.core.path.pmtu import payloads
 from sidecar.core.seam.links import FragmentsLost, PathMtuChanged
 from sidecar.core.wire.frame import BASE_BYTES
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import Address
-    from sidecar.core.paths import Path
+    from sidecar.core.path.in_flight import Sent
+    from sidecar.core.path.path import Path
     from sidecar.core.seam.links import LinkEvent
-    from sidecar.core.sent import Sent
 
 DEFAULT_MTU = 1500
 """Ethernet's, in bytes; until the interface's own is known."""

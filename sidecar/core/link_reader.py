@@ -9,8 +9,8 @@ from protos.errors import DecodeError
 from protos.model import Role
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.key_exchange import TooManyExchangesError
 from sidecar.core.link_opener import LinkOpener
+from sidecar.core.path.key_exchange import TooManyExchangesError
 from sidecar.core.seam.links import FragmentsReceived, MessageAbandoned, MessageFinished, MessageForgotten, PeerClosed
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import (
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from protos.model import Address
     from sidecar.core.link_mtu import LinkMtu
     from sidecar.core.link_opener import Opened
+    from sidecar.core.path.path import Path
     from sidecar.core.path_keeper import PathKeeper
     from sidecar.core.path_table import PathTable
-    from sidecar.core.paths import Path
 
 
 T = TypeVar("T")

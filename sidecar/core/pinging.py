@@ -15,12 +15,12 @@ from protos.token_bucket import TokenBucket
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
-from sidecar.core.probing import SentPing
+from sidecar.core.path.probing import SentPing
 from sidecar.core.wire.frame import HEADER_BYTES
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
-    from sidecar.core.paths import Path
+    from sidecar.core.path.path import Path
     from sidecar.core.seam.links import Ping
 
 PINGS_PER_S = 20.0

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from typing import TYPE_CHECKING, Any
 
-from sidecar.core.pmtu import HEADERS_V4, HEADERS_V6, LEAST_MTU
+from sidecar.core.path.pmtu import HEADERS_V4, HEADERS_V6, LEAST_MTU
 from sidecar.core.wire.frame import BASE_BYTES
 from sidecar.doctor.finding import duration, fail, milliseconds, ok, share, warn
 

@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
     from sidecar.core.crypto.session import OwnSession
     from sidecar.core.message.decoding import Decoding
-    from sidecar.core.path_history import Change
-    from sidecar.core.path_view import PathView
+    from sidecar.core.path.history import Change
+    from sidecar.core.path.view import PathView
     from sidecar.core.seam.links import LinkEvent
     from sidecar.core.seam.stats import EngineStats, LinkStats
     from sidecar.core.stun_events import StunEvent

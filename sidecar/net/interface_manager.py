@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import Candidate, InterfaceId, InterfaceName
 from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.key_exchange import KeyLimits
+from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.readiness import Readiness
 from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.stun_events import Failed, Mapped, MappingChanged

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from sidecar.core.base.values import PathState
 from sidecar.core.datagrams import Batch
-from sidecar.core.path_history import PathHistory
+from sidecar.core.path.history import PathHistory
 from sidecar.core.seam.links import PathChanged, Rebind
 from sidecar.core.wire.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
 from sidecar.net.batch_socket import RECEIVE_CALLS, BatchSocket

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import InterfaceId, InterfaceName, NodeName, PeerSet, Role, SessionId, Version
-from sidecar.core.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.link_memory import MAX_PATHS_OF_A_PEER
-from sidecar.core.path_keys import make_path_keys
+from sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
+from sidecar.core.path.keys import make_path_keys
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import Header
 from sidecar.core.wire.introduction import encode_introduction

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from protos.model import InterfaceName
-    from sidecar.core.paths import Path
+    from sidecar.core.path.path import Path
 
 
 def fragment(number: int, total: int, symbol: int, index: int) -> bytes:

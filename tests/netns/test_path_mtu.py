@@ -9,7 +9,7 @@ import pytest
 
 from bench.dataplane.ours import Ours
 from bench.netlab import HostSpec, InterfaceSpec, Lab, LabConfig, server
-from sidecar.core.pmtu import COMMON_MTUS, HEADERS_V4, HEADERS_V6
+from sidecar.core.path.pmtu import COMMON_MTUS, HEADERS_V4, HEADERS_V6
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -31,9 +31,9 @@ from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import RequestId
 from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.link import Link
-from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.rules import ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, ResponseArrived
 from sidecar.core.seam.links import SetReady

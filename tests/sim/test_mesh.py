@@ -8,8 +8,8 @@ from collections import Counter
 import pytest
 
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, Peer, PeerSet, ServiceMapping, Version
-from sidecar.core.paths import DOWN_FLOOR_S
-from sidecar.core.probing import FIRST_PROBE_S
+from sidecar.core.path.path import DOWN_FLOOR_S
+from sidecar.core.path.probing import FIRST_PROBE_S
 from sidecar.core.seam.application import DeadlineMissed, OfferService, RequestFailed, WithdrawService
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sidecar.core.message.reassembly import MAX_AGE_S
-from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.mesh import Mesh, Node, rule
 from tests.sim.test_mesh import mapped, two_by_two

@@ -6,7 +6,7 @@ import pytest
 
 from protos.model import NodeName
 from sidecar.core.base.values import PathState
-from sidecar.core.probing import FIRST_PROBE_S
+from sidecar.core.path.probing import FIRST_PROBE_S
 from tests.sim.mesh import Mesh, rule
 from tests.sim.test_mesh import mapped
 

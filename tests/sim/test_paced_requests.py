@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from sidecar.core.turn import Turn
+from sidecar.core.path.turn import Turn
 from tests.sim.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:

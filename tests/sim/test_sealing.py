@@ -11,7 +11,7 @@ import pytest
 from protos.credential import Aead
 from protos.errors import DecodeError
 from protos.model import InterfaceId, PeerSet, Version
-from sidecar.core.key_exchange import KeyLimits
+from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.wire import frame
 from sidecar.core.wire.introduction import encode_introduction
 from tests.sessions import credential_of

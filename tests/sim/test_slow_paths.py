@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sidecar.core.base.values import PathState
-from sidecar.core.probing import MAX_PROBE_S
+from sidecar.core.path.probing import MAX_PROBE_S
 from tests.sim.mesh import Mesh, Node, Wire, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once
 
 if TYPE_CHECKING:
-    from sidecar.core.paths import Path
+    from sidecar.core.path.path import Path
 
 pytestmark = pytest.mark.audit("dp-2")
 

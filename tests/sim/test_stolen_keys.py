@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import KEY_BYTES, TAG_BYTES, make_cipher
-from sidecar.core.key_exchange import KeyLimits
+from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, decode_header
 from tests.sessions import private_key
 from tests.sim.mesh import Mesh, Node

@@ -13,7 +13,7 @@ import pytest
 from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, Role
 from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import PathState, Priority
-from sidecar.core.path_address import AMPLIFICATION
+from sidecar.core.path.address import AMPLIFICATION
 from sidecar.core.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
 from sidecar.core.wire import frame
 from sidecar.core.wire.messages import RequestMessage, encode_message
@@ -21,7 +21,7 @@ from tests.sim.mesh import SERVICE, TYPE, Mesh, rule
 
 if TYPE_CHECKING:
     from protos.model import Address, Peer
-    from sidecar.core.paths import Path
+    from sidecar.core.path.path import Path
     from tests.sim.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-5")

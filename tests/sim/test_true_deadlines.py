@@ -8,7 +8,7 @@ import pytest
 
 from protos.model import Role
 from sidecar.core.base.values import Priority
-from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.seam.application import ExecuteRequest
 from sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.mesh import Mesh, Node, Wire, rule

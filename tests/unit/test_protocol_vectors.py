@@ -38,14 +38,15 @@ from protos.model import (
     ServiceName,
 )
 from protos.pair_token import pair_token
-from sidecar.core import key_exchange, outbox, path_address, path_table
+from sidecar.core import outbox, path_table
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.crypto import session
 from sidecar.core.crypto.key_schedule import pair_keys
-from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.message import reassembly
-from sidecar.core.path_keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
+from sidecar.core.path import address, key_exchange
+from sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from sidecar.core.path.keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
 from sidecar.core.peers import RESTART_GAP_S
 from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
 from sidecar.core.wire import fec, frame, introduction, messages
@@ -453,7 +454,7 @@ def test_the_numbers_on_the_page_are_those_of_the_code() -> None:
         f"seals 2^{key_exchange.MAX_SEALED.bit_length() - 1} datagrams",
         f"after 2^{MAX_FAILED.bit_length() - 1} the path",
         f"{key_exchange.EXCHANGES_AT_ONCE:.0f} exchanges at once and {key_exchange.EXCHANGES_PER_S:.0f} a second",
-        f"most {path_address.AMPLIFICATION} times",
+        f"most {address.AMPLIFICATION} times",
         f"first datagram that opens, {LATE_S:.0f} s after the change",
         f"late, {key_exchange.WAITS_S:.0f} s at most",
         f"at most {LOOKS_PER_S:.0f} a second are judged",

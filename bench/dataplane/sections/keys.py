@@ -17,7 +17,7 @@ from bench.dataplane.section import Findings, Section, table_of
 from bench.dataplane.statistics import MS, Row, goodput_of_stretches, interval, median, median_ratio, p99_ratio
 from protos.credential import Aead
 from sidecar.core.crypto.key_schedule import PairKeys
-from sidecar.core.key_exchange import RENEW_AFTER_S, KeyExchange, KeyLimits
+from sidecar.core.path.key_exchange import RENEW_AFTER_S, KeyExchange, KeyLimits
 
 if TYPE_CHECKING:
     from bench.dataplane.section import Context

@@ -24,12 +24,12 @@ from protos.pair_token import pair_token
 from sidecar.core.base.values import PathId, Priority, RequestId
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.link import Link
 from sidecar.core.link_memory import LinkMemory
 from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.path_keys import PathKeys, make_path_keys
-from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from sidecar.core.path.keys import PathKeys, make_path_keys
+from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.rules import ServiceRule
 from sidecar.core.seam.links import LinkCommand, LinkEvent, LinkPeer, SetMtu, SetPeers, SetReady
 from sidecar.core.wire.frame import (

@@ -11,10 +11,10 @@ import pytest
 from protos.errors import DecodeError
 from protos.model import InterfaceId, NodeName, Role, SessionId
 from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.key_exchange import DEFAULT_LIMITS, EXCHANGES_AT_ONCE
 from sidecar.core.link import Link
-from sidecar.core.path_keys import make_path_keys
-from sidecar.core.pmtu import HEADERS_V4
+from sidecar.core.path.key_exchange import DEFAULT_LIMITS, EXCHANGES_AT_ONCE
+from sidecar.core.path.keys import make_path_keys
+from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.seam.links import LinkPeer, SetMtu, SetPeers, SetReady
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Probe, ProbeReply
@@ -24,7 +24,7 @@ from tests.unit.sidecar.core.builders import OUR_ID, OUR_TOKEN, PEER_ADDRESS, WL
 from tests.unit.sidecar.core.test_link import PROBE, fragment, up
 
 if TYPE_CHECKING:
-    from sidecar.core.path_keys import PathKeys
+    from sidecar.core.path.keys import PathKeys
 
 RNG = random.Random(3)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.received import MAX_ACK_DELAY_S
+from sidecar.core.path.received import MAX_ACK_DELAY_S
 from sidecar.core.seam.links import (
     FinishedLost,
     FragmentsLost,

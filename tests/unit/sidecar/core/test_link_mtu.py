@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.pmtu import PROBE_TIMEOUT_S
+from sidecar.core.path.pmtu import PROBE_TIMEOUT_S
 from sidecar.core.seam.links import FragmentsLost, PathMtuChanged, Send, SetMtu
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from protos.model import InterfaceId
-from sidecar.core.probing import FIRST_PROBE_S
+from sidecar.core.path.probing import FIRST_PROBE_S
 from sidecar.core.seam.links import Send
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import ProbeReply

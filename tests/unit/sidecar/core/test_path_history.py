@@ -6,7 +6,7 @@ import pytest
 
 from protos.model import InterfaceId
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.path_history import MAX_REMEMBERED, Change, PathHistory
+from sidecar.core.path.history import MAX_REMEMBERED, Change, PathHistory
 from sidecar.core.seam.links import PathChanged
 from tests.unit.sidecar.core.builders import WLAN, A
 

@@ -11,8 +11,8 @@ from protos.errors import DecodeError
 from protos.model import InterfaceId, Role
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import proof_of_offer
-from sidecar.core.key_exchange import OTHER_OFFER_AFTER_S, KeyLimits
-from sidecar.core.path_keys import LATE_S, OpeningKeys, PathKeys, make_path_keys
+from sidecar.core.path.key_exchange import OTHER_OFFER_AFTER_S, KeyLimits
+from sidecar.core.path.keys import LATE_S, OpeningKeys, PathKeys, make_path_keys
 from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, NONCE_OFFSET, PHASE_FLAG, KeyAnswer, KeyOffer
 from tests.sessions import agree, session_of, with_credential
 from tests.unit.sidecar.core.builders import peer

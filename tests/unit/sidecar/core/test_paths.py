@@ -7,15 +7,11 @@ import pytest
 from protos.model import Address, InterfaceId, Role, SessionId
 from protos.token_bucket import TokenBucket
 from sidecar.core.base.values import PathState
-from sidecar.core.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
-from sidecar.core.path_keys import make_path_keys
-from sidecar.core.paths import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
-from sidecar.core.probing import (
-    FIRST_PROBE_S,
-    IDLE_PROBE_S,
-    MAX_PROBE_S,
-)
+from sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from sidecar.core.path.keys import make_path_keys
+from sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
+from sidecar.core.path.probing import FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
 from tests.sessions import agree, session_of, with_credential
 from tests.unit.sidecar.core.builders import path, peer
 

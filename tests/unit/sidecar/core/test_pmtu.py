@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from sidecar.core.pmtu import (
+from sidecar.core.path.pmtu import (
     COMMON_MTUS,
     MAX_PROBES,
     PROBE_TIMEOUT_S,

@@ -6,7 +6,7 @@ import random
 import pytest
 
 from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
-from sidecar.core.probing import (
+from sidecar.core.path.probing import (
     FIRST_PROBE_S,
     FREE_ADDRESSES,
     IDLE_PROBE_S,

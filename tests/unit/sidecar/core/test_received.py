@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sidecar.core.received import ACK_EVERY, MAX_ACK_DELAY_S, STALE_PACKETS, ReceivedPackets
+from sidecar.core.path.received import ACK_EVERY, MAX_ACK_DELAY_S, STALE_PACKETS, ReceivedPackets
 from sidecar.core.wire.frame import MAX_ACK_RANGES
 
 

@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.received import MAX_ACK_DELAY_S, ReceivedPackets
-from sidecar.core.recovery import PTO_DATAGRAMS, Recovery
-from sidecar.core.reordering import PACKET_THRESHOLD
+from sidecar.core.path.received import MAX_ACK_DELAY_S, ReceivedPackets
+from sidecar.core.path.recovery import PTO_DATAGRAMS, Recovery
+from sidecar.core.path.reordering import PACKET_THRESHOLD
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import AckFrame
 from tests.unit.sidecar.core.builders import message
 
 if TYPE_CHECKING:
-    from sidecar.core.sent import Sent
+    from sidecar.core.path.in_flight import Sent
 
 
 def ack(*ranges: tuple[int, int], delay_s: float = 0.0) -> AckFrame:

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S, RttEstimator
-from sidecar.core.reordering import MAX_REMEMBERED, PACKET_THRESHOLD, PERSISTS, Reordering
-from sidecar.core.sent import Sent
+from sidecar.core.path.in_flight import Sent
+from sidecar.core.path.reordering import MAX_REMEMBERED, PACKET_THRESHOLD, PERSISTS, Reordering
 from sidecar.core.wire.frame import MAX_ACK_RANGES
 from tests.unit.sidecar.core.builders import message
 

@@ -6,7 +6,7 @@ import pytest
 
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import SHARE, Priority
-from sidecar.core.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SendQueue
+from sidecar.core.path.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SendQueue
 from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 from tests.unit.sidecar.core.builders import message, path
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sidecar.core.base.timers import NEVER
-from sidecar.core.turn import PATIENCE, SMALL, Turn
+from sidecar.core.path.turn import PATIENCE, SMALL, Turn
 from tests.unit.sidecar.core.builders import message, path
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.core.pmtu import LEAST_MTU
+from sidecar.core.path.pmtu import LEAST_MTU
 from sidecar.doctor import running_checks
 from sidecar.doctor.finding import Finding, Level
 from sidecar.doctor.running_checks import Pinged

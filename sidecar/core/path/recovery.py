@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.path.congestion.controller import RateSample
 from sidecar.core.path.congestion.rtt import RttEstimator
-from sidecar.core.received import MAX_ACK_DELAY_S
-from sidecar.core.reordering import Reordering
-from sidecar.core.sent import Sent
+from sidecar.core.path.in_flight import Sent
+from sidecar.core.path.received import MAX_ACK_DELAY_S
+from sidecar.core.path.reordering import Reordering
 
 if TYPE_CHECKING:
     import random

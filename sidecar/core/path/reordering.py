@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from sidecar.core.path.congestion.rtt import RttEstimator
-    from sidecar.core.sent import Sent
+    from sidecar.core.path.in_flight import Sent
 
 PACKET_THRESHOLD = 3
 """A datagram is lost when one sent this many later is acknowledged (RFC 9002 section 6.1.1)."""

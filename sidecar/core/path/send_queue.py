@@ -17,7 +17,7 @@ from itertools import count
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from sidecar.core.base.values import SHARE, Priority
-from sidecar.core.turn import Turn
+from sidecar.core.path.turn import Turn
 from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 
 if TYPE_CHECKING:

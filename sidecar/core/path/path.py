@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathId, PathState
+from sidecar.core.path.address import PathAddress
 from sidecar.core.path.congestion.controller import CongestionController
 from sidecar.core.path.congestion.rtt import RttEstimator
-from sidecar.core.path_address import PathAddress
-from sidecar.core.pmtu import PathMtu
-from sidecar.core.probing import Probing
-from sidecar.core.recovery import Recovery
+from sidecar.core.path.pmtu import PathMtu
+from sidecar.core.path.probing import Probing
+from sidecar.core.path.recovery import Recovery
+from sidecar.core.path.send_queue import SendQueue
 from sidecar.core.seam.links import PathMeasured
-from sidecar.core.send_queue import SendQueue
 from sidecar.core.wire.frame import Finished, encode_ack, encode_finished
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
     from protos.token_bucket import TokenBucket
-    from sidecar.core.path_keys import PathKeys
-    from sidecar.core.probing import SentPing
+    from sidecar.core.path.keys import PathKeys
+    from sidecar.core.path.probing import SentPing
     from sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 DOWN_FACTOR = 4.0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from protos.model import Address
     from sidecar.core.base.values import PathId, PathState
-    from sidecar.core.paths import Path
+    from sidecar.core.path.path import Path
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 from cryptography.exceptions import InvalidTag
 
 from sidecar.core.crypto import aead as ciphers
-from sidecar.core.key_exchange import KeyExchange
-from sidecar.core.received import ReceivedPackets
+from sidecar.core.path.key_exchange import KeyExchange
+from sidecar.core.path.received import ReceivedPackets
 from sidecar.core.wire.frame import PHASE_FLAG, clear_head
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from protos.token_bucket import TokenBucket
     from sidecar.core.crypto.aead import Cipher
     from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.key_exchange import KeyLimits
+    from sidecar.core.path.key_exchange import KeyLimits
     from sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 _PHASE = PHASE_FLAG << 16
