@@ -33,9 +33,9 @@ from protos.model import (
 )
 from protos.pair_token import pair_token
 from sidecar.core.base.values import RequestId
-from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link import Link
+from sidecar.core.link.datagrams import LinkIdentity
+from sidecar.core.link.link import Link
 from sidecar.core.rules import ServiceRule
 from sidecar.core.seam.application import ExecuteRequest, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import SetReady
@@ -45,7 +45,7 @@ from sidecar.start_session import start_session
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sidecar.core.datagrams import Batch
+    from sidecar.core.link.datagrams import Batch
 
 SERVICE = ServiceName("/bench")
 TYPE = "bench/srv/Bytes"

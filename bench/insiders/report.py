@@ -16,7 +16,7 @@ from bench.insiders.stage import CLOUDS, PROFILES, ROBOTS
 from bench.reporting.machine import machine
 from bench.reporting.tables import Table
 from bench.reporting.terminal import rich_table
-from sidecar.core.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
+from sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
 
 if TYPE_CHECKING:
     from pathlib import Path

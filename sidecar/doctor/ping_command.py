@@ -25,7 +25,7 @@ from protos.arguments import checked, number, whole
 from protos.errors import ConfigError, DecodeError
 from protos.names import interface_name, node_name
 from protos.printable import escaped
-from sidecar.core.pinging import LEAST_BYTES
+from sidecar.core.link.pinging import LEAST_BYTES
 from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 from sidecar.doctor.examination import connect, read_config
 from sidecar.doctor.finding import share

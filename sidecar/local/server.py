@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from protos.errors import DecodeError
-from sidecar.core.pinging import Pong
+from sidecar.core.link.pinging import Pong
 from sidecar.local.entrance import Entrance, SocketLock, for_group
 from sidecar.local.peer import groups_of, user_of
 from sidecar.local.protocol import (
@@ -63,7 +63,7 @@ MAX_UNREAD_BYTES = 65_536
 STATES = Rates(owner=Rate(4.0, 8.0), members=Rate(2.0, 8.0), member=Rate(1.0, 4.0))
 PING_REQUESTS = Rates(owner=Rate(50.0, 100.0), members=Rate(40.0, 80.0), member=Rate(20.0, 40.0))
 PINGS = Rates(owner=Rate(50.0, 100.0), members=Rate(10.0, 30.0), member=Rate(5.0, 15.0))
-"""Over each interface, which sends few (`sidecar/core/pinging.py`): members leave half of them to root."""
+"""Over each interface, which sends few (`sidecar/core/link/pinging.py`): members leave half of them to root."""
 MAX_INTERFACES = 64
 """Of which it is remembered how many pings they were asked for."""
 MAX_PINGS_OUT = 256

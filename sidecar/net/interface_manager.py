@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.model import Candidate, InterfaceId, InterfaceName
-from sidecar.core.datagrams import LinkIdentity
+from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.readiness import Readiness
 from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from protos.model import Address
     from sidecar.config import SidecarConfig
     from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.link_memory import LinkMemory
+    from sidecar.core.link.memory import LinkMemory
     from sidecar.core.stun_client import StunView
     from sidecar.core.stun_events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane

@@ -12,7 +12,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
 from sidecar.core.base.values import PathState
-from sidecar.core.datagrams import Batch
+from sidecar.core.link.datagrams import Batch
 from sidecar.core.path.history import PathHistory
 from sidecar.core.seam.links import PathChanged, Rebind
 from sidecar.core.wire.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import Address, InterfaceName
-    from sidecar.core.link import Link
-    from sidecar.core.pinging import Pong
+    from sidecar.core.link.link import Link
+    from sidecar.core.link.pinging import Pong
     from sidecar.core.seam.links import LinkCommand, LinkEvent
     from sidecar.core.stun_client import StunClient
     from sidecar.core.stun_events import StunEvent

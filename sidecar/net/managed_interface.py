@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from protos.model import Candidate, CandidateKind
 from sidecar.core.control_ways import families_in_turn
-from sidecar.core.link import Link
+from sidecar.core.link.link import Link
 from sidecar.core.path.pmtu import LEAST_MTU
 from sidecar.core.seam.links import SetCarrier, SetMtu, SetReady
 from sidecar.core.stun_client import StunClient
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import Address, InterfaceName
-    from sidecar.core.datagrams import LinkIdentity
-    from sidecar.core.link_memory import LinkMemory
+    from sidecar.core.link.datagrams import LinkIdentity
+    from sidecar.core.link.memory import LinkMemory
     from sidecar.core.path.key_exchange import KeyLimits
     from sidecar.core.seam.links import Rebind
     from sidecar.net.interface_thread import LinkOwner

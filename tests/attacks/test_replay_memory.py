@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import InterfaceId, InterfaceName, NodeName, PeerSet, Role, SessionId, Version
-from sidecar.core.link_memory import MAX_PATHS_OF_A_PEER
+from sidecar.core.link.memory import MAX_PATHS_OF_A_PEER
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.path.keys import make_path_keys
 from sidecar.core.wire import frame
@@ -22,7 +22,7 @@ from tests.sim.mesh import Mesh, rule
 
 if TYPE_CHECKING:
     from protos.model import Address
-    from sidecar.core.link import Link
+    from sidecar.core.link.link import Link
     from tests.sim.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-1")

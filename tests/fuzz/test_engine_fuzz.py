@@ -12,8 +12,8 @@ from sidecar.core.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
 from sidecar.core.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
 from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from sidecar.core.dedup import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
+from sidecar.core.link.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
 from sidecar.core.message.reassembly import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
-from sidecar.core.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
 from sidecar.core.refused_copies import MAX_REFUSED_COPIES
 from sidecar.core.room import MAX_MESSAGES
 from sidecar.core.wire import frame

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from protos.model import InterfaceId, SessionId
 from sidecar.core.base.values import PathId
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.path_table import MAX_PATHS_OF_A_PEER, MAX_PENDING_FRAMES
+from sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, MAX_PENDING_FRAMES
 from sidecar.core.seam.links import FragmentsReceived, Send
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply

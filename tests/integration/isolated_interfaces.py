@@ -36,9 +36,9 @@ from protos.model import (
     Version,
 )
 from sidecar.core.base.values import RequestId
-from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import EngineConfig
-from sidecar.core.link import Link
+from sidecar.core.link.datagrams import LinkIdentity
+from sidecar.core.link.link import Link
 from sidecar.core.rules import ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, OfferService, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import SetReady

@@ -29,9 +29,9 @@ from protos.pair_token import pair_token
 from sidecar.announcement import Announcer
 from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import RequestId
-from sidecar.core.datagrams import LinkIdentity
 from sidecar.core.engine import Engine, EngineConfig
-from sidecar.core.link import Link
+from sidecar.core.link.datagrams import LinkIdentity
+from sidecar.core.link.link import Link
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.rules import ServiceRule

@@ -10,13 +10,13 @@ import pytest
 from protos.model import Role
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathState
+from sidecar.core.link.liveness import PathKeeper
 from sidecar.core.path.probing import IDLE_PROBE_S, IDLE_SPREAD, MAX_IDLE_PROBE_S, WATCH_FACTOR
-from sidecar.core.path_keeper import PathKeeper
 from tests.sim.mesh import Mesh, Node, rule
 from tests.sim.test_mesh import assert_each_answered_once, mapped, two_by_two
 
 if TYPE_CHECKING:
-    from sidecar.core.link import Link
+    from sidecar.core.link.link import Link
     from sidecar.core.path.path import Path
 
 pytestmark = pytest.mark.audit("dp-11")

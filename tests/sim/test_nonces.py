@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from protos.credential import Aead
 from protos.model import PeerSet, Version
 from sidecar.core.crypto import aead
-from sidecar.core.link import Link
+from sidecar.core.link.link import Link
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.seam.links import ResetPaths, SetPeers, SetReady
 from sidecar.core.wire import introduction

@@ -13,8 +13,8 @@ import pytest
 from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, Role
 from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import PathState, Priority
+from sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
 from sidecar.core.path.address import AMPLIFICATION
-from sidecar.core.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
 from sidecar.core.wire import frame
 from sidecar.core.wire.messages import RequestMessage, encode_message
 from tests.sim.mesh import SERVICE, TYPE, Mesh, rule

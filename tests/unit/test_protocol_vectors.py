@@ -38,11 +38,12 @@ from protos.model import (
     ServiceName,
 )
 from protos.pair_token import pair_token
-from sidecar.core import outbox, path_table
+from sidecar.core import outbox
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.crypto import session
 from sidecar.core.crypto.key_schedule import pair_keys
+from sidecar.core.link.link import path_table
 from sidecar.core.message import reassembly
 from sidecar.core.path import address, key_exchange
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS

@@ -23,9 +23,9 @@ from protos.model import (
 from protos.pair_token import pair_token
 from sidecar.core.base.values import PathId, Priority, RequestId
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.link import Link
-from sidecar.core.link_memory import LinkMemory
+from sidecar.core.link.datagrams import LinkIdentity
+from sidecar.core.link.link import Link
+from sidecar.core.link.memory import LinkMemory
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.keys import PathKeys, make_path_keys

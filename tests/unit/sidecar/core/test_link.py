@@ -6,7 +6,7 @@ import pytest
 
 from protos.model import InterfaceId, InterfaceName, NodeName, Role, SessionId
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link import Link
+from sidecar.core.link.link import Link
 from sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
 from sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S
 from sidecar.core.path.probing import IDLE_PROBE_S, MAX_PROBE_S

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sidecar.core.link import MAX_FINISHED_DELAY_S
+from sidecar.core.link.link import MAX_FINISHED_DELAY_S
 from sidecar.core.seam.links import FragmentsLost, Send, SendFinished
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, AckFrame, Finished, Fragment

@@ -9,8 +9,8 @@ import pytest
 
 from protos.model import InterfaceId, NodeName
 from sidecar.core.base.values import PathId, PathState
+from sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, NEW_PATHS, NEW_PATHS_PER_S
 from sidecar.core.path.probing import FIRST_PROBE_S
-from sidecar.core.path_table import MAX_PATHS_OF_A_PEER, NEW_PATHS, NEW_PATHS_PER_S
 from sidecar.core.seam.links import PathChanged, SetCredential
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import Probe, ProbeReply

@@ -6,7 +6,7 @@ import pytest
 
 from protos.model import InterfaceId
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.pinging import LEAST_BYTES, MAX_PINGS_OUT, PINGS_AT_ONCE, PINGS_PER_S, Pong
+from sidecar.core.link.pinging import LEAST_BYTES, MAX_PINGS_OUT, PINGS_AT_ONCE, PINGS_PER_S, Pong
 from sidecar.core.seam.links import Ping, SetCarrier
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply

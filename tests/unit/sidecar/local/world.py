@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from protos.model import InterfaceId, InterfaceName, NodeName
 from sidecar.core.base.values import PathId
-from sidecar.core.pinging import Pong
+from sidecar.core.link.pinging import Pong
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -36,9 +36,9 @@ from protos.model import (
 )
 from protos.pair_token import pair_token
 from sidecar.core.base.values import PathState, RequestId
-from sidecar.core.datagrams import Batch, LinkIdentity
 from sidecar.core.engine import EngineConfig
-from sidecar.core.link import Link
+from sidecar.core.link.datagrams import Batch, LinkIdentity
+from sidecar.core.link.link import Link
 from sidecar.core.rules import ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
 from sidecar.core.seam.links import SetReady
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from protos.credential import SessionCredential
-    from sidecar.core.pinging import Pong
+    from sidecar.core.link.pinging import Pong
 
 SERVICE, TYPE = ServiceName("/echo"), "t/srv/Echo"
 PATIENCE_S = 20.0

@@ -7,15 +7,15 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from protos.model import InterfaceId, InterfaceName, Role
-from sidecar.core.datagrams import Batch, LinkIdentity
-from sidecar.core.link import Link
+from sidecar.core.link.datagrams import Batch, LinkIdentity
+from sidecar.core.link.link import Link
 from sidecar.net.interface_thread import InterfaceThread
 from tests.sessions import credential_of
 
 if TYPE_CHECKING:
     import pytest
 
-    from sidecar.core.pinging import Pong
+    from sidecar.core.link.pinging import Pong
     from sidecar.core.seam.links import LinkEvent
     from sidecar.core.stun_events import StunEvent
 

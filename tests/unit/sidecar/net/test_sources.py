@@ -8,8 +8,8 @@ import pytest
 
 from protos.model import InterfaceId, InterfaceName, NodeName, Role
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.datagrams import LinkIdentity
-from sidecar.core.link import Link
+from sidecar.core.link.datagrams import LinkIdentity
+from sidecar.core.link.link import Link
 from sidecar.core.seam.links import PathChanged
 from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.sources import Sources

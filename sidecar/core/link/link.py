@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.timers import NEVER, Timers
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.datagrams import Batch, Burst, DatagramBuilder
-from sidecar.core.link_memory import LinkMemory
-from sidecar.core.link_mtu import LinkMtu
-from sidecar.core.link_reader import LinkReader
+from sidecar.core.link.datagrams import Batch, Burst, DatagramBuilder
+from sidecar.core.link.liveness import PathKeeper
+from sidecar.core.link.memory import LinkMemory
+from sidecar.core.link.mtu import LinkMtu
+from sidecar.core.link.path_table import PathTable
+from sidecar.core.link.reader import LinkReader
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.path.view import view_of
-from sidecar.core.path_keeper import PathKeeper
-from sidecar.core.path_table import PathTable
 from sidecar.core.seam.links import (
     Attend,
     CheckPaths,
@@ -52,11 +52,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from protos.model import Address, NodeName
-    from sidecar.core.datagrams import LinkIdentity
+    from sidecar.core.link.datagrams import LinkIdentity
+    from sidecar.core.link.pinging import Pong
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.path.path import Path
     from sidecar.core.path.view import PathView
-    from sidecar.core.pinging import Pong
     from sidecar.core.seam.links import LinkPeer
 
 MAX_FINISHED_DELAY_S = 0.003

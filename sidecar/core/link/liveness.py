@@ -9,11 +9,11 @@ from sidecar.core.seam.links import FinishedLost, FragmentsLost, PathChanged, Pe
 from sidecar.core.wire.frame import KEY_ANSWER_TYPE, encode_key_answer
 
 if TYPE_CHECKING:
-    from sidecar.core.link_mtu import LinkMtu
+    from sidecar.core.link.mtu import LinkMtu
+    from sidecar.core.link.path_table import PathTable
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.path.in_flight import Sent
     from sidecar.core.path.path import Path
-    from sidecar.core.path_table import PathTable
     from sidecar.core.wire import frame
 
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from protos.model import Role
 from protos.token_bucket import TokenBucket
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link_memory import LinkMemory
+from sidecar.core.link.memory import LinkMemory
+from sidecar.core.link.pinging import Pings
 from sidecar.core.path.key_exchange import EXCHANGES_AT_ONCE, EXCHANGES_PER_S
 from sidecar.core.path.keys import make_path_keys
 from sidecar.core.path.path import Path
-from sidecar.core.pinging import Pings
 from sidecar.core.seam.stats import LinkStats
 from sidecar.core.wire.introduction import hello_id
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from protos.model import Address, InterfaceId, NodeName, SessionId
-    from sidecar.core.datagrams import LinkIdentity
+    from sidecar.core.link.datagrams import LinkIdentity
     from sidecar.core.path.key_exchange import KeyLimits
     from sidecar.core.seam.links import LinkEvent, LinkPeer
 

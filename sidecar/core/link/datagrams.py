@@ -10,8 +10,8 @@ from protos.pair_token import pair_token
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
+from sidecar.core.link.path_table import MAX_PENDING_FRAMES
 from sidecar.core.path.address import LEAST_CREDIT_BYTES
-from sidecar.core.path_table import MAX_PENDING_FRAMES
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import (
     BASE_FRAMES_BYTES,

@@ -9,7 +9,7 @@ from protos.errors import DecodeError
 from protos.model import Role
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.link_opener import LinkOpener
+from sidecar.core.link.opener import LinkOpener
 from sidecar.core.path.key_exchange import TooManyExchangesError
 from sidecar.core.seam.links import FragmentsReceived, MessageAbandoned, MessageFinished, MessageForgotten, PeerClosed
 from sidecar.core.wire import frame
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import Address
-    from sidecar.core.link_mtu import LinkMtu
-    from sidecar.core.link_opener import Opened
+    from sidecar.core.link.liveness import PathKeeper
+    from sidecar.core.link.mtu import LinkMtu
+    from sidecar.core.link.opener import Opened
+    from sidecar.core.link.path_table import PathTable
     from sidecar.core.path.path import Path
-    from sidecar.core.path_keeper import PathKeeper
-    from sidecar.core.path_table import PathTable
 
 
 T = TypeVar("T")

@@ -10,9 +10,9 @@ from protos.errors import DecodeError
 from protos.model import InterfaceId, SessionId
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
+from sidecar.core.link.path_table import MAX_INTRODUCTIONS
 from sidecar.core.path.key_exchange import TooManyExchangesError
 from sidecar.core.path.keys import MAX_FAILED
-from sidecar.core.path_table import MAX_INTRODUCTIONS
 from sidecar.core.seam.links import PeerRenewed, PeerRestarted
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_DATAGRAM_BYTES, NONCE_OFFSET
@@ -20,8 +20,8 @@ from sidecar.core.wire.introduction import UnauthenticError, open_introduction, 
 
 if TYPE_CHECKING:
     from protos.model import Address
+    from sidecar.core.link.path_table import PathTable
     from sidecar.core.path.path import Path
-    from sidecar.core.path_table import PathTable
     from sidecar.core.wire.frame import Header
 
 _OVERHEAD_BYTES = HEADER_BYTES + TAG_BYTES
