@@ -37,7 +37,7 @@ from std_srvs.srv import Empty
 from protos import interpreter
 from protos.model import NodeName, Role, ServiceName, SessionId
 from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
 from sidecar.ros import rcl
 

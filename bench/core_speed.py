@@ -36,7 +36,7 @@ from sidecar.core.base.values import RequestId
 from sidecar.core.engine import Engine, EngineConfig
 from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ExecuteRequest, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import SetReady
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, symbol_count

@@ -37,7 +37,7 @@ from sidecar.config_fields import (
     is_glob,
 )
 from sidecar.core.control_ways import Price
-from sidecar.core.rules import Rules, ServiceRule
+from sidecar.core.rules.service_rule import Rules, ServiceRule
 from sidecar.service_config import NetworkConfig, ServiceConfig
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from protos.identity import Identity
     from protos.model import InterfaceName
-    from sidecar.core.budget import Budget
+    from sidecar.core.rules.budget import Budget
 
 DEFAULT_CLOUD_UDP_PORT = 24700
 """Fixed, since a firewall rule has to name it; below Linux' ephemeral ports (32768 and up)."""

@@ -24,10 +24,10 @@ from sidecar.config_fields import (
     is_glob,
 )
 from sidecar.core.base.values import Priority
-from sidecar.core.budget import Budget
 from sidecar.core.fallback_queue import SPARE
-from sidecar.core.fallback_rule import FallbackRule
-from sidecar.core.rules import MAX_LIFETIME_S, ServiceRule
+from sidecar.core.rules.budget import Budget
+from sidecar.core.rules.fallback_rule import FallbackRule
+from sidecar.core.rules.service_rule import MAX_LIFETIME_S, ServiceRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

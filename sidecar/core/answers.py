@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
-    from sidecar.core.rules import Rules
+    from sidecar.core.rules.service_rule import Rules
     from sidecar.core.seam.stats import EngineStats
 
 MAX_ANSWERS = 32_768

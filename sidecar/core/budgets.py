@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import InterfaceName, ServiceName
-    from sidecar.core.budget import Budget
+    from sidecar.core.rules.budget import Budget
     from sidecar.core.seam.stats import EngineStats
 
 MAX_SAVED_BYTES = 32 * 1024 * 1024

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
 
 HEDGE_AT = 0.5
 """At this part of the deadline, a server that has the request alone and is silent makes another one worth asking."""

@@ -24,7 +24,7 @@ from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
 from sidecar.core.cancels import EarlyCancels
 from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
-from sidecar.core.rules import MAX_LIFETIME_S
+from sidecar.core.rules.service_rule import MAX_LIFETIME_S
 from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 

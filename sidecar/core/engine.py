@@ -28,7 +28,7 @@ from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.revocation_exchange import RevocationExchange
 from sidecar.core.routes import Routes
-from sidecar.core.rules import Rules, ServiceRule
+from sidecar.core.rules.service_rule import Rules, ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, OfferService, WithdrawService
 from sidecar.core.seam.links import (
     Attend,
@@ -67,9 +67,9 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from protos.model import InterfaceName, NodeName, Peer, ServiceMapping, ServiceName, ServiceOffer, SessionId
-    from sidecar.core.budget import Budget
     from sidecar.core.crypto.session import OwnSession
     from sidecar.core.message.decoding import Decoding
+    from sidecar.core.rules.budget import Budget
 
 SWEEP_EVERY_S = 1.0
 """How often old messages and half messages are looked for."""

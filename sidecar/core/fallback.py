@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sidecar.core.base.values import RequestId
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import RequestFailed
 
 MAX_WANTED = 64

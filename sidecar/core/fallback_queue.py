@@ -14,7 +14,7 @@ from sidecar.core.fallback_times import FallbackTimes
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import RequestId
-    from sidecar.core.fallback_rule import FallbackRule
+    from sidecar.core.rules.fallback_rule import FallbackRule
     from sidecar.core.seam.application import RequestFailed
 
 MAX_CALLED = 2

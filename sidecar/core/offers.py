@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName, Peer, ServiceName
     from sidecar.core.routes import Routes
-    from sidecar.core.rules import Rules
+    from sidecar.core.rules.service_rule import Rules
     from sidecar.core.seam.stats import EngineStats
 
 MAX_TYPES = 2048

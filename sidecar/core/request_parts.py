@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName
-    from sidecar.core.budget import Budget
     from sidecar.core.mapping import MappingTable
     from sidecar.core.measurements import Measurements
     from sidecar.core.offers import Offers
     from sidecar.core.outbox import Outbox
     from sidecar.core.routes import Routes
+    from sidecar.core.rules.budget import Budget
     from sidecar.core.seam.application import ApplicationEvent
     from sidecar.core.seam.stats import EngineStats
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sidecar.core.base.slices import Step
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.request_parts import RequestParts
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
 
 MAX_IN_FLIGHT = 8192
 """Requests that wait for a response."""

@@ -12,7 +12,7 @@ from sidecar.core.base.slices import in_groups
 from sidecar.core.base.values import RejectReason
 from sidecar.core.dedup import ExecutionTable, Reply, Waiter
 from sidecar.core.forbidden import ForbiddenCalls
-from sidecar.core.rules import MAX_LIFETIME_S, Rules
+from sidecar.core.rules.service_rule import MAX_LIFETIME_S, Rules
 from sidecar.core.seam.application import ExecuteRequest
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from protos.model import NodeName, ServiceName
 from protos.regular_file import read_regular
 from protos.tls_files import load_tls_files
 from sidecar.config import load_config
-from sidecar.core.rules import Rules
+from sidecar.core.rules.service_rule import Rules
 from sidecar.doctor import host, node_checks, running_checks
 from sidecar.doctor.finding import fail, ok, warn
 from sidecar.doctor.running_checks import Pinged

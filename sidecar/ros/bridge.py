@@ -26,7 +26,7 @@ from sidecar.ros.stats import BridgeStats
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import ApplicationEvent
     from sidecar.ports import Application, DataPlane
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from protos.model import ServiceOffer
 from sidecar.core.base.fair_share import Shares
 from sidecar.core.base.values import RejectReason
-from sidecar.core.rules import Rules
+from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
     from sidecar.core.base.values import ExecutionId
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import ApplicationEvent
     from sidecar.ports import DataPlane
     from sidecar.ros.log_limit import LimitedLog

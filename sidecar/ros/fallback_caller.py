@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from protos.model import ServiceName
     from sidecar.core.base.values import RequestId
     from sidecar.core.fallback import FallbackCall
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import RequestFailed
     from sidecar.ros.graph import NameOf, Served
     from sidecar.ros.log_limit import LimitedLog

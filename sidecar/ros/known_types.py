@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.rules import Rules
+from sidecar.core.rules.service_rule import Rules
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.types import load_service_type
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model import Peer
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
 
 MAX_LINES = 10
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.core.rules import Rules
+from sidecar.core.rules.service_rule import Rules
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.service_proxy import ServiceProxy
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from protos.model import ServiceName
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import OfferService, WithdrawService
     from sidecar.ros.rcl import RmwRequestId
     from sidecar.ros.ros_loop import RosLoop

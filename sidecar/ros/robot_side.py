@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
     from sidecar.core.base.values import RequestId
-    from sidecar.core.rules import ServiceRule
+    from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import ApplicationEvent
     from sidecar.ports import DataPlane
     from sidecar.ros.fallback_caller import FallbackAnswer

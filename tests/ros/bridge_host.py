@@ -8,7 +8,7 @@ import sys
 import threading
 
 from protos.model import Role
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Loopback
 

@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from protos.model import Role
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Faults, Loopback
 from tests.ros.processes import Program

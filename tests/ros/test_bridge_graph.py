@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from protos.model import Role, ServiceName
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import OfferService
 from sidecar.ros import graph
 from sidecar.ros.bridge import RosBridge

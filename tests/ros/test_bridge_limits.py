@@ -8,7 +8,7 @@ import pytest
 
 from protos.model import NodeName, ServiceName, SessionId
 from sidecar.core.base.values import RejectReason
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import OfferService
 from sidecar.ros.rcl import RmwRequestId
 from sidecar.ros.request_numbering import RequestNumbering

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from protos.model import Address
-    from sidecar.core.budget import Budget
+    from sidecar.core.rules.budget import Budget
 
 STARTING_S = 1.0
 WARM_S = 4.0

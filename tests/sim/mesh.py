@@ -34,7 +34,7 @@ from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.pmtu import HEADERS_V4
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, ResponseArrived
 from sidecar.core.seam.links import SetReady
 from tests.sessions import session_of
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import Address
-    from sidecar.core.budget import Budget
     from sidecar.core.crypto.session import OwnSession
+    from sidecar.core.rules.budget import Budget
 
 SERVICE = ServiceName("/echo")
 IPV6 = ":6"

@@ -6,7 +6,7 @@ import pytest
 
 from bench.evaluation.scenario import Scenario, read_scenarios
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.budget import Budget
+from sidecar.core.rules.budget import Budget
 from tests.sim.drives import drive
 
 

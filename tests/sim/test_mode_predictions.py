@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.budget import Budget
+from sidecar.core.rules.budget import Budget
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 from tests.sim.test_redundancy_modes import stall

@@ -11,7 +11,7 @@ import pytest
 from controlplane.core.estimator import Estimator
 from protos.model import InterfaceName
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.budget import Budget
+from sidecar.core.rules.budget import Budget
 from tests.sim.mesh import SERVICE, Mesh, Node, Wire, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
 

@@ -8,8 +8,8 @@ from protos.model import InterfaceName, ServiceName
 from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import Priority
-from sidecar.core.budget import Budget
-from sidecar.core.fallback_rule import FallbackRule
+from sidecar.core.rules.budget import Budget
+from sidecar.core.rules.fallback_rule import FallbackRule
 from tests.unit.sidecar.configs import CLOUD, ROBOT, SAFE, parse, with_service
 
 

@@ -30,7 +30,7 @@ from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.keys import PathKeys, make_path_keys
 from sidecar.core.path.pmtu import HEADERS_V4
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.links import LinkCommand, LinkEvent, LinkPeer, SetMtu, SetPeers, SetReady
 from sidecar.core.wire.frame import (
     BASE_BYTES,

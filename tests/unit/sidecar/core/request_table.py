@@ -13,7 +13,7 @@ from sidecar.core.outbox import Outbox
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.routes import Routes
-from sidecar.core.rules import Rules, ServiceRule
+from sidecar.core.rules.service_rule import Rules, ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import LinkCommand, Send
 from sidecar.core.seam.stats import EngineStats
@@ -22,7 +22,7 @@ from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path,
 
 if TYPE_CHECKING:
     from protos.model import NodeName
-    from sidecar.core.budget import Budget
+    from sidecar.core.rules.budget import Budget
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
 SERVERS = {A: WLAN_A, B: WWAN_B}

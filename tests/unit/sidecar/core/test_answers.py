@@ -15,7 +15,7 @@ from sidecar.core.dedup import Reply, Waiter
 from sidecar.core.outbox import Outbox
 from sidecar.core.room import SMALL_ROOM_BYTES
 from sidecar.core.routes import Routes
-from sidecar.core.rules import Rules
+from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.links import LinkCommand, Send
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message

@@ -11,7 +11,7 @@ from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.measurements import Measurements
 from sidecar.core.routes import Routes
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:

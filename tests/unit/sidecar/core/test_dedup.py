@@ -20,7 +20,7 @@ from sidecar.core.dedup import (
     Reply,
     Waiter,
 )
-from sidecar.core.rules import MAX_LIFETIME_S
+from sidecar.core.rules.service_rule import MAX_LIFETIME_S
 from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage

@@ -11,8 +11,8 @@ import pytest
 from protos.model import ServiceName
 from sidecar.core import fallback, fallback_queue
 from sidecar.core.fallback import Accepted, Fallbacks
-from sidecar.core.fallback_rule import FallbackRule
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.fallback_rule import FallbackRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import RequestFailed
 from tests.unit.sidecar.core.builders import request_id
 

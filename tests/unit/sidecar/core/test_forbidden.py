@@ -8,7 +8,7 @@ from sidecar.core.base.values import PathState, RejectReason
 from sidecar.core.forbidden import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
 from sidecar.core.outbox import Outbox
 from sidecar.core.routes import Routes
-from sidecar.core.rules import Rules
+from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import ApplicationEvent, CallsForbidden, ExecuteRequest
 from sidecar.core.seam.links import PathCommand, Send
 from sidecar.core.seam.stats import EngineStats

@@ -12,7 +12,7 @@ from sidecar.core.base.values import PathState
 from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.interface_outcomes import interface_outcomes
 from sidecar.core.routes import Routes
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:

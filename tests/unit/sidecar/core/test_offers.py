@@ -10,7 +10,7 @@ from sidecar.core import offers
 from sidecar.core.base.values import PathState
 from sidecar.core.offers import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
 from sidecar.core.routes import Routes
-from sidecar.core.rules import Rules
+from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import OfferService, WithdrawService
 from sidecar.core.seam.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, TYPE, A, B, path, peer, rule

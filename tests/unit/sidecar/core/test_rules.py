@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from protos.model import ServiceName
-from sidecar.core.fallback_rule import FallbackRule
-from sidecar.core.rules import MAX_FOUND, Rules
+from sidecar.core.rules.fallback_rule import FallbackRule
+from sidecar.core.rules.service_rule import MAX_FOUND, Rules
 from tests.unit.sidecar.core.builders import rule
 
 RULES = (rule("/arm/plan"), rule("/arm/*"), rule("/node/get_parameters"), rule("/*"))

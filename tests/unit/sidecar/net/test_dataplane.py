@@ -39,7 +39,7 @@ from sidecar.core.base.values import PathState, RequestId
 from sidecar.core.engine import EngineConfig
 from sidecar.core.link.datagrams import Batch, LinkIdentity
 from sidecar.core.link.link import Link
-from sidecar.core.rules import ServiceRule
+from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
 from sidecar.core.seam.links import SetReady
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from protos.model import ServiceName
-    from sidecar.core.fallback_rule import FallbackRule
     from sidecar.core.message.repair import Redundancy
+    from sidecar.core.rules.fallback_rule import FallbackRule
 
 MAX_LIFETIME_S = 300.0
 """A request that may wait longer is a job, not a call; a server remembers every request for longer than this."""
