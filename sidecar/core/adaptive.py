@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
     from sidecar.core.copies import Copy, Request
     from sidecar.core.path_pace import PathPaces
-    from sidecar.core.routes import Routes
+    from sidecar.core.transfer.routes import Routes
 
 LOOKS = 20
 """Looks at a request until its deadline ..."""

@@ -23,8 +23,8 @@ from sidecar.core.base.slices import in_groups
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import PathState, Priority, RejectReason
 from sidecar.core.dedup import Waiter
-from sidecar.core.room import Lane
-from sidecar.core.waiting_line import WaitingLine
+from sidecar.core.transfer.room import Lane
+from sidecar.core.transfer.waiting_line import WaitingLine
 from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode_message
 
 if TYPE_CHECKING:
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.dedup import Reply
     from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.outbox import Outbox
-    from sidecar.core.routes import Routes
     from sidecar.core.rules.service_rule import Rules
     from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.outbox import Outbox
+    from sidecar.core.transfer.routes import Routes
 
 MAX_ANSWERS = 32_768
 """Answers and rejections that wait or are under way; one robot may have half: twice what it may have in flight."""

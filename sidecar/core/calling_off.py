@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.base.values import RequestId
     from sidecar.core.copies import Copy, Request
-    from sidecar.core.outbox import Outbox
-    from sidecar.core.routes import Routes
     from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.outbox import Outbox
+    from sidecar.core.transfer.routes import Routes
 
 MAX_CALLED_OFF = 1024
 """Ids of requests whose copies were called off, kept to tell answers that were on their way from strays."""

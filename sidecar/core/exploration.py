@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
     from sidecar.core.copies import Request
     from sidecar.core.mapping import MappingTable
-    from sidecar.core.outbox import Outbox
-    from sidecar.core.routes import Routes
+    from sidecar.core.transfer.outbox import Outbox
+    from sidecar.core.transfer.routes import Routes
 
 MAX_PER_S = 0.2
 """Such copies of one service: 12 a minute at most, however many requests there are."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
-    from sidecar.core.routes import Route, Routes
+    from sidecar.core.transfer.routes import Route, Routes
 
 
 class MappingTable:

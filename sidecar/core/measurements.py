@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
     from sidecar.core.copies import Carried
     from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
-    from sidecar.core.routes import Routes
     from sidecar.core.seam.links import PathMeasured
+    from sidecar.core.transfer.routes import Routes
 
 MAX_ANSWER_SIZES = 1024
 """Services whose usual size of an answer is kept: as many as a robot can carry."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from sidecar.core.room import Lane
-from sidecar.core.waiting_line import WaitingLine
+from sidecar.core.transfer.room import Lane
+from sidecar.core.transfer.waiting_line import WaitingLine
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import RequestId
     from sidecar.core.copies import Request
     from sidecar.core.dispatching import Dispatching
-    from sidecar.core.routes import Routes
+    from sidecar.core.transfer.routes import Routes
 
     _Group = tuple[Lane, tuple[NodeName, ...]]
 

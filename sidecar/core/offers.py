@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Container, Mapping
 
     from protos.model import NodeName, Peer, ServiceName
-    from sidecar.core.routes import Routes
     from sidecar.core.rules.service_rule import Rules
     from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.routes import Routes
 
 MAX_TYPES = 2048
 """Services whose type in use is remembered, the one noted longest ago goes: peers invent names under a glob."""

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
-    from sidecar.core.routes import Routes
     from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.routes import Routes
 
 MAX_PACES = 4096
 """Pairs remembered, each for one service; then the one that was used longest ago goes."""

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from sidecar.core.mapping import MappingTable
     from sidecar.core.measurements import Measurements
     from sidecar.core.offers import Offers
-    from sidecar.core.outbox import Outbox
-    from sidecar.core.routes import Routes
     from sidecar.core.rules.budget import Budget
     from sidecar.core.seam.application import ApplicationEvent
     from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.outbox import Outbox
+    from sidecar.core.transfer.routes import Routes
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName
     from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.outbox import Outbox
-    from sidecar.core.routes import Routes
     from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.outbox import Outbox
+    from sidecar.core.transfer.routes import Routes
     from sidecar.core.wire.messages import Encoded, RevocationMessage
 
 ASK_AFTER_S = 0.5

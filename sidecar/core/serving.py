@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName, ServiceOffer
     from sidecar.core.base.slices import Backlog, Step
     from sidecar.core.base.values import ExecutionId, PathId, RequestId
-    from sidecar.core.outbox import Outbox
-    from sidecar.core.routes import Routes
     from sidecar.core.seam.application import ApplicationEvent
     from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.outbox import Outbox
+    from sidecar.core.transfer.routes import Routes
     from sidecar.core.wire.messages import CancelMessage, RequestMessage
 
 

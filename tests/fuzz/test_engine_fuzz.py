@@ -15,7 +15,7 @@ from sidecar.core.dedup import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TI
 from sidecar.core.link.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
 from sidecar.core.message.reassembly import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
 from sidecar.core.refused_copies import MAX_REFUSED_COPIES
-from sidecar.core.room import MAX_MESSAGES
+from sidecar.core.transfer.room import MAX_MESSAGES
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
 from sidecar.core.wire.messages import (

@@ -6,9 +6,9 @@ import pytest
 
 from protos.model import Role, ServiceOffer
 from sidecar.core import answers as answers_module
-from sidecar.core import room as room_module
-from sidecar.core.room import SMALL_BYTES, Lane
 from sidecar.core.seam.application import RequestFailed
+from sidecar.core.transfer import room as room_module
+from sidecar.core.transfer.room import SMALL_BYTES, Lane
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 pytestmark = pytest.mark.audit("dp-1")

@@ -6,9 +6,9 @@ import pytest
 
 from protos.model import Role, ServiceName, ServiceOffer
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core import room as room_module
 from sidecar.core.base.values import Priority
-from sidecar.core.room import SMALL_BYTES, Lane
+from sidecar.core.transfer import room as room_module
+from sidecar.core.transfer.room import SMALL_BYTES, Lane
 from tests.sim.mesh import TYPE, Mesh, rule
 
 SIZE = 400_000

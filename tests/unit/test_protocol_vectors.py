@@ -38,7 +38,6 @@ from protos.model import (
     ServiceName,
 )
 from protos.pair_token import pair_token
-from sidecar.core import outbox
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.crypto import session
@@ -49,6 +48,7 @@ from sidecar.core.path import address, key_exchange
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
 from sidecar.core.peers import RESTART_GAP_S
+from sidecar.core.transfer import outbox
 from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
 from sidecar.core.wire import fec, frame, introduction, messages
 from sidecar.core.wire.frame import Header

@@ -9,14 +9,14 @@ from sidecar.core.base.values import PathId, PathState, Priority, RejectReason, 
 from sidecar.core.mapping import MappingTable
 from sidecar.core.measurements import Measurements
 from sidecar.core.offers import Offers
-from sidecar.core.outbox import Outbox
 from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
-from sidecar.core.routes import Routes
 from sidecar.core.rules.service_rule import Rules, ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import LinkCommand, Send
 from sidecar.core.seam.stats import EngineStats
+from sidecar.core.transfer.outbox import Outbox
+from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 

@@ -12,12 +12,12 @@ from sidecar.core.answers import Answers
 from sidecar.core.base.slices import SLICE, Backlog
 from sidecar.core.base.values import PathState, Priority, RejectReason
 from sidecar.core.dedup import Reply, Waiter
-from sidecar.core.outbox import Outbox
-from sidecar.core.room import SMALL_ROOM_BYTES
-from sidecar.core.routes import Routes
 from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.links import LinkCommand, Send
 from sidecar.core.seam.stats import EngineStats
+from sidecar.core.transfer.outbox import Outbox
+from sidecar.core.transfer.room import SMALL_ROOM_BYTES
+from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
 from tests.unit.sidecar.core.builders import ECHO, path, request_id, rule
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import NodeName, SessionId
-from sidecar.core.inbound import Inbound
 from sidecar.core.message import decoding
 from sidecar.core.message.decoding import MAX_BYTES, Decoding, DecodingLine
 from sidecar.core.message.outbound import OutboundMessage
@@ -17,6 +16,7 @@ from sidecar.core.message.partial import SLICE_OPERATIONS, Partial
 from sidecar.core.message.reassembly import Reassembler
 from sidecar.core.seam.links import SendFinished, SendForgotten
 from sidecar.core.seam.stats import EngineStats
+from sidecar.core.transfer.inbound import Inbound
 from sidecar.core.wire import fec
 from sidecar.core.wire.fec import MAX_BLOCK, decoding_cost
 from sidecar.core.wire.frame import Fragment, symbol_count

@@ -6,13 +6,13 @@ from protos.model import NodeName, ServiceName, ServiceOffer
 from sidecar.core.base.slices import Backlog
 from sidecar.core.base.values import PathState, RejectReason
 from sidecar.core.forbidden import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
-from sidecar.core.outbox import Outbox
-from sidecar.core.routes import Routes
 from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import ApplicationEvent, CallsForbidden, ExecuteRequest
 from sidecar.core.seam.links import PathCommand, Send
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.serving import Serving, ServingParts
+from sidecar.core.transfer.outbox import Outbox
+from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, path, request, rule
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, ServiceMapping, Version
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.mapping import MappingTable
-from sidecar.core.routes import Routes
+from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 
 WLAN_A, WLAN_B, WWAN_A, WWAN_B = path(WLAN, A), path(WLAN, B), path(WWAN, A), path(WWAN, B)

@@ -22,8 +22,8 @@ from sidecar.core.base.values import PathState
 from sidecar.core.copies import Carried
 from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
 from sidecar.core.measurements import Measurements
-from sidecar.core.routes import Routes
 from sidecar.core.seam.links import PathMeasured
+from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 
 ON_WLAN, ON_WWAN = Carried(WLAN, A, ECHO, 0), Carried(WWAN, A, ECHO, 3)

@@ -9,10 +9,10 @@ from protos.model import Peer, ServiceName, ServiceOffer
 from sidecar.core import offers
 from sidecar.core.base.values import PathState
 from sidecar.core.offers import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
-from sidecar.core.routes import Routes
 from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import OfferService, WithdrawService
 from sidecar.core.seam.stats import EngineStats
+from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, TYPE, A, B, path, peer, rule
 
 if TYPE_CHECKING:

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 from sidecar.core.base.values import PathState, Priority, RequestId
 from sidecar.core.message.reassembly import MAX_PEER_BYTES
 from sidecar.core.message.repair import MAX_COPIES
-from sidecar.core.outbox import MAX_GENERATIONS, Outbox
-from sidecar.core.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
-from sidecar.core.routes import Routes
 from sidecar.core.seam.links import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
 from sidecar.core.seam.stats import EngineStats
+from sidecar.core.transfer.outbox import MAX_GENERATIONS, Outbox
+from sidecar.core.transfer.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
+from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.frame import BASE_BYTES
 from sidecar.core.wire.messages import Encoded
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path

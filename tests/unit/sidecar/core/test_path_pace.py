@@ -7,8 +7,8 @@ import pytest
 from sidecar.core import path_pace
 from sidecar.core.base.values import PathState
 from sidecar.core.path_pace import FADE_S, PathPaces
-from sidecar.core.routes import Routes
 from sidecar.core.seam.stats import EngineStats
+from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from sidecar.core.base.values import PathState
-from sidecar.core.routes import Routes
+from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.frame import BASE_BYTES, FRAGMENT_OVERHEAD_BYTES
 from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
 

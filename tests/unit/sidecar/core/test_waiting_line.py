@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sidecar.core.base.values import SHARE, Priority
-from sidecar.core.waiting_line import SLACK, WaitingLine
+from sidecar.core.transfer.waiting_line import SLACK, WaitingLine
 
 
 def order(line: WaitingLine[str], now: float) -> list[str]:

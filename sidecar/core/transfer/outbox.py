@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from sidecar.core.base.slices import in_groups
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.message.repair import repair_symbols, worth_a_copy
-from sidecar.core.room import Room
 from sidecar.core.seam.links import FragmentsLost, Resend, Send, SendAbandon
+from sidecar.core.transfer.room import Room
 from sidecar.core.wire.frame import symbol_count
 
 if TYPE_CHECKING:
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from sidecar.core.base.slices import Step
     from sidecar.core.base.values import PathId, Priority, RequestId
     from sidecar.core.message.repair import Redundancy
-    from sidecar.core.routes import Routes
     from sidecar.core.seam.links import PathCommand
     from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.routes import Routes
     from sidecar.core.wire.messages import Encoded
 
 LOOKED_AT_ONCE = 512
