@@ -16,8 +16,8 @@ from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
-    from sidecar.core.copies import Copy, Request
     from sidecar.core.path_pace import PathPaces
+    from sidecar.core.robot.request.request import Copy, Request
     from sidecar.core.transfer.routes import Routes
 
 LOOKS = 20

@@ -6,13 +6,13 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import Priority
-from sidecar.core.copies import CopyState
+from sidecar.core.robot.request.request import CopyState
 from sidecar.core.wire.messages import CancelMessage, encode_message
 
 if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.base.values import RequestId
-    from sidecar.core.copies import Copy, Request
+    from sidecar.core.robot.request.request import Copy, Request
     from sidecar.core.seam.stats import EngineStats
     from sidecar.core.transfer.outbox import Outbox
     from sidecar.core.transfer.routes import Routes

@@ -14,13 +14,13 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 from protos.model import Assignment
-from sidecar.core.copies import CopyState
 from sidecar.core.interface_outcomes import interface_outcomes
+from sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName
-    from sidecar.core.copies import Copy, Request
     from sidecar.core.measurements import Measurements
+    from sidecar.core.robot.request.request import Copy, Request
 
 
 def measure_outcomes(request: Request, measurements: Measurements) -> None:

@@ -13,10 +13,10 @@ from protos.redundancy_mode import RedundancyMode
 from sidecar.core.adaptive import Adaptive
 from sidecar.core.base.values import PathState
 from sidecar.core.budgets import Budgets
-from sidecar.core.copies import HEDGE_AT, Copy, CopyState, Request
 from sidecar.core.exploration import Exploration
 from sidecar.core.path_pace import PathPaces
 from sidecar.core.path_records import PathRecords
+from sidecar.core.robot.request.request import HEDGE_AT, Copy, CopyState, Request
 from sidecar.core.wire.messages import RequestMessage, encode_message
 
 if TYPE_CHECKING:

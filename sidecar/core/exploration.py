@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName, ServiceName
     from sidecar.core.base.values import PathId
-    from sidecar.core.copies import Request
-    from sidecar.core.mapping import MappingTable
+    from sidecar.core.robot.request.mapping_table import MappingTable
+    from sidecar.core.robot.request.request import Request
     from sidecar.core.transfer.outbox import Outbox
     from sidecar.core.transfer.routes import Routes
 

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 
 from protos.model import InterfaceJointReport
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.copies import CopyState
+from sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from protos.model import InterfaceName, NodeName, ServiceName
-    from sidecar.core.copies import Request
+    from sidecar.core.robot.request.request import Request
 
 
 @dataclass(frozen=True, slots=True)

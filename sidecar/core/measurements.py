@@ -25,8 +25,8 @@ from sidecar.core.interface_outcomes import JointCounts
 if TYPE_CHECKING:
     from protos.model import Assignment, InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
-    from sidecar.core.copies import Carried
     from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
+    from sidecar.core.robot.request.request import Carried
     from sidecar.core.seam.links import PathMeasured
     from sidecar.core.transfer.routes import Routes
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName
     from sidecar.core.base.values import RequestId
-    from sidecar.core.copies import Request
     from sidecar.core.dispatching import Dispatching
+    from sidecar.core.robot.request.request import Request
     from sidecar.core.transfer.routes import Routes
 
     _Group = tuple[Lane, tuple[NodeName, ...]]

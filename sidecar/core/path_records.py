@@ -11,12 +11,12 @@ import math
 from collections import OrderedDict, deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.copies import CopyState
+from sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
-    from sidecar.core.copies import Copy, Request
+    from sidecar.core.robot.request.request import Copy, Request
     from sidecar.core.seam.stats import EngineStats
 
 WINDOW = 128

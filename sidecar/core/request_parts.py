@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.slices import Backlog
 from sidecar.core.penalties import Penalties
-from sidecar.core.request_index import RequestIndex
+from sidecar.core.robot.request.index import RequestIndex
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName
-    from sidecar.core.mapping import MappingTable
     from sidecar.core.measurements import Measurements
-    from sidecar.core.offers import Offers
+    from sidecar.core.robot.request.mapping_table import MappingTable
+    from sidecar.core.robot.request.service_catalog import Offers
     from sidecar.core.rules.budget import Budget
     from sidecar.core.seam.application import ApplicationEvent
     from sidecar.core.seam.stats import EngineStats

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.control_events import Settings
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from protos.model import NodeName, Role, ServiceName, ServiceOffer
-from sidecar.core.offers import WITHDRAW_AFTER_S
+from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import CallsForbidden, ExecuteRequest, RequestFailed, WithdrawService
 from tests.sim.joined_planes import JoinedPlanes, restored
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule

@@ -7,7 +7,7 @@ import pytest
 from protos.model import ServiceOffer
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import RejectReason
-from sidecar.core.offers import WITHDRAW_AFTER_S
+from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed, WithdrawService
 from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 from tests.sim.test_mesh import call_at, mapped

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.measurements import Measurements
+from sidecar.core.robot.request.request import Copy, CopyState, Request
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id

@@ -9,8 +9,8 @@ import pytest
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathState
-from sidecar.core.copies import Copy, CopyState, Request
 from sidecar.core.interface_outcomes import interface_outcomes
+from sidecar.core.robot.request.request import Copy, CopyState, Request
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, ServiceMapping, Version
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.mapping import MappingTable
+from sidecar.core.robot.request.mapping_table import MappingTable
 from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 

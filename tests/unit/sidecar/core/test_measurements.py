@@ -19,9 +19,9 @@ from protos.model import (
 from sidecar.core import measurements as measurements_module
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathState
-from sidecar.core.copies import Carried
 from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
 from sidecar.core.measurements import Measurements
+from sidecar.core.robot.request.request import Carried
 from sidecar.core.seam.links import PathMeasured
 from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path

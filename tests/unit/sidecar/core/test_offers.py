@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import Peer, ServiceName, ServiceOffer
-from sidecar.core import offers
 from sidecar.core.base.values import PathState
-from sidecar.core.offers import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
+from sidecar.core.robot.request import service_catalog
+from sidecar.core.robot.request.service_catalog import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
 from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import OfferService, WithdrawService
 from sidecar.core.seam.stats import EngineStats
@@ -204,7 +204,7 @@ def test_the_type_of_the_configuration_stands_against_any_number_of_servers() ->
 
 
 def test_types_of_names_that_peers_invent_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(offers, "MAX_TYPES", 2)
+    monkeypatch.setattr(service_catalog, "MAX_TYPES", 2)
     robot = Robot(pattern="/*")
     names = [ServiceName(f"/s{number}") for number in range(3)]
     for name in names:

@@ -8,7 +8,7 @@ import pytest
 
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathId, PathState, RejectReason
-from sidecar.core.copies import HEDGE_AT
+from sidecar.core.robot.request.request import HEDGE_AT
 from sidecar.core.rules.budget import Budget
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table

@@ -6,7 +6,7 @@ import pytest
 
 from protos.model import PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
 from sidecar.core.base.values import ExecutionId, PathState
-from sidecar.core.offers import WITHDRAW_AFTER_S
+from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import CancelExecution, ResponseArrived, WithdrawService
 from sidecar.core.seam.links import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
 from sidecar.core.wire.messages import ResponseMessage

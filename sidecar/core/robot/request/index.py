@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
     from sidecar.core.base.values import PathId, RequestId
-    from sidecar.core.copies import Copy, Request
+    from sidecar.core.robot.request.request import Copy, Request
 
 _Key = TypeVar("_Key")
 _Entry = TypeVar("_Entry")
