@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName
-    from sidecar.core.measurements import Measurements
+    from sidecar.core.robot.measure.measurements import Measurements
     from sidecar.core.robot.request.mapping_table import MappingTable
     from sidecar.core.robot.request.service_catalog import Offers
     from sidecar.core.rules.budget import Budget

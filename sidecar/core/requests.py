@@ -24,9 +24,9 @@ from sidecar.core.base.slices import GROUP, rest
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
 from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
-from sidecar.core.deadline_outcomes import measure_outcomes
 from sidecar.core.dispatching import MAX_COPIES, Dispatching
 from sidecar.core.no_room import NoRoom
+from sidecar.core.robot.measure.deadline_outcomes import measure_outcomes
 from sidecar.core.robot.request.request import Answer, Copy, CopyState, Request
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from sidecar.core.wire.messages import MAX_NAME_BYTES, MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage

@@ -10,7 +10,7 @@ import pytest
 from controlplane.core.shared_fate import HALF_LIFE_S, SharedFate
 from protos.explanation import Correlation
 from protos.model import InterfaceJointReport, InterfaceName, ServiceName
-from sidecar.core.interface_outcomes import InterfacePair, JointCounts, PairOutcome
+from sidecar.core.robot.measure.interface_outcomes import InterfacePair, JointCounts, PairOutcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

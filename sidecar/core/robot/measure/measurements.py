@@ -20,12 +20,12 @@ from protos.model import (
 from protos.size_class import size_class
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathState
-from sidecar.core.interface_outcomes import JointCounts
+from sidecar.core.robot.measure.interface_outcomes import JointCounts
 
 if TYPE_CHECKING:
     from protos.model import Assignment, InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
-    from sidecar.core.interface_outcomes import InterfacePair, PairOutcome
+    from sidecar.core.robot.measure.interface_outcomes import InterfacePair, PairOutcome
     from sidecar.core.robot.request.request import Carried
     from sidecar.core.seam.links import PathMeasured
     from sidecar.core.transfer.routes import Routes

@@ -1,0 +1,1 @@
+"""What the robot measures and reports. Imports `robot.request`."""
