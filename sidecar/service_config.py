@@ -51,7 +51,7 @@ CLOUD_LIFETIME_MS = 60_000.0
 
 MAX_EXPLORATION = 0.1
 DEFAULT_EXPLORATION = 0.01
-"""What it costs is bounded besides, see `sidecar.core.exploration`."""
+"""What it costs is bounded besides, see `sidecar.core.robot.dispatch.exploration`."""
 
 MIN_HEDGE_QUANTILE, MAX_HEDGE_QUANTILE = 0.5, 0.99
 """Below, most requests would be sent twice, which replicate does sooner; above, too few latencies are known."""

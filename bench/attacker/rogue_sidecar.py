@@ -12,7 +12,7 @@ from typing import Any
 
 from protos.model import ServiceName
 from sidecar import __main__ as sidecar
-from sidecar.core import dispatching
+from sidecar.core.robot.dispatch import dispatcher
 from sidecar.core.wire.messages import RequestMessage
 
 WANTED = ServiceName("/echo")
@@ -25,8 +25,8 @@ def main() -> int:
         return dataclasses.replace(RequestMessage(*arguments, **fields), service=WANTED)
 
     # What somebody has changed.
-    assert hasattr(dispatching, "RequestMessage"), "the requests are made elsewhere by now"
-    setattr(dispatching, "RequestMessage", forged)  # noqa: B010 - the module does not export it
+    assert hasattr(dispatcher, "RequestMessage"), "the requests are made elsewhere by now"
+    setattr(dispatcher, "RequestMessage", forged)  # noqa: B010 - the module does not export it
     return sidecar.main()
 
 

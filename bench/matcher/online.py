@@ -21,7 +21,7 @@ from bench.matcher.feed import REPORT_INTERVAL_S, Reporter
 from bench.matcher.plane import Plane
 from bench.matcher.races import ANSWER_BYTES, PATHS
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
-from sidecar.core.exploration import ExplorationBudget
+from sidecar.core.robot.dispatch.exploration import ExplorationBudget
 from sidecar.service_config import DEFAULT_EXPLORATION
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from protos.model import NodeName
 
 LONGEST_S = 600.0
-"""No sidecar keeps a server out for longer (`sidecar.core.penalties`), whatever it says."""
+"""No sidecar keeps a server out for longer (`sidecar.core.robot.dispatch.penalties`), whatever it says."""
 
 
 class Penalties:

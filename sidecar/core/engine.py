@@ -18,10 +18,10 @@ from sidecar.core.base.slices import SLICE, Backlog, Step, rest
 from sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
 from sidecar.core.goodbyes import Goodbyes
 from sidecar.core.peers import Peers
-from sidecar.core.penalties import Penalties
-from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
 from sidecar.core.revocation_exchange import RevocationExchange
+from sidecar.core.robot.dispatch.context import RequestParts
+from sidecar.core.robot.dispatch.penalties import Penalties
 from sidecar.core.robot.measure.measurements import Measurements
 from sidecar.core.robot.request.mapping_table import MappingTable
 from sidecar.core.robot.request.service_catalog import Offers

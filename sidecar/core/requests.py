@@ -23,9 +23,9 @@ from protos.redundancy_mode import RedundancyMode
 from sidecar.core.base.slices import GROUP, rest
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
-from sidecar.core.calling_off import SMALL_ANSWER_BYTES, CallingOff
-from sidecar.core.dispatching import MAX_COPIES, Dispatching
-from sidecar.core.no_room import NoRoom
+from sidecar.core.robot.dispatch.backlog import NoRoom
+from sidecar.core.robot.dispatch.cancelling import SMALL_ANSWER_BYTES, CallingOff
+from sidecar.core.robot.dispatch.dispatcher import MAX_COPIES, Dispatching
 from sidecar.core.robot.measure.deadline_outcomes import measure_outcomes
 from sidecar.core.robot.request.request import Answer, Copy, CopyState, Request
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName
     from sidecar.core.base.slices import Step
     from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.request_parts import RequestParts
+    from sidecar.core.robot.dispatch.context import RequestParts
     from sidecar.core.rules.service_rule import ServiceRule
 
 MAX_IN_FLIGHT = 8192

@@ -8,7 +8,7 @@ import pytest
 
 from controlplane.explanation_text import render
 from protos.model import Role
-from sidecar.core.penalties import FIRST_S, LONGEST_S
+from sidecar.core.robot.dispatch.penalties import FIRST_S, LONGEST_S
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 from sidecar.core.base.values import RejectReason
-from sidecar.core.dispatching import MAX_ASKED, MAX_COPIES
+from sidecar.core.robot.dispatch.dispatcher import MAX_ASKED, MAX_COPIES
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed
 from tests.sim.mesh import Mesh, rule
 

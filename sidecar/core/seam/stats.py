@@ -68,7 +68,7 @@ class EngineStats:
     hedged: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
     """Copies sent since another one took long."""
     copy_bytes: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
-    """(interface, service, copy: first | extra); bytes of messages, see `sidecar.core.budgets`."""
+    """(interface, service, copy: first | extra); bytes of messages, see `sidecar.core.robot.dispatch.budgets`."""
     copies_refused: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
     """(interface, service, limit: load | day); copies that a budget forbade."""
     bad_answers: Counter[tuple[NodeName, ServiceName]] = field(default_factory=Counter)

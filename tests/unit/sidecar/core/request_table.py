@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathId, PathState, Priority, RejectReason, RequestId
-from sidecar.core.request_parts import RequestParts
 from sidecar.core.requests import RequestTable
+from sidecar.core.robot.dispatch.context import RequestParts
 from sidecar.core.robot.measure.measurements import Measurements
 from sidecar.core.robot.request.mapping_table import MappingTable
 from sidecar.core.robot.request.service_catalog import Offers

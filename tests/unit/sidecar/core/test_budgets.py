@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from sidecar.core.budgets import DAY_S, MAX_SAVED_BYTES, Budgets
+from sidecar.core.robot.dispatch.budgets import DAY_S, MAX_SAVED_BYTES, Budgets
 from sidecar.core.rules.budget import Budget
 from sidecar.core.seam.stats import EngineStats
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN

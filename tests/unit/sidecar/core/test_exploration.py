@@ -10,7 +10,7 @@ import pytest
 
 from protos.model import Assignment, MappingSet, ServiceMapping, Version
 from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
-from sidecar.core.exploration import (
+from sidecar.core.robot.dispatch.exploration import (
     MAX_PER_S,
     MAX_REQUEST_BYTES,
     MAX_SAVED,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core import path_pace
 from sidecar.core.base.values import PathState
-from sidecar.core.path_pace import FADE_S, PathPaces
+from sidecar.core.robot.dispatch import path_pace
+from sidecar.core.robot.dispatch.path_pace import FADE_S, PathPaces
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path

@@ -10,12 +10,12 @@ import enum
 from typing import TYPE_CHECKING
 
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.adaptive import Adaptive
 from sidecar.core.base.values import PathState
-from sidecar.core.budgets import Budgets
-from sidecar.core.exploration import Exploration
-from sidecar.core.path_pace import PathPaces
-from sidecar.core.path_records import PathRecords
+from sidecar.core.robot.dispatch.adaptive import Adaptive
+from sidecar.core.robot.dispatch.budgets import Budgets
+from sidecar.core.robot.dispatch.exploration import Exploration
+from sidecar.core.robot.dispatch.path_pace import PathPaces
+from sidecar.core.robot.dispatch.path_records import PathRecords
 from sidecar.core.robot.request.request import HEDGE_AT, Copy, CopyState, Request
 from sidecar.core.wire.messages import RequestMessage, encode_message
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName
     from sidecar.core.base.values import PathId
-    from sidecar.core.request_parts import RequestParts
+    from sidecar.core.robot.dispatch.context import RequestParts
     from sidecar.core.wire.messages import Encoded
 
 MAX_COPIES = 8

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName
     from sidecar.core.base.values import RequestId
-    from sidecar.core.dispatching import Dispatching
+    from sidecar.core.robot.dispatch.dispatcher import Dispatching
     from sidecar.core.robot.request.request import Request
     from sidecar.core.transfer.routes import Routes
 

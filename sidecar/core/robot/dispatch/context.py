@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.slices import Backlog
-from sidecar.core.penalties import Penalties
+from sidecar.core.robot.dispatch.penalties import Penalties
 from sidecar.core.robot.request.index import RequestIndex
 
 if TYPE_CHECKING:

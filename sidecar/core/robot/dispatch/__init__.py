@@ -1,0 +1,1 @@
+"""Which copies of a request leave, where and when. Imports `robot.measure` and `robot.request`."""
