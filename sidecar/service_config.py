@@ -24,7 +24,7 @@ from sidecar.config_fields import (
     is_glob,
 )
 from sidecar.core.base.values import Priority
-from sidecar.core.fallback_queue import SPARE
+from sidecar.core.robot.fallback.queue import SPARE
 from sidecar.core.rules.budget import Budget
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.rules.service_rule import MAX_LIFETIME_S, ServiceRule

@@ -1,6 +1,6 @@
 """Robot: the local services that stand in for the network: where they are, and what they are asked.
 
-When they are asked, and which answer counts, is settled in `sidecar.core.fallback`.
+When they are asked, and which answer counts, is settled in `sidecar.core.robot.fallback.fallbacks`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sidecar.core.fallback import Fallbacks
+from sidecar.core.robot.fallback.fallbacks import Fallbacks
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.local_server import LocalServer
 from sidecar.ros.types import load_service_type
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from protos.model import ServiceName
     from sidecar.core.base.values import RequestId
-    from sidecar.core.fallback import FallbackCall
+    from sidecar.core.robot.fallback.fallbacks import FallbackCall
     from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import RequestFailed
     from sidecar.ros.graph import NameOf, Served

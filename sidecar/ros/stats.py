@@ -33,7 +33,7 @@ class BridgeStats:
     abandoned: Counter[ServiceName] = field(default_factory=Counter)
     """Cloud: requests whose answer nobody waits for any more."""
     fallbacks: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
-    """Robot: (service, outcome: one of `sidecar.core.fallback.OUTCOMES`)."""
+    """Robot: (service, outcome: one of `sidecar.core.robot.fallback.fallbacks.OUTCOMES`)."""
     fallback_up: dict[ServiceName, bool] = field(default_factory=dict)
     """Robot: services with a fallback; whether it can be asked. Replaced, never changed."""
     fallback_takes_s: dict[ServiceName, float] = field(default_factory=dict)

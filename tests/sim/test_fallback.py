@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.model import Role, ServiceName
-from sidecar.core.fallback import Fallbacks
+from sidecar.core.robot.fallback.fallbacks import Fallbacks
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from tests.sim.mesh import SERVICE, Mesh, rule

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import ServiceName
-from sidecar.core import fallback, fallback_queue
-from sidecar.core.fallback import Accepted, Fallbacks
+from sidecar.core.robot.fallback import fallbacks, queue
+from sidecar.core.robot.fallback.fallbacks import Accepted, Fallbacks
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import RequestFailed
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 PLAN, LOCAL = ServiceName("/plan"), ServiceName("/plan_locally")
 DEADLINE_S, LIFETIME_S = 1.0, 10.0
 TAKES_S = 0.2
-START_S = DEADLINE_S * (1 - fallback_queue.SPARE) - TAKES_S
+START_S = DEADLINE_S * (1 - queue.SPARE) - TAKES_S
 """When a single request has to begin."""
 IN_TIME, LATE = Accepted(PLAN, late=False), Accepted(PLAN, late=True)
 
@@ -65,7 +65,7 @@ class World:
         return self.fallbacks.network_failed(failed(request_id(number)), now)
 
     def counted(self) -> dict[str, int]:
-        assert {outcome for _, outcome in self.outcomes} == set(fallback.OUTCOMES)
+        assert {outcome for _, outcome in self.outcomes} == set(fallbacks.OUTCOMES)
         return {outcome: count for (_, outcome), count in self.outcomes.items() if count}
 
     def assert_empty(self) -> None:
@@ -120,7 +120,7 @@ def test_many_at_once_begin_so_early_that_the_last_is_in_time() -> None:
     """One server, one request after the other."""
     world = World()
     world.submit(1, 2, 3)
-    last = 1.0 - fallback_queue.SPARE - TAKES_S
+    last = 1.0 - queue.SPARE - TAKES_S
     times = [rounded(last - ahead * TAKES_S) for ahead in (2, 1, 0)]
     assert world.run_until(last - TAKES_S) == [(times[0], 1), (times[1], 2)]
     done = 0.35
@@ -200,7 +200,7 @@ def test_what_went_down_with_it_is_asked_again_but_not_for_ever() -> None:
     world.up(0.85, up=False)
     assert world.asked() == []
     world.up(0.9)
-    for _ in range(fallback.MAX_ATTEMPTS - 1):
+    for _ in range(fallbacks.MAX_ATTEMPTS - 1):
         assert world.asked() == [1]
         world.fallbacks.replaced(PLAN, 0.95)
     assert world.asked() == []
@@ -212,7 +212,7 @@ def test_what_went_down_with_it_is_asked_again_but_not_for_ever() -> None:
 def test_a_hung_one_is_given_up_and_tried_again() -> None:
     world = World()
     world.submit(1)
-    begins = [rounded(START_S + turn * fallback_queue.STALL_S) for turn in range(fallback.MAX_ATTEMPTS)]
+    begins = [rounded(START_S + turn * queue.STALL_S) for turn in range(fallbacks.MAX_ATTEMPTS)]
     assert world.run_until(9.0) == [(at, 1) for at in begins]
     assert not world.fallbacks._queues[PLAN].called, "there is room for the next"
     assert world.fallbacks.answered(request_id(1), 9.0) is None
@@ -234,17 +234,17 @@ def test_in_an_overload_those_go_first_that_can_be_in_time() -> None:
 
 def test_the_queue_has_an_end() -> None:
     world = World()
-    count = fallback.MAX_WANTED + fallback_queue.MAX_CALLED
+    count = fallbacks.MAX_WANTED + queue.MAX_CALLED
     for number in range(count + 3):
         world.submit(number)
         world.fallbacks.unreachable(request_id(number), 0.0)
-    assert world.counted() == {"started": fallback_queue.MAX_CALLED, "overloaded": 3}
+    assert world.counted() == {"started": queue.MAX_CALLED, "overloaded": 3}
     assert world.fail(count, 0.5)
     assert not world.fail(count - 1, 0.5)
 
 
 def test_payloads_are_not_kept_beyond_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.core.fallback.MAX_HELD_BYTES", 2)
+    monkeypatch.setattr("sidecar.core.robot.fallback.fallbacks.MAX_HELD_BYTES", 2)
     world = World()
     world.submit(1, 2, 3)
     assert world.counted() == {"overloaded": 1}
@@ -255,7 +255,7 @@ def test_payloads_are_not_kept_beyond_the_limit(monkeypatch: pytest.MonkeyPatch)
 def test_what_it_takes_is_learned() -> None:
     world = World(takes_s=None)
     world.submit(1)
-    assert world.run_until(0.45) == [(rounded(1 - fallback_queue.SPARE - 0.5), 1)], "half the deadline at first"
+    assert world.run_until(0.45) == [(rounded(1 - queue.SPARE - 0.5), 1)], "half the deadline at first"
     world.fallbacks.answered(request_id(1), 0.55)
     assert world.fallbacks.expected_s(PLAN) == pytest.approx(0.15), "half as much again while little is known"
     for number in range(2, 60):

@@ -13,7 +13,7 @@ import heapq
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.model import ServiceName
-from sidecar.core.fallback_queue import FallbackQueue, FallbackRequest
+from sidecar.core.robot.fallback.queue import FallbackQueue, FallbackRequest
 
 if TYPE_CHECKING:
     from collections import Counter

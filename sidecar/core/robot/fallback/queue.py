@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from sidecar.core.fallback_times import FallbackTimes
+from sidecar.core.robot.fallback.times import FallbackTimes
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import RequestId
