@@ -16,15 +16,15 @@ from sidecar.core.attention import Attention
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.slices import SLICE, Backlog, Step, rest
 from sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
-from sidecar.core.goodbyes import Goodbyes
 from sidecar.core.peers import Peers
-from sidecar.core.requests import RequestTable
 from sidecar.core.revocation_exchange import RevocationExchange
 from sidecar.core.robot.dispatch.context import RequestParts
 from sidecar.core.robot.dispatch.penalties import Penalties
+from sidecar.core.robot.goodbyes import Goodbyes
 from sidecar.core.robot.measure.measurements import Measurements
 from sidecar.core.robot.request.mapping_table import MappingTable
 from sidecar.core.robot.request.service_catalog import Offers
+from sidecar.core.robot.request_table import RequestTable
 from sidecar.core.rules.service_rule import Rules, ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, OfferService, WithdrawService
 from sidecar.core.seam.links import (

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathId, PathState, Priority, RejectReason, RequestId
-from sidecar.core.requests import RequestTable
 from sidecar.core.robot.dispatch.context import RequestParts
 from sidecar.core.robot.measure.measurements import Measurements
 from sidecar.core.robot.request.mapping_table import MappingTable
 from sidecar.core.robot.request.service_catalog import Offers
+from sidecar.core.robot.request_table import RequestTable
 from sidecar.core.rules.service_rule import Rules, ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import LinkCommand, Send

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import MAX_GOODBYES, NodeName, SessionId
-from sidecar.core.goodbyes import Goodbyes
+from sidecar.core.robot.goodbyes import Goodbyes
 
 pytestmark = pytest.mark.audit("ops-11")
 
