@@ -16,6 +16,7 @@ from sidecar.core.attention import Attention
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.slices import SLICE, Backlog, Step, rest
 from sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
+from sidecar.core.cloud.serving import Serving, ServingParts
 from sidecar.core.peers import Peers
 from sidecar.core.revocation_exchange import RevocationExchange
 from sidecar.core.robot.dispatch.context import RequestParts
@@ -49,7 +50,6 @@ from sidecar.core.seam.links import (
     SetPeers,
 )
 from sidecar.core.seam.stats import EngineStats
-from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.transfer.inbound import Inbound
 from sidecar.core.transfer.outbox import Outbox
 from sidecar.core.transfer.routes import Routes

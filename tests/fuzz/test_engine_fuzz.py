@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protos.model import Role, ServiceName
-from sidecar.core.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
-from sidecar.core.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
 from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
-from sidecar.core.dedup import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
+from sidecar.core.cloud.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
+from sidecar.core.cloud.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
+from sidecar.core.cloud.executions import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
+from sidecar.core.cloud.refused_copies import MAX_REFUSED_COPIES
 from sidecar.core.link.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
 from sidecar.core.message.reassembly import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
-from sidecar.core.refused_copies import MAX_REFUSED_COPIES
 from sidecar.core.transfer.room import MAX_MESSAGES
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import Role, ServiceOffer
-from sidecar.core import answers as answers_module
+from sidecar.core.cloud import answers as answers_module
 from sidecar.core.seam.application import RequestFailed
 from sidecar.core.transfer import room as room_module
 from sidecar.core.transfer.room import SMALL_BYTES, Lane

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model import NodeName
-from sidecar.core import answers as answers_module
-from sidecar.core.answers import Answers
 from sidecar.core.base.slices import SLICE, Backlog
 from sidecar.core.base.values import PathState, Priority, RejectReason
-from sidecar.core.dedup import Reply, Waiter
+from sidecar.core.cloud import answers as answers_module
+from sidecar.core.cloud.answers import Answers
+from sidecar.core.cloud.executions import Reply, Waiter
 from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.links import LinkCommand, Send
 from sidecar.core.seam.stats import EngineStats

@@ -4,7 +4,7 @@ import pytest
 
 from protos.model import NodeName
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
-from sidecar.core.cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
+from sidecar.core.cloud.early_cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
 from sidecar.core.seam.stats import EngineStats
 from tests.unit.sidecar.core.builders import request_id
 

@@ -5,11 +5,11 @@ from itertools import pairwise
 import pytest
 
 from protos.model import NodeName, ServiceName
-from sidecar.core import dedup
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
 from sidecar.core.base.slices import Backlog
 from sidecar.core.base.values import ExecutionId, RejectReason
-from sidecar.core.dedup import (
+from sidecar.core.cloud import executions as dedup
+from sidecar.core.cloud.executions import (
     MAX_CACHED_BYTES,
     MAX_RUNNING,
     MAX_WAITERS,

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 from protos.model import NodeName, ServiceName, ServiceOffer
 from sidecar.core.base.slices import Backlog
 from sidecar.core.base.values import PathState, RejectReason
-from sidecar.core.forbidden import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
+from sidecar.core.cloud.forbidden_calls import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
+from sidecar.core.cloud.serving import Serving, ServingParts
 from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import ApplicationEvent, CallsForbidden, ExecuteRequest
 from sidecar.core.seam.links import PathCommand, Send
 from sidecar.core.seam.stats import EngineStats
-from sidecar.core.serving import Serving, ServingParts
 from sidecar.core.transfer.outbox import Outbox
 from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from protos.model import NodeName
-from sidecar.core import refused_copies
 from sidecar.core.base.values import RejectReason
-from sidecar.core.dedup import MIN_REMEMBER_S, Reply, Waiter
-from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
+from sidecar.core.cloud import refused_copies
+from sidecar.core.cloud.executions import MIN_REMEMBER_S, Reply, Waiter
+from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import RejectionMessage
 from tests.unit.sidecar.core.builders import request, request_id

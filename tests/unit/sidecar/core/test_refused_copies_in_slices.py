@@ -7,7 +7,7 @@ import pytest
 from protos.model import NodeName
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
 from sidecar.core.base.values import RejectReason, RequestId
-from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
+from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.seam.stats import EngineStats
 
 ROBOT = NodeName("robot")

@@ -22,7 +22,7 @@ from sidecar.core.base.request_id import is_race
 from sidecar.core.base.slices import in_groups
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import PathState, Priority, RejectReason
-from sidecar.core.dedup import Waiter
+from sidecar.core.cloud.executions import Waiter
 from sidecar.core.transfer.room import Lane
 from sidecar.core.transfer.waiting_line import WaitingLine
 from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode_message
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from protos.model import NodeName
     from sidecar.core.base.slices import Backlog, Step
     from sidecar.core.base.values import PathId, RequestId
-    from sidecar.core.dedup import Reply
+    from sidecar.core.cloud.executions import Reply
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.rules.service_rule import Rules
     from sidecar.core.seam.stats import EngineStats

@@ -18,12 +18,12 @@ import heapq
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.answer_cache import AnswerCache
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
-from sidecar.core.cancels import EarlyCancels
-from sidecar.core.refused_copies import RefusedCopies, RefusedCopy
+from sidecar.core.cloud.answer_cache import AnswerCache
+from sidecar.core.cloud.early_cancels import EarlyCancels
+from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.rules.service_rule import MAX_LIFETIME_S
 from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage

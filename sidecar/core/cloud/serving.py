@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from sidecar.core.answers import Answers
 from sidecar.core.base.slices import in_groups
 from sidecar.core.base.values import RejectReason
-from sidecar.core.dedup import ExecutionTable, Reply, Waiter
-from sidecar.core.forbidden import ForbiddenCalls
+from sidecar.core.cloud.answers import Answers
+from sidecar.core.cloud.executions import ExecutionTable, Reply, Waiter
+from sidecar.core.cloud.forbidden_calls import ForbiddenCalls
 from sidecar.core.rules.service_rule import MAX_LIFETIME_S, Rules
 from sidecar.core.seam.application import ExecuteRequest
 
