@@ -33,7 +33,7 @@ from protos.model import (
 )
 from protos.pair_token import pair_token
 from sidecar.core.base.values import RequestId
-from sidecar.core.engine import Engine, EngineConfig
+from sidecar.core.engine.engine import Engine, EngineConfig
 from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
 from sidecar.core.rules.service_rule import ServiceRule

@@ -20,7 +20,7 @@ from protos.model import ResourceKind
 from protos.revocation_views import revocation_gauges
 from sidecar.core.control_watch import LEAVE_CAUSES
 from sidecar.core.control_ways import DIAL_DROPS
-from sidecar.core.revocation_exchange import EXCHANGES
+from sidecar.core.engine.revocation_exchange import EXCHANGES
 from sidecar.local.server import REFUSALS
 from sidecar.metric_families import by_one, counter, cumulative, gauge
 from sidecar.state_store import FAILURES

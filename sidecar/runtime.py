@@ -32,7 +32,7 @@ from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient
 from sidecar.core.control_session import Apply, ControlSession
 from sidecar.core.control_ways import ControlInterface
-from sidecar.core.engine import EngineConfig
+from sidecar.core.engine.engine import EngineConfig
 from sidecar.local.server import LocalServer, LocalSocketError
 from sidecar.local.state import LocalState, MappingOrigin
 from sidecar.metrics import MetricSources, serve_metrics

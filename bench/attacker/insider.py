@@ -31,7 +31,7 @@ from protos.tls_files import load_tls_files
 from sidecar import __main__ as sidecar
 from sidecar import runtime
 from sidecar.core.base.values import RejectReason, RequestId
-from sidecar.core.engine import Engine
+from sidecar.core.engine.engine import Engine
 from sidecar.net import managed_interface
 from sidecar.net.dataplane import ThreadedDataPlane
 

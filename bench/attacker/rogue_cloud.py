@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sidecar import __main__ as sidecar
-from sidecar.core.engine import Engine
+from sidecar.core.engine.engine import Engine
 
 SHARE = ".share"
 GARBAGE_BYTES = 10

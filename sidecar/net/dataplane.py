@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError
 from sidecar.core.base.values import PathState
-from sidecar.core.engine import Engine, EngineConfig
+from sidecar.core.engine.engine import Engine, EngineConfig
 from sidecar.core.link.pinging import Pong
 from sidecar.core.seam.links import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
 from sidecar.net.decoder import Decoder

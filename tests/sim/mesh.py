@@ -29,7 +29,7 @@ from protos.pair_token import pair_token
 from sidecar.announcement import Announcer
 from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import RequestId
-from sidecar.core.engine import Engine, EngineConfig
+from sidecar.core.engine.engine import Engine, EngineConfig
 from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS

@@ -13,7 +13,7 @@ import pytest
 
 from protos.model import InterfaceName, PeerSet, RemovalReason, RemovedPeer, ServiceName, ServiceOffer, Version
 from protos.redundancy_mode import RedundancyMode
-from sidecar.core.engine import Engine
+from sidecar.core.engine.engine import Engine
 from sidecar.core.seam.application import RequestFailed
 from sidecar.core.seam.links import SetCarrier
 from tests.sim.mesh import TYPE, Mesh, Node, rule

@@ -15,7 +15,7 @@ from protos.model import Role
 from protos.tls_files import CRL_FILE, TlsWatch, load_tls_files
 from sidecar.announcement import Announcer
 from sidecar.core.base.values import Priority
-from sidecar.core.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
+from sidecar.core.engine.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
 from sidecar.core.seam.links import SetCredential
 from sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 from sidecar.revocations import Revocations

@@ -42,14 +42,14 @@ from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.crypto import session
 from sidecar.core.crypto.key_schedule import pair_keys
+from sidecar.core.engine.peers import RESTART_GAP_S
+from sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
 from sidecar.core.link.link import path_table
 from sidecar.core.message import reassembly
 from sidecar.core.path import address, key_exchange
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
-from sidecar.core.peers import RESTART_GAP_S
 from sidecar.core.transfer import outbox
-from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
 from sidecar.core.wire import fec, frame, introduction, messages
 from sidecar.core.wire.frame import Header
 from tests.sessions import seal

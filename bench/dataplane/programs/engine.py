@@ -40,7 +40,7 @@ from protos.model import (
 from protos.pair_token import pair_token
 from sidecar.config import SidecarConfig
 from sidecar.core.base.values import RequestId
-from sidecar.core.engine import EngineConfig
+from sidecar.core.engine.engine import EngineConfig
 from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager

@@ -13,10 +13,10 @@ from protos.candidate_signature import sign_candidates, verify_candidates
 from protos.clock_floor import ClockFloor
 from protos.identity import IdentityRole
 from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, NodeName, Peer, PeerSet, Role, Version
-from sidecar.core import announced as module
-from sidecar.core.announced import Announced
 from sidecar.core.crypto import session
-from sidecar.core.peers import Peers
+from sidecar.core.engine.announced import Announced
+from sidecar.core.engine.engine import announced as module
+from sidecar.core.engine.peers import Peers
 from sidecar.start_session import start_session
 from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import peer

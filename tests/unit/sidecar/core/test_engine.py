@@ -22,7 +22,7 @@ from protos.model import (
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathId, PathState, Priority, RejectReason
-from sidecar.core.engine import SWEEP_EVERY_S, Engine, EngineConfig
+from sidecar.core.engine.engine import SWEEP_EVERY_S, Engine, EngineConfig
 from sidecar.core.message.reassembly import OVER_REMEMBERED
 from sidecar.core.rules.budget import Budget
 from sidecar.core.seam.application import (

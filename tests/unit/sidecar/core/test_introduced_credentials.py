@@ -15,9 +15,9 @@ from protos.credential import decode_credential
 from protos.errors import DecodeError
 from protos.model import POLICY_PENDING, NodeName, PeerSet, Role, SessionId, Version
 from sidecar.core.crypto.session import OwnSession
-from sidecar.core.peers import Peers
+from sidecar.core.engine.peers import Peers
+from sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_AT_ONCE, LOOKS_PER_S
 from sidecar.core.seam.links import PeerRenewed, PeerRestarted
-from sidecar.core.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_AT_ONCE, LOOKS_PER_S
 from tests.sessions import credential_of, private_key
 from tests.unit.sidecar.core.builders import A, B, peer
 

@@ -30,7 +30,7 @@ from protos.model import (
     Version,
 )
 from sidecar.core.crypto.session import OwnSession
-from sidecar.core.peers import RESTART_GAP_S, Peers
+from sidecar.core.engine.peers import RESTART_GAP_S, Peers
 from sidecar.core.seam.links import PeerRestarted
 from tests.sessions import credential_of, private_key, session_of, with_credential
 from tests.unit.sidecar.core.builders import ECHO, A, B, peer

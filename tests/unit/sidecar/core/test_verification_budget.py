@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import NodeName
-from sidecar.core.verification_budget import LOOKS_AT_ONCE, VerificationBudget
+from sidecar.core.engine.verification_budget import LOOKS_AT_ONCE, VerificationBudget
 
 
 @pytest.mark.audit("sec-5")

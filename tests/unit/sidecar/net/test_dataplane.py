@@ -36,7 +36,7 @@ from protos.model import (
 )
 from protos.pair_token import pair_token
 from sidecar.core.base.values import PathState, RequestId
-from sidecar.core.engine import EngineConfig
+from sidecar.core.engine.engine import EngineConfig
 from sidecar.core.link.datagrams import Batch, LinkIdentity
 from sidecar.core.link.link import Link
 from sidecar.core.rules.service_rule import ServiceRule

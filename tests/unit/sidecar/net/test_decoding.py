@@ -10,7 +10,7 @@ import pytest
 
 from protos.model import InterfaceName, PeerSet, Role, ServiceOffer, SessionId, Version
 from sidecar.core.base.values import Priority
-from sidecar.core.engine import EngineConfig
+from sidecar.core.engine.engine import EngineConfig
 from sidecar.core.message.decoding import Decoding
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.message.partial import Partial

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 from protos.errors import DecodeError
 from protos.identity import CertificateError
 from protos.model import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
-from sidecar.core.announced import Announced
+from sidecar.core.engine.announced import Announced
+from sidecar.core.engine.verification_budget import VerificationBudget
 from sidecar.core.seam.links import LinkPeer
-from sidecar.core.verification_budget import VerificationBudget
 
 if TYPE_CHECKING:
     from collections import Counter

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 from protos.errors import DecodeError, UnknownKindError
 from protos.model import MAX_PEERS, MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
-from sidecar.core.attention import Attention
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.slices import SLICE, Backlog, Step, rest
 from sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
 from sidecar.core.cloud.serving import Serving, ServingParts
-from sidecar.core.peers import Peers
-from sidecar.core.revocation_exchange import RevocationExchange
+from sidecar.core.engine.attention import Attention
+from sidecar.core.engine.peers import Peers
+from sidecar.core.engine.revocation_exchange import RevocationExchange
 from sidecar.core.robot.dispatch.context import RequestParts
 from sidecar.core.robot.dispatch.penalties import Penalties
 from sidecar.core.robot.goodbyes import Goodbyes
