@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.base.values import PathState
     from sidecar.core.link.pinging import Pong
-    from sidecar.core.stun_events import StunEvent
+    from sidecar.core.stun.events import StunEvent
     from sidecar.stop_request import StopRequest
 
 log = logging.getLogger(__name__)

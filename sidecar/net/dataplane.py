@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from sidecar.core.path.view import PathView
     from sidecar.core.seam.links import LinkEvent
     from sidecar.core.seam.stats import EngineStats, LinkStats
-    from sidecar.core.stun_events import StunEvent
+    from sidecar.core.stun.events import StunEvent
     from sidecar.net.interface_thread import InterfaceThread
     from sidecar.ports import Application
 

@@ -16,7 +16,7 @@ from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.readiness import Readiness
 from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
-from sidecar.core.stun_events import Failed, Mapped, MappingChanged
+from sidecar.core.stun.events import Failed, Mapped, MappingChanged
 from sidecar.net.host_names import HostNames
 from sidecar.net.interfaces import choose, list_interfaces, missing_interfaces
 from sidecar.net.managed_interface import STOP_TIMEOUT_S, ManagedInterface
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from sidecar.config import SidecarConfig
     from sidecar.core.crypto.session import OwnSession
     from sidecar.core.link.memory import LinkMemory
-    from sidecar.core.stun_client import StunView
-    from sidecar.core.stun_events import StunEvent
+    from sidecar.core.stun.client import StunView
+    from sidecar.core.stun.events import StunEvent
     from sidecar.net.dataplane import ThreadedDataPlane
     from sidecar.net.interface_thread import InterfaceThread
     from sidecar.net.interfaces import Interface, InterfaceChoice

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from sidecar.core.link.link import Link
     from sidecar.core.link.pinging import Pong
     from sidecar.core.seam.links import LinkCommand, LinkEvent
-    from sidecar.core.stun_client import StunClient
-    from sidecar.core.stun_events import StunEvent
+    from sidecar.core.stun.client import StunClient
+    from sidecar.core.stun.events import StunEvent
 
 log = logging.getLogger(__name__)
 

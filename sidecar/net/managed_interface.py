@@ -16,7 +16,7 @@ from sidecar.core.control_ways import families_in_turn
 from sidecar.core.link.link import Link
 from sidecar.core.path.pmtu import LEAST_MTU
 from sidecar.core.seam.links import SetCarrier, SetMtu, SetReady
-from sidecar.core.stun_client import StunClient
+from sidecar.core.stun.client import StunClient
 from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.sockets import BoundTo, open_socket
 

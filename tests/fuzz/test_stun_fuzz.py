@@ -21,7 +21,7 @@ from protos.stun import (
     encode,
     is_stun,
 )
-from sidecar.core.stun_client import StunClient
+from sidecar.core.stun.client import StunClient
 
 COOKIE = bytes.fromhex("2112a442")
 

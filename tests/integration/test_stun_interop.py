@@ -19,8 +19,8 @@ import pytest
 from controlplane.core.stun_responder import StunOutcome
 from controlplane.stun_server import SHARE, StunServer, start_stun_server
 from protos.stun import MessageClass, StunMessage, decode, encode
-from sidecar.core.stun_client import StunClient
-from sidecar.core.stun_events import Mapped, StunEvent
+from sidecar.core.stun.client import StunClient
+from sidecar.core.stun.events import Mapped, StunEvent
 from tests.free_ports import free_port
 
 if TYPE_CHECKING:

@@ -6,11 +6,11 @@ import random
 from typing import TYPE_CHECKING
 
 from protos.stun import MessageClass, StunMessage, decode, encode
-from sidecar.core.stun_client import StunClient
+from sidecar.core.stun.client import StunClient
 
 if TYPE_CHECKING:
-    from sidecar.core.stun_events import StunEvent
-    from sidecar.core.stun_family import StunClientConfig
+    from sidecar.core.stun.events import StunEvent
+    from sidecar.core.stun.family import StunClientConfig
 
 A = ("192.0.2.1", 3478)
 B = ("192.0.2.2", 3478)

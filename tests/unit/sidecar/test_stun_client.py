@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import pytest
 
-from sidecar.core.stun_client import MAX_SERVERS_PER_FAMILY, StunClient
-from sidecar.core.stun_events import Failed, Mapped, MappingChanged, StunEvent
-from sidecar.core.stun_family import MAX_QUEUED_EVENTS, StunClientConfig
-from sidecar.core.stun_transaction import Retransmission
+from sidecar.core.stun.client import MAX_SERVERS_PER_FAMILY, StunClient
+from sidecar.core.stun.events import Failed, Mapped, MappingChanged, StunEvent
+from sidecar.core.stun.family import MAX_QUEUED_EVENTS, StunClientConfig
+from sidecar.core.stun.transaction import Retransmission
 from tests.unit.sidecar.stun_network import (
     C6,
     MOVED,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from sidecar.core.link.pinging import Pong
     from sidecar.core.seam.links import LinkEvent
-    from sidecar.core.stun_events import StunEvent
+    from sidecar.core.stun.events import StunEvent
 
 PATIENCE_S = 20.0
 

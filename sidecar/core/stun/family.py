@@ -8,8 +8,8 @@ from ipaddress import ip_address
 from typing import TYPE_CHECKING
 
 from protos.stun import TRANSACTION_ID_BYTES, MessageClass, StunMessage
-from sidecar.core.stun_events import Failed, Mapped, MappingChanged, StunDrop, StunEvent
-from sidecar.core.stun_transaction import Retransmission, StunTransaction
+from sidecar.core.stun.events import Failed, Mapped, MappingChanged, StunDrop, StunEvent
+from sidecar.core.stun.transaction import Retransmission, StunTransaction
 
 if TYPE_CHECKING:
     import random

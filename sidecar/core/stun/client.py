@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from protos.errors import DecodeError
 from protos.stun import MessageClass, decode, is_stun
-from sidecar.core.stun_events import StunDrop
-from sidecar.core.stun_family import StunClientConfig, StunFamilyClient, StunOutbox
+from sidecar.core.stun.events import StunDrop
+from sidecar.core.stun.family import StunClientConfig, StunFamilyClient, StunOutbox
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Iterable
 
     from protos.model import Address
-    from sidecar.core.stun_events import StunEvent
+    from sidecar.core.stun.events import StunEvent
 
 MAX_SERVERS_PER_FAMILY = 4
 """Servers used of those a control plane names; the others are ignored and counted."""

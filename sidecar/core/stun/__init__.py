@@ -1,0 +1,1 @@
+"""The STUN client (RFC 8489). Stands by itself."""
