@@ -36,7 +36,7 @@ from sidecar.config_fields import (
     converted,
     is_glob,
 )
-from sidecar.core.control_ways import Price
+from sidecar.core.control.ways import Price
 from sidecar.core.rules.service_rule import Rules, ServiceRule
 from sidecar.service_config import NetworkConfig, ServiceConfig
 

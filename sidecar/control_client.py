@@ -25,8 +25,8 @@ from protos.model import PeerSet, Report, ResourceKind, ServiceSet, Welcome
 from protos.names import clean_text
 from protos.plr.v1 import control_pb2_grpc
 from sidecar.control_channel import REFUSALS, open_channel
-from sidecar.core.control_session import Apply
-from sidecar.core.control_watch import CHEAPER
+from sidecar.core.control.session import Apply
+from sidecar.core.control.watch import CHEAPER
 from sidecar.outage_log import OutageLog
 from sidecar.refusal_log import RefusalLog
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from protos.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
     from sidecar.core.base.report_scope import ReportScope
-    from sidecar.core.control_session import ControlSession, ControlStats
+    from sidecar.core.control.session import ControlSession, ControlStats
     from sidecar.net.control_dialer import ControlDialer, ControlLine
 
     _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]

@@ -18,8 +18,8 @@ from protos.host_port import split_host_port
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind
 from protos.revocation_views import revocation_gauges
-from sidecar.core.control_watch import LEAVE_CAUSES
-from sidecar.core.control_ways import DIAL_DROPS
+from sidecar.core.control.watch import LEAVE_CAUSES
+from sidecar.core.control.ways import DIAL_DROPS
 from sidecar.core.engine.revocation_exchange import EXCHANGES
 from sidecar.local.server import REFUSALS
 from sidecar.metric_families import by_one, counter, cumulative, gauge
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from protos.identity import Identity
     from protos.model import InterfaceName, ServiceName
-    from sidecar.core.control_session import ControlStats
+    from sidecar.core.control.session import ControlStats
     from sidecar.core.seam.stats import EngineStats, LinkStats
     from sidecar.revocations import RevocationState
     from sidecar.ros.stats import BridgeStats

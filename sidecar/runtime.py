@@ -30,8 +30,8 @@ from protos.notifier import Notifier
 from protos.tls_files import TlsWatch, load_tls_files
 from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient
-from sidecar.core.control_session import Apply, ControlSession
-from sidecar.core.control_ways import ControlInterface
+from sidecar.core.control.session import Apply, ControlSession
+from sidecar.core.control.ways import ControlInterface
 from sidecar.core.engine.engine import EngineConfig
 from sidecar.local.server import LocalServer, LocalSocketError
 from sidecar.local.state import LocalState, MappingOrigin

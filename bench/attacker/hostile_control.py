@@ -36,7 +36,7 @@ from protos.model import (
     ServiceUse,
     Version,
 )
-from sidecar.core.control_session import ControlSession, ControlState
+from sidecar.core.control.session import ControlSession, ControlState
 
 if TYPE_CHECKING:
     from bench.attacker.hostile_means import Means

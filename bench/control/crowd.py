@@ -20,7 +20,7 @@ from protos.model import MappingSet, PeerSet, Role
 from protos.plr.v1 import control_pb2_grpc
 from sidecar.control_channel import REFUSALS
 from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.control_session import Apply, ControlState
+from sidecar.core.control.session import Apply, ControlState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from bench.control.member import Member
     from protos.model import NodeName
     from protos.plr.v1 import control_pb2
-    from sidecar.core.control_session import ControlSession
+    from sidecar.core.control.session import ControlSession
 
     Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
 

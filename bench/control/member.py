@@ -28,7 +28,7 @@ from protos.model import (
     ServiceSet,
     ServiceUse,
 )
-from sidecar.core.control_session import ControlSession
+from sidecar.core.control.session import ControlSession
 
 if TYPE_CHECKING:
     import random

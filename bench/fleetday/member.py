@@ -30,7 +30,7 @@ from protos.model import (
     Welcome,
 )
 from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.control_session import Apply, ControlSession, ControlState
+from sidecar.core.control.session import Apply, ControlSession, ControlState
 
 if TYPE_CHECKING:
     import random

@@ -11,7 +11,7 @@ from sidecar.net.control_sockets import open_stream
 if TYPE_CHECKING:
     import socket
 
-    from sidecar.core.control_ways import ControlWays, Way
+    from sidecar.core.control.ways import ControlWays, Way
 
 STALE_ATTEMPT_S = 1.0
 """When the network changes, an attempt this old begins again: the kernel repeats its first packet ever more rarely."""

@@ -4,7 +4,7 @@
       ╚═══════════════════════════ TLS, end to end ════════════════════════╝
 
 For every stream there is a line: gRPC's one connection, and the TCP connection behind it, which wins a race over
-interfaces and addresses (`sidecar.core.control_race`) and is watched (`sidecar.core.control_watch`). Bytes are passed
+interfaces and addresses (`sidecar.core.control.race`) and is watched (`sidecar.core.control.watch`). Bytes are passed
 on as they are. All decisions are the cores'.
 """
 
@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.host_port import numeric_host
-from sidecar.core.control_race import ControlRace
-from sidecar.core.control_watch import CHEAPER, GONE, SILENT, ControlWatch, Leave
-from sidecar.core.control_ways import STRANGER, ControlWays, Life, WayClass
+from sidecar.core.control.race import ControlRace
+from sidecar.core.control.watch import CHEAPER, GONE, SILENT, ControlWatch, Leave
+from sidecar.core.control.ways import STRANGER, ControlWays, Life, WayClass
 from sidecar.net.control_attempts import Attempts, words
 from sidecar.net.control_sockets import NotAllowedError, is_ours, listen_privately, look, own_address
 from sidecar.net.host_names import HostNames
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from protos.model import Address, InterfaceName
     from sidecar.core.base.values import PathState
-    from sidecar.core.control_session import ControlStats
-    from sidecar.core.control_ways import ControlInterface, Way
+    from sidecar.core.control.session import ControlStats
+    from sidecar.core.control.ways import ControlInterface, Way
 
 log = logging.getLogger(__name__)
 

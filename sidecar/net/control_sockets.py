@@ -8,11 +8,11 @@ import socket
 import struct
 from typing import TYPE_CHECKING
 
-from sidecar.core.control_watch import KEEPALIVE_S, Seen
+from sidecar.core.control.watch import KEEPALIVE_S, Seen
 
 if TYPE_CHECKING:
     from protos.model import Address
-    from sidecar.core.control_ways import Way
+    from sidecar.core.control.ways import Way
 
 USER_TIMEOUT_MS = 5_000
 """Unacknowledged for so long, TCP gives up (TCP_USER_TIMEOUT), as gRPC has it on its own sockets."""

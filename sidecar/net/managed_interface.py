@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING
 
 from protos.model import Candidate, CandidateKind
-from sidecar.core.control_ways import families_in_turn
+from sidecar.core.control.ways import families_in_turn
 from sidecar.core.link.link import Link
 from sidecar.core.path.pmtu import LEAST_MTU
 from sidecar.core.seam.links import SetCarrier, SetMtu, SetReady

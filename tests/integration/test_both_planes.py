@@ -19,7 +19,7 @@ from protos.model import (
 )
 from protos.status import SyncState
 from sidecar.control_client import ControlClient
-from sidecar.core.control_session import ControlSession
+from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
 from tests.unit.controlplane.samples import interfaces, path, registration, use

@@ -48,8 +48,8 @@ from protos.model import (
 from protos.plr.v1 import control_pb2
 from sidecar import control_client
 from sidecar.control_client import ControlClient
-from sidecar.core import control_session
-from sidecar.core.control_session import ControlSession
+from sidecar.core.control import session as control_session
+from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
 from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedControlPlane

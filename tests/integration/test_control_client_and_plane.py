@@ -42,8 +42,8 @@ from protos.model import (
 )
 from protos.pair_token import pair_token
 from sidecar.control_client import ControlClient
-from sidecar.core import control_session
-from sidecar.core.control_session import ControlSession
+from sidecar.core.control import session
+from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
 from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import WAIT_S
@@ -228,7 +228,7 @@ def test_a_refused_mapping_leaves_the_old_version_and_does_not_end_the_stream(tm
 def test_a_killed_control_plane_comes_back_with_larger_versions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control_session, "RETRY_MAX_S", 0.5)
+    monkeypatch.setattr(session, "RETRY_MAX_S", 0.5)
     control_plane = ControlPlane(tmp_path)
     with mesh(control_plane.port) as (robot, cloud):
         with control_plane.running():

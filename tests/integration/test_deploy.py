@@ -25,7 +25,7 @@ from protos.host_port import split_host_port
 from protos.identity import Identity, IdentityRole, RevocationList
 from protos.model import NodeName, Role
 from sidecar.config import SidecarConfig, load_config
-from sidecar.core.control_session import ControlStats
+from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats
 from sidecar.metrics import MetricSources, SidecarCollector
 from sidecar.revocations import RevocationState

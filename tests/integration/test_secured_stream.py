@@ -22,7 +22,7 @@ from protos.tls_files import TlsWatch, load_tls_files
 from sidecar import control_client
 from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient
-from sidecar.core.control_session import ControlSession
+from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
 from tests.free_ports import free_port
 from tests.integration.control_plane_process import (

@@ -15,7 +15,7 @@ from controlplane import tls_gate
 from controlplane.core.admission import Admission
 from controlplane.core.pacing import Pacing
 from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, SessionId, Welcome
-from sidecar.core.control_session import ControlSession, ControlState
+from sidecar.core.control.session import ControlSession, ControlState
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,9 +16,9 @@ import pytest
 
 from protos.model import Address, InterfaceName
 from sidecar.core.base.values import PathState
-from sidecar.core.control_race import ControlRace
-from sidecar.core.control_watch import CHEAPER, KEEPALIVE_S, SILENT, ControlWatch, Seen
-from sidecar.core.control_ways import WELL_S, ControlInterface, ControlWays, Price, Way
+from sidecar.core.control.race import ControlRace
+from sidecar.core.control.watch import CHEAPER, KEEPALIVE_S, SILENT, ControlWatch, Seen
+from sidecar.core.control.ways import WELL_S, ControlInterface, ControlWays, Price, Way
 
 STEP_S = 0.02
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")

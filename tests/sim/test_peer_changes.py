@@ -35,7 +35,7 @@ from protos.model import (
 )
 from protos.peer_changes import put_together
 from protos.status import SyncState
-from sidecar.core.control_session import Apply, ControlSession, ControlState
+from sidecar.core.control.session import Apply, ControlSession, ControlState
 from tests.unit.controlplane.samples import candidate, offer, registration, use
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from protos.model import InterfaceName, NodeName, ServiceName
 from protos.tls_files import MAX_FILE_BYTES
 from sidecar.config import SidecarConfig
 from sidecar.control_client import JUDGE_AGAIN_S
-from sidecar.core.control_session import ControlStats
+from sidecar.core.control.session import ControlStats
 from sidecar.core.engine.revocation_exchange import ASK_AGAIN_S, ASK_NEXT_AFTER_S
 from sidecar.core.seam.stats import EngineStats, LinkStats
 from sidecar.core.wire.messages import RevocationsHeld, encode_message

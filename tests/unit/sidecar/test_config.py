@@ -20,7 +20,7 @@ from sidecar.config import (
     parse_config,
     refuse_exposed,
 )
-from sidecar.core.control_ways import Price
+from sidecar.core.control.ways import Price
 from tests.unit.sidecar.configs import CLOUD, ROBOT, SOURCE, parse
 
 

@@ -40,7 +40,7 @@ from protos.model import (
     Welcome,
 )
 from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.control_session import (
+from sidecar.core.control.session import (
     MIN_INTERVAL_S,
     PATIENCE_TIMES,
     RETRY_FIRST_S,

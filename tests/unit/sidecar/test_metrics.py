@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from protos.histogram import Histogram
 from protos.model import InterfaceName, NodeName, ResourceKind, ServiceName
-from sidecar.core.control_session import ControlStats
+from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats, LinkStats, PathStats
 from sidecar.metric_families import DURATION_BOUNDS_S, cumulative
 from sidecar.metrics import MetricSources, SidecarCollector, serve_metrics

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from protos.model import InterfaceName
-from sidecar.core.control_race import ControlRace
-from sidecar.core.control_ways import STAGGER_S, Way, WayClass
+from sidecar.core.control.race import ControlRace
+from sidecar.core.control.ways import STAGGER_S, Way, WayClass
 
 A, B, C, D = (Way(InterfaceName(f"if{n}"), ("192.0.2.1", 1)) for n in range(4))
 

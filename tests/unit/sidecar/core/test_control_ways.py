@@ -6,7 +6,7 @@ import pytest
 
 from protos.model import Address, InterfaceName
 from sidecar.core.base.values import PathState
-from sidecar.core.control_ways import (
+from sidecar.core.control.ways import (
     ADDRESSES_FULL,
     FAILED_FIRST_S,
     FAILED_MAX_S,

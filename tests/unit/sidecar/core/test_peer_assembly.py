@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from protos.model import MAX_PEERS, NodeName, Peer, PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
-from sidecar.core.peer_assembly import PeerAssembly
+from sidecar.core.control.peer_assembly import PeerAssembly
 
 SEEDS = range(200)
 

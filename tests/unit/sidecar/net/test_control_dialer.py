@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from protos.model import InterfaceName
-from sidecar.core import control_ways
 from sidecar.core.base.values import PathState
-from sidecar.core.control_session import ControlStats
-from sidecar.core.control_watch import CHEAPER, GONE, SILENT, Leave, Seen
-from sidecar.core.control_ways import STRANGER, ControlInterface, Price, Way
+from sidecar.core.control import ways
+from sidecar.core.control.session import ControlStats
+from sidecar.core.control.watch import CHEAPER, GONE, SILENT, Leave, Seen
+from sidecar.core.control.ways import STRANGER, ControlInterface, Price, Way
 from sidecar.net import control_attempts, control_dialer, control_sockets
 from sidecar.net.control_dialer import ControlDialer
 
@@ -293,7 +293,7 @@ def test_silence_is_doubted_then_confirmed_by_the_data_plane_and_avoided(monkeyp
 def test_the_cheaper_interface_is_connected_before_the_dearer_one_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     async def test(echo: Echo) -> None:
         echo.refuse = lambda way: OSError(errno.EHOSTUNREACH, "no") if way.interface == WLAN else None
-        monkeypatch.setattr(control_ways, "FAILED_FIRST_S", 0.2)
+        monkeypatch.setattr(ways, "FAILED_FIRST_S", 0.2)
         dialer = make()
         dialer.ways._states[WLAN].well_s = 0.0
         both = {WLAN: PathState.UP, WWAN: PathState.UP}

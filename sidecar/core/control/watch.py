@@ -13,11 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.control_ways import Life
+from sidecar.core.control.ways import Life
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName
-    from sidecar.core.control_ways import ControlWays, Way
+    from sidecar.core.control.ways import ControlWays, Way
 
 SILENT_S = 1.0
 """Unacknowledged for so long, while the data plane hears somebody over another interface."""

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.control_ways import STAGGER_S
+from sidecar.core.control.ways import STAGGER_S
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from sidecar.core.control_ways import Way, WayClass
+    from sidecar.core.control.ways import Way, WayClass
 
 
 class ControlRace:

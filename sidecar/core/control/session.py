@@ -35,9 +35,9 @@ from protos.model import (
     Version,
     Welcome,
 )
-from sidecar.core.backoff import Backoff
 from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.peer_assembly import PeerAssembly
+from sidecar.core.control.backoff import Backoff
+from sidecar.core.control.peer_assembly import PeerAssembly
 
 if TYPE_CHECKING:
     import random
