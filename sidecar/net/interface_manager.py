@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.model import Candidate, InterfaceId, InterfaceName
+from sidecar.core.interfaces.readiness import Readiness
+from sidecar.core.interfaces.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.path.key_exchange import KeyLimits
-from sidecar.core.readiness import Readiness
-from sidecar.core.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.stun.events import Failed, Mapped, MappingChanged
 from sidecar.net.host_names import HostNames
 from sidecar.net.interfaces import choose, list_interfaces, missing_interfaces

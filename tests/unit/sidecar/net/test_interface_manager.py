@@ -9,7 +9,7 @@ import pytest
 
 from protos.model import InterfaceName, Role
 from sidecar.config import SidecarConfig, StunConfig
-from sidecar.core.scan_schedule import RETRY_S
+from sidecar.core.interfaces.scan_schedule import RETRY_S
 from sidecar.core.seam.links import SetCarrier
 from sidecar.net import interface_manager as module
 from sidecar.net.interface_manager import InterfaceManager
