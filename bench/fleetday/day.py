@@ -14,11 +14,11 @@ from bench.fleetday.member import Measurements, Member
 from bench.fleetday.plane import Plane
 from bench.fleetday.sizes import Sizes, grown, measure
 from bench.fleetday.timeline import Timeline
+from controlplane.core.base.member_table import MAX_MEMBERS
 from controlplane.core.compute import MAX_PROCESSING
 from controlplane.core.control_events import Settings
 from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED
 from controlplane.core.mapping_history import MAX_CHANGES, MAX_HISTORIES
-from controlplane.core.member_table import MAX_MEMBERS
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.publisher import MAX_GONE_SNAPSHOTS
 from controlplane.core.reached import MAX_PAIRS

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from controlplane.core.member_table import MemberTable
+from controlplane.core.base.member_table import MemberTable
 from protos.token_bucket import TokenBucket
 
 LINES_BURST = 20.0

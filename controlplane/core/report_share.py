@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.member_table import MemberTable
+from controlplane.core.base.member_table import MemberTable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.member_table import MemberTable
+from controlplane.core.base.member_table import MemberTable
 from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:

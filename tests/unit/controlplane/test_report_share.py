@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from controlplane.core import member_table
+from controlplane.core.base import member_table
 from controlplane.core.report_share import (
     BUSY,
     ENTRIES_BURST,

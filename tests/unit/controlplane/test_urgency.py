@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core import member_table
+from controlplane.core.base import member_table
 from controlplane.core.urgency import LEAST_PAIRS, PAIRS_BURST, PAIRS_PER_S, Urgency
 from protos.model import NodeName
 

@@ -1,0 +1,1 @@
+"""Something small kept of each member. Imports nothing of the core."""
