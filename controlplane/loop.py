@@ -20,12 +20,12 @@ from controlplane.core.control_events import (
     StreamLostNotice,
     UnmetNotice,
 )
-from controlplane.core.line_share import LineShare
+from controlplane.core.overload.line_share import LineShare
+from controlplane.core.overload.report_share import ReportShares
 from controlplane.core.plan import Plan
 from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry import Refusal
-from controlplane.core.report_share import ReportShares
 from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.earliest_end import EarliestEnd
 from controlplane.fleet_metrics import MAX_GONE, Fleet

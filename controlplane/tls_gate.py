@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
-from controlplane.core.admission import Admission
+from controlplane.core.overload.admission import Admission
 from controlplane.earliest_end import EarliestEnd
 from controlplane.gate_pipe import PipeEnd
 from controlplane.half_open import HalfOpen

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import grpc
 
-from controlplane.core.pacing import Pacing
+from controlplane.core.overload.pacing import Pacing
 from protos.convert import control_message_to_proto, parse_sidecar_message
 from protos.model import (
     Assignment,

@@ -33,7 +33,8 @@ from controlplane.core.explanation import explain, find
 from controlplane.core.exploration import Exploration
 from controlplane.core.fleet_view import MemberView, view_of
 from controlplane.core.mapping_history import MappingHistory
-from controlplane.core.pacing import Pacing
+from controlplane.core.overload.pacing import Pacing
+from controlplane.core.overload.urgency import Urgency
 from controlplane.core.permits import Permits
 from controlplane.core.picture import Picture
 from controlplane.core.plan import Plan
@@ -50,7 +51,6 @@ from controlplane.core.stability import Stability
 from controlplane.core.status import is_met, is_offered, statuses
 from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.core.unanswered import Unanswered
-from controlplane.core.urgency import Urgency
 from protos.errors import DecodeError
 from protos.fleet_events import Why
 from protos.model import (

@@ -12,8 +12,8 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
-from controlplane.core.postponed import Postponed
-from controlplane.core.registration_share import RegistrationShare
+from controlplane.core.overload.postponed import Postponed
+from controlplane.core.overload.registration_share import RegistrationShare
 from protos.model import (
     NO_REVOCATIONS,
     CandidateSet,

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.base import member_table
-from controlplane.core.line_share import LINES_BURST, LINES_PER_S, LineShare
+from controlplane.core.overload.line_share import LINES_BURST, LINES_PER_S, LineShare
 from protos.token_bucket import TokenBucket
 
 

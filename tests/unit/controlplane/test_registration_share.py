@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.core.base import member_table
-from controlplane.core.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
+from controlplane.core.overload.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
 from controlplane.core.registry import Admission, Refusal, Registry
 from protos.model import NodeName, Role
 from tests.unit.controlplane.samples import registration, stream

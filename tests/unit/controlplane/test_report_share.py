@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from controlplane.core.base import member_table
-from controlplane.core.report_share import (
+from controlplane.core.overload.report_share import (
     BUSY,
     ENTRIES_BURST,
     ENTRIES_PER_S,

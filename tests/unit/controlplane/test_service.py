@@ -9,7 +9,7 @@ import grpc
 import pytest
 
 from controlplane import service as module
-from controlplane.core.report_share import ReportShares
+from controlplane.core.overload.report_share import ReportShares
 from controlplane.limits import MAX_FIRST_BYTES
 from controlplane.mailbox import Mailbox
 from controlplane.service import ControlPlaneService

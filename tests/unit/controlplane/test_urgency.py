@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.base import member_table
-from controlplane.core.urgency import LEAST_PAIRS, PAIRS_BURST, PAIRS_PER_S, Urgency
+from controlplane.core.overload.urgency import LEAST_PAIRS, PAIRS_BURST, PAIRS_PER_S, Urgency
 from protos.model import NodeName
 
 ROBOT, OTHER = NodeName("robot"), NodeName("other")
