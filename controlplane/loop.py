@@ -10,7 +10,6 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.claims import check_claims, check_unproven_claims
 from controlplane.core.control import ControlCore, Settled
 from controlplane.core.control_events import (
     CutOffNotice,
@@ -25,7 +24,8 @@ from controlplane.core.overload.report_share import ReportShares
 from controlplane.core.plan import Plan
 from controlplane.core.policy import OfferRule
 from controlplane.core.problem import Problem
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
+from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.earliest_end import EarliestEnd
 from controlplane.fleet_metrics import MAX_GONE, Fleet
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from controlplane.core.fleet_view import MemberView
     from controlplane.core.picture import Picture
     from controlplane.core.policy import Policy
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
     from controlplane.event_log import EventLog
     from controlplane.matcher import Matcher
     from controlplane.metrics import Metrics

@@ -19,7 +19,7 @@ from grpc_reflection.v1alpha import reflection
 from controlplane import admin, service
 from controlplane.access import AccessGuard
 from controlplane.certificates import CertificateKeeper
-from controlplane.core.registry import MAX_SIDECARS
+from controlplane.core.registry.registry import MAX_SIDECARS
 from controlplane.event_log import EventLog
 from controlplane.limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
 from controlplane.loop import ControlLoop

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import grpc
 
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import CloseReason
 from controlplane.limits import (
     MAX_FIRST_BYTES,
@@ -32,7 +32,7 @@ from protos.plr.v1 import control_pb2
 from protos.protocol_versions import Spoken, refusal
 
 if TYPE_CHECKING:
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
     from controlplane.loop import ControlLoop
     from controlplane.mailbox import Mailbox
     from controlplane.tls_gate import Caller, TlsGate

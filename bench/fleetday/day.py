@@ -22,7 +22,7 @@ from controlplane.core.mapping_history import MAX_CHANGES, MAX_HISTORIES
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.publisher import MAX_GONE_SNAPSHOTS
 from controlplane.core.reached import MAX_PAIRS
-from controlplane.core.registry import MAX_REMEMBERED_REMOVALS
+from controlplane.core.registry.registry import MAX_REMEMBERED_REMOVALS
 from protos.model import InterfaceName, NodeName, RemovalReason, Role, ServiceName, ServiceOffer, ServiceSet, ServiceUse
 
 if TYPE_CHECKING:

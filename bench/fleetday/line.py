@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import CloseReason
 from controlplane.mailbox import Mailbox
 from protos.convert import (
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from bench.fleetday.member import Member
     from bench.fleetday.plane import Plane
     from bench.fleetday.timeline import Timeline
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
     from protos.model import ControlMessage, SidecarMessage
 
 IN_FLIGHT = 2

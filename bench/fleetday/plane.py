@@ -15,7 +15,7 @@ from controlplane.core.control_events import (
     StreamLostNotice,
     UnmetNotice,
 )
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.event_log import EventLog
 from controlplane.matcher import Matcher
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
     from controlplane.core.policy import Policy
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
     from protos.model import Heartbeat, NodeName, Registration, RemovalReason, SidecarMessage
 
 TURN_S = 0.02

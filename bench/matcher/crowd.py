@@ -39,7 +39,7 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
 
 SERVICE = ServiceName("/bench")
 TYPE = "nav_msgs/srv/GetPlan"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from bench.matcher.feed import REPORT_INTERVAL_S, ROBOT, SERVICE
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Settings
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import Send
 from controlplane.matcher import Matcher
 from protos.model import (
@@ -31,7 +31,7 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
     from protos.model import Assignment, NodeName, SidecarMessage
 
 FOREVER_S = 1e9

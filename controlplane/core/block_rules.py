@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from controlplane.core.problem import Block
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from protos.model import ServiceName, ServiceUse
 
 

@@ -43,9 +43,9 @@ from controlplane.core.publisher import Publisher
 from controlplane.core.reached import Reached
 from controlplane.core.reconcile import changed_robots
 from controlplane.core.refused_offers import RefusedOffers
-from controlplane.core.registry import Admission, Refusal, Registry, StreamId
+from controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
+from controlplane.core.registry.restlessness import Restlessness
 from controlplane.core.report_filter import believable
-from controlplane.core.restlessness import Restlessness
 from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
 from controlplane.core.status import is_met, is_offered, statuses
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Set
 
     from controlplane.core.policy import Policy
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from protos.explanation import Explanation
     from protos.model import NodeName, ServiceName, SidecarMessage
     from protos.status import SidecarStatus, SyncState

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from controlplane.core.permits import Permits
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from protos.model import NodeName
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from controlplane.core.picture import BlockNotes, Picture
     from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.problem import Objective
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from controlplane.core.snapshots import Snapshots
     from protos.model import InterfaceName, NodeName, Role, ServiceMapping, ServiceName
     from protos.status import ResourceStatus

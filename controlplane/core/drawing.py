@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from controlplane.core.path_rules import PathRule
     from controlplane.core.permits import Group, Permits
     from controlplane.core.problem import Block, Objective
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from protos.model import InterfaceName, NodeName, Registration, Report, ServiceName, ServiceOffer, ServiceUse
     from protos.preferences import InterfaceLabel
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.posterior import Estimate
     from controlplane.core.problem import Block, Choice
-    from controlplane.core.registry import Registry, Sidecar
+    from controlplane.core.registry.registry import Registry, Sidecar
     from controlplane.core.shared_fate import CommonMisses
     from protos.model import InterfaceName, NodeName, PenaltyReport, ServiceMapping, ServiceName, ServiceUse
     from protos.status import ResourceStatus

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
     from controlplane.core.reached import Reached
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from controlplane.core.snapshots import Snapshots
     from controlplane.core.unanswered import Unanswered
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse

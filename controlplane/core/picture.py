@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from controlplane.core.estimator import Estimator
     from controlplane.core.mode_miss import PairTiming
     from controlplane.core.problem import Path
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceUse
 
 

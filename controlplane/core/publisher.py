@@ -24,7 +24,7 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 from controlplane.core import reconcile
-from controlplane.core.registry import MAX_SIDECARS
+from controlplane.core.registry.registry import MAX_SIDECARS
 from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
 from controlplane.core.stream_messages import Send
 from controlplane.core.told_peers import ToldPeers
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from controlplane.core.permits import Permits
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
-    from controlplane.core.registry import Registry, Sidecar, StreamId
+    from controlplane.core.registry.registry import Registry, Sidecar, StreamId
     from protos.model import Ack, Nack, NodeName, Registration
     from protos.status import SyncState
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.picture import BlockNotes, Picture
     from controlplane.core.plan import BlockPlan, Plan
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from protos.model import CallPermit, InterfaceName, NodeName, ServiceName
 
 PREDICTION_CHANGE = 2.0

@@ -9,7 +9,7 @@ from protos.model import Role
 
 if TYPE_CHECKING:
     from controlplane.core.permits import Permits
-    from controlplane.core.registry import Registry
+    from controlplane.core.registry.registry import Registry
     from protos.model import CallPermit, NodeName, Report, ServiceName
 
 

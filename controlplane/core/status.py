@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from controlplane.core.estimator import Estimator
     from controlplane.core.permits import Permits
     from controlplane.core.publisher import Publisher
-    from controlplane.core.registry import Registry
+    from controlplane.core.registry.registry import Registry
     from controlplane.core.unanswered import Unanswered
     from protos.model import NodeName, ServiceName
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
     from protos.model import ControlMessage
 
 

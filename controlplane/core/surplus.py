@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.posterior import Estimate
     from controlplane.core.problem import Block
-    from controlplane.core.registry import Sidecar
+    from controlplane.core.registry.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceUse
 
 MAX_PLANNED = 8

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from controlplane.core.permits import Group, Permits
-    from controlplane.core.registry import Registry, Sidecar
+    from controlplane.core.registry.registry import Registry, Sidecar
     from protos.model import CallPermit, NodeName, Peer
 
 

@@ -12,7 +12,7 @@ from controlplane import admin, turns
 from controlplane.admin import AdminService
 from controlplane.cli import main
 from controlplane.config import ControlPlaneConfig
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics

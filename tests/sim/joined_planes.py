@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import OffersRefusedNotice, Settings
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import Send
 from controlplane.matcher import solve
 from protos.convert import control_message_to_proto, parse_control_message
@@ -27,7 +27,7 @@ from protos.model import (
 
 if TYPE_CHECKING:
     from controlplane.core.policy import Policy
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
     from protos.model import ControlMessage, NodeName
     from tests.sim.mesh import Mesh, Node
 

@@ -17,7 +17,7 @@ from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Settings
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.publisher import RESEND_S
-from controlplane.core.registry import Refusal, StreamId
+from controlplane.core.registry.registry import Refusal, StreamId
 from controlplane.core.stream_messages import Close, Send
 from controlplane.stream_encoder import StreamEncoder
 from protos.convert import parse_control_message

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.control_events import Settings
-from controlplane.core.registry import Refusal
-from controlplane.core.restlessness import BYTES_BURST, BYTES_PER_S
+from controlplane.core.registry.registry import Refusal
+from controlplane.core.registry.restlessness import BYTES_BURST, BYTES_PER_S
 from protos.model import CandidateSet, Drain, NodeName, PeerSet, Role, ServiceSet
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import candidate, interfaces, offer, registration

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from controlplane.ca import Authority, Issued
-from controlplane.core.claims import check_claims, check_unproven_claims
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
+from controlplane.core.registry.registry import Refusal
 from protos.credential import Aead, SessionCredential, session_number
 from protos.identity import Identity, IdentityRole, Trust
 from protos.model import NodeName, Registration, Role

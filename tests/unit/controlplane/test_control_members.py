@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from controlplane.core import control
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import CloseReason
 from protos.errors import DecodeError
 from protos.model import (

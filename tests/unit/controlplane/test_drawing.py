@@ -29,7 +29,7 @@ from controlplane.core.permits import Permits
 from controlplane.core.picture import KEPT_PAIRS
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem import Block, BlockKey, Objective
-from controlplane.core.registry import Sidecar
+from controlplane.core.registry.registry import Sidecar
 from protos.model import InterfaceName, NodeName, Report, Role, ServiceName, ServiceSet
 from protos.preferences import InterfaceLabel
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use

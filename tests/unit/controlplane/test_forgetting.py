@@ -9,7 +9,7 @@ from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Settings
 from controlplane.core.estimator import Estimator
 from controlplane.core.forgetting import FORGET_S, forget_after_s
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import CloseReason
 from protos.model import CandidateSet, InterfaceName, NodeName, OutcomeReport, Report, Role, ServiceName, ServiceSet
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use

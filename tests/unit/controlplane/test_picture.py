@@ -16,7 +16,7 @@ from controlplane.core.permits import Permits
 from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem import BlockKey, FleetKey, Objective, Target
-from controlplane.core.registry import Sidecar
+from controlplane.core.registry.registry import Sidecar
 from protos.model import (
     Assignment,
     Candidate,

@@ -10,7 +10,7 @@ from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.plan import BlockPlan, Plan
 from controlplane.core.problem import BlockKey, FleetKey, Problem
 from controlplane.core.reconcile import differs, mapping_of, reads_differently
-from controlplane.core.registry import Sidecar
+from controlplane.core.registry.registry import Sidecar
 from protos.model import (
     ALL_CALLS,
     Assignment,

@@ -8,7 +8,7 @@ import pytest
 
 from controlplane.core.base import member_table
 from controlplane.core.overload.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
-from controlplane.core.registry import Admission, Refusal, Registry
+from controlplane.core.registry.registry import Admission, Refusal, Registry
 from protos.model import NodeName, Role
 from tests.unit.controlplane.samples import registration, stream
 

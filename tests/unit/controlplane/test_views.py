@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from controlplane.core.permits import Permits
 from controlplane.core.policy import CallRule, OfferRule, Policy
-from controlplane.core.registry import Registry, Sidecar
+from controlplane.core.registry.registry import Registry, Sidecar
 from controlplane.core.views import KnownPeers, Views
 from protos.model import (
     ALL_CALLS,

@@ -15,7 +15,7 @@ from protos.token_bucket import TokenBucket
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from controlplane.core.registry import StreamId
+    from controlplane.core.registry.registry import StreamId
     from protos.model import CandidateSet, NodeName, ServiceSet
 
     Announcement = CandidateSet | ServiceSet

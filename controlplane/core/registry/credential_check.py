@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.registry import Refusal
+from controlplane.core.registry.registry import Refusal
 from protos.credential import decode_credential, verify
 from protos.errors import DecodeError
 

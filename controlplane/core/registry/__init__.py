@@ -1,0 +1,4 @@
+"""Who is there: registrations, leases, and whether they agree with their certificates.
+
+Imports `base` and `overload`.
+"""
