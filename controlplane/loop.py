@@ -22,7 +22,7 @@ from controlplane.core.control_events import (
 from controlplane.core.overload.line_share import LineShare
 from controlplane.core.overload.report_share import ReportShares
 from controlplane.core.plan import Plan
-from controlplane.core.policy import OfferRule
+from controlplane.core.policy.policy import OfferRule
 from controlplane.core.problem import Problem
 from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from controlplane.core.registry.registry import Refusal
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from controlplane.core.departed import Departed
     from controlplane.core.fleet_view import MemberView
     from controlplane.core.picture import Picture
-    from controlplane.core.policy import Policy
+    from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import StreamId
     from controlplane.event_log import EventLog
     from controlplane.matcher import Matcher

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from controlplane.core.patterns import MAX_PATTERN_CHARACTERS, NameKind, can_match
-from controlplane.core.policy import MAX_PATTERNS
+from controlplane.core.policy.patterns import MAX_PATTERN_CHARACTERS, NameKind, can_match
+from controlplane.core.policy.policy import MAX_PATTERNS
 from protos.config_fields import refuse_duplicates
 
 _EXAMPLES = {

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from controlplane.config import load_config
-from controlplane.core.policy_explain import explain
+from controlplane.core.policy.explain import explain
 from protos.arguments import checked
 from protos.errors import ConfigError
 from protos.names import node_name, service_name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from controlplane.core.policy import MAX_RULES, CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import MAX_RULES, CallRule, OfferRule, Policy
 from controlplane.pattern_fields import NodePatterns, ServicePatterns
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from controlplane.config import ControlPlaneConfig
-    from controlplane.core.policy import Policy
+    from controlplane.core.policy.policy import Policy
     from controlplane.metrics import Metrics
 
 log = logging.getLogger(__name__)

@@ -19,7 +19,7 @@ from controlplane.core.compute import MAX_PROCESSING
 from controlplane.core.control_events import Settings
 from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED
 from controlplane.core.mapping_history import MAX_CHANGES, MAX_HISTORIES
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publisher import MAX_GONE_SNAPSHOTS
 from controlplane.core.reached import MAX_PAIRS
 from controlplane.core.registry.registry import MAX_REMEMBERED_REMOVALS

@@ -23,7 +23,6 @@ from controlplane.core.control_events import (
     StreamLostNotice,
     UnmetNotice,
 )
-from controlplane.core.cut_off import cut_off
 from controlplane.core.debounce import Change, Debounce
 from controlplane.core.departed import Departed, Departure, departure, last_known, why_removed
 from controlplane.core.departed_explanation import explain_departed
@@ -35,17 +34,18 @@ from controlplane.core.fleet_view import MemberView, view_of
 from controlplane.core.mapping_history import MappingHistory
 from controlplane.core.overload.pacing import Pacing
 from controlplane.core.overload.urgency import Urgency
-from controlplane.core.permits import Permits
 from controlplane.core.picture import Picture
 from controlplane.core.plan import Plan
+from controlplane.core.policy.cut_off import cut_off
+from controlplane.core.policy.permits import Permits
+from controlplane.core.policy.refused_offers import RefusedOffers
+from controlplane.core.policy.report_filter import believable
 from controlplane.core.problem import BlockKey, Problem
 from controlplane.core.publisher import Publisher
 from controlplane.core.reached import Reached
 from controlplane.core.reconcile import changed_robots
-from controlplane.core.refused_offers import RefusedOffers
 from controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.registry.restlessness import Restlessness
-from controlplane.core.report_filter import believable
 from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
 from controlplane.core.status import is_met, is_offered, statuses
@@ -73,7 +73,7 @@ from protos.model import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Set
 
-    from controlplane.core.policy import Policy
+    from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import Sidecar
     from protos.explanation import Explanation
     from protos.model import NodeName, ServiceName, SidecarMessage

@@ -11,8 +11,8 @@ from controlplane.core.stream_messages import Close, Send
 
 if TYPE_CHECKING:
     from controlplane.core.departed import Departure
-    from controlplane.core.path_rules import PathRule
-    from controlplane.core.policy import Policy
+    from controlplane.core.policy.path_rules import PathRule
+    from controlplane.core.policy.policy import Policy
     from protos.model import Nack, NodeName, ResourceKind, Role, ServiceName
 
 

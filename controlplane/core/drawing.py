@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from controlplane.core.path_rules import PathRules
 from controlplane.core.picture import BlockNotes, Picture, draw_block, interfaces_of
+from controlplane.core.policy.path_rules import PathRules
 from controlplane.core.problem import BlockKey, FleetKey, Problem
 from protos.model import Role
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
     from controlplane.core.estimator import Estimator
-    from controlplane.core.path_rules import PathRule
-    from controlplane.core.permits import Group, Permits
+    from controlplane.core.policy.path_rules import PathRule
+    from controlplane.core.policy.permits import Group, Permits
     from controlplane.core.problem import Block, Objective
     from controlplane.core.registry.registry import Sidecar
     from protos.model import InterfaceName, NodeName, Registration, Report, ServiceName, ServiceOffer, ServiceUse

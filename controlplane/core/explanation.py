@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
     from controlplane.core.estimator import Evidence
     from controlplane.core.mapping_history import History
-    from controlplane.core.permits import Permits
     from controlplane.core.picture import Picture
     from controlplane.core.plan import BlockPlan, Plan
+    from controlplane.core.policy.permits import Permits
     from controlplane.core.posterior import Estimate
     from controlplane.core.problem import Block, Choice
     from controlplane.core.registry.registry import Registry, Sidecar

@@ -34,9 +34,9 @@ from protos.model import POLICY_PENDING, ResourceKind, Role, Version
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from controlplane.core.permits import Permits
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
+    from controlplane.core.policy.permits import Permits
     from controlplane.core.registry.registry import Registry, Sidecar, StreamId
     from protos.model import Ack, Nack, NodeName, Registration
     from protos.status import SyncState

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from controlplane.core.estimator import Estimator
-    from controlplane.core.permits import Permits
+    from controlplane.core.policy.permits import Permits
     from controlplane.core.publisher import Publisher
     from controlplane.core.registry.registry import Registry
     from controlplane.core.unanswered import Unanswered

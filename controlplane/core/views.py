@@ -15,7 +15,7 @@ from protos.model import ALL_CALLS, RemovalReason, RemovedPeer, Role
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from controlplane.core.permits import Group, Permits
+    from controlplane.core.policy.permits import Group, Permits
     from controlplane.core.registry.registry import Registry, Sidecar
     from protos.model import CallPermit, NodeName, Peer
 

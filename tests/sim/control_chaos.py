@@ -37,7 +37,7 @@ from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import PLAN_TYPE, interfaces, offer, path, registration, use
 
 if TYPE_CHECKING:
-    from controlplane.core.policy import Policy
+    from controlplane.core.policy.policy import Policy
     from protos.model import Peer
 
 SERVICES = ("/plan", "/detect", "/grasp")

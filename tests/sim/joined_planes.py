@@ -26,7 +26,7 @@ from protos.model import (
 )
 
 if TYPE_CHECKING:
-    from controlplane.core.policy import Policy
+    from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import StreamId
     from protos.model import ControlMessage, NodeName
     from tests.sim.mesh import Mesh, Node

@@ -8,7 +8,7 @@ import random
 import pytest
 
 from controlplane.core.control_events import Settings
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.stream_messages import CloseReason
 from protos.model import CandidateSet, InterfaceName, MappingSet, PeerSet, Role, ServiceSet, Version
 from protos.preferences import AT_MOST_EVERY_INTERFACE, Copies, InterfaceLabel

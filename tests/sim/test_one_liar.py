@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.control_events import Settings
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.fleet_metrics import families
 from protos.model import NodeName, RemovalReason, Report, Role, ServiceSet
 from tests.sim.control_world import SETTLED_S, SimSidecar, World

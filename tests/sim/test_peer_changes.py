@@ -15,7 +15,7 @@ import pytest
 from controlplane import stream_encoder
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Settings
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publisher import RESEND_S
 from controlplane.core.registry.registry import Refusal, StreamId
 from controlplane.core.stream_messages import Close, Send

@@ -8,7 +8,7 @@ import pytest
 
 from controlplane.core.control_events import UnmetNotice
 from controlplane.core.explanation import UnknownNameError
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.status_table import render
 from protos.model import NodeName, ServiceName, ServiceSet
 from tests.sim.control_world import SETTLED_S, World

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from controlplane.config import ControlPlaneConfig, load_config, parse_config
-from controlplane.core.path_rules import PathRule
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.path_rules import PathRule
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from protos.config_file import MAX_CONFIG_BYTES
 from protos.errors import ConfigError
 from protos.host_port import check_remote, split_host_port

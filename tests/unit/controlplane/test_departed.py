@@ -9,7 +9,7 @@ import pytest
 from controlplane.core.control_events import Settings
 from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED, Departed, Departure
 from controlplane.core.explanation import UnknownNameError
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.explanation_text import render
 from protos.fleet_events import Why
 from protos.model import Drain, NodeName, OutcomeReport, RemovalReason, Report, Role

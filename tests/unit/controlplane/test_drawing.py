@@ -25,9 +25,9 @@ from controlplane.core.drawing import (
     is_alike,
 )
 from controlplane.core.estimator import Estimator
-from controlplane.core.permits import Permits
 from controlplane.core.picture import KEPT_PAIRS
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.permits import Permits
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem import Block, BlockKey, Objective
 from controlplane.core.registry.registry import Sidecar
 from protos.model import InterfaceName, NodeName, Report, Role, ServiceName, ServiceSet

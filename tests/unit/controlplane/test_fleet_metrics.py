@@ -17,7 +17,7 @@ from controlplane.core.departed import Departure
 from controlplane.core.fading import FadedHistogram
 from controlplane.core.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
 from controlplane.core.network import PathView
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.registry.registry import Refusal
 from controlplane.core.unanswered import LATELY_S
 from controlplane.event_log import EventLog

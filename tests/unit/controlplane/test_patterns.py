@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.patterns import NameKind, can_match, matches
+from controlplane.core.policy.patterns import NameKind, can_match, matches
 from protos.errors import DecodeError
 from protos.names import interface_name, node_name, service_name
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from controlplane.core.policy import CallRule, OfferRule, Policy
-from controlplane.core.policy_explain import MAX_CLOSE, explain
+from controlplane.core.policy.explain import MAX_CLOSE, explain
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from protos.model import NO_POLICY, POLICY_PENDING, NodeName, ServiceName
 
 ARM, BASE = NodeName("arm-1"), NodeName("base-1")

@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.policy_reload import announce
 
 CALLS = (CallRule(("*",), ("/*",), ("*",)),)

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.permits import Permits
-from controlplane.core.policy import CallRule, OfferRule, Policy
+from controlplane.core.policy.permits import Permits
+from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.registry.registry import Registry, Sidecar
 from controlplane.core.views import KnownPeers, Views
 from protos.model import (

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from controlplane.core.patterns import matches
-from controlplane.core.policy import CallRule, OfferRule
+from controlplane.core.policy.patterns import matches
+from controlplane.core.policy.policy import CallRule, OfferRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.core.policy import Policy
+    from controlplane.core.policy.policy import Policy
     from protos.model import NodeName, ServiceName
 
 

@@ -12,7 +12,7 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.patterns import matches
+from controlplane.core.policy.patterns import matches
 from protos.model import NO_POLICY
 
 if TYPE_CHECKING:

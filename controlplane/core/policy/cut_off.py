@@ -9,7 +9,7 @@ from protos.model import Role
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from controlplane.core.permits import Permits
+    from controlplane.core.policy.permits import Permits
     from controlplane.core.registry.registry import Sidecar
     from protos.model import NodeName
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from protos.model import Role
 
 if TYPE_CHECKING:
-    from controlplane.core.permits import Permits
+    from controlplane.core.policy.permits import Permits
     from controlplane.core.registry.registry import Registry
     from protos.model import CallPermit, NodeName, Report, ServiceName
 

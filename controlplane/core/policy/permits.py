@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.pattern_index import PatternIndex
+from controlplane.core.policy.pattern_index import PatternIndex
 from controlplane.core.registry.registry import MAX_SIDECARS
 from protos.model import ALL_CALLS, NO_POLICY, CallPermit
 
 if TYPE_CHECKING:
-    from controlplane.core.policy import Policy
+    from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import Sidecar
     from protos.model import NodeName, ServiceName
 

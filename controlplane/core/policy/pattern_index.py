@@ -10,7 +10,7 @@ import re
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
-from controlplane.core.patterns import matches
+from controlplane.core.policy.patterns import matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
