@@ -10,7 +10,7 @@ Layout 1::
 
 A value reported at the geometric middle of its bucket is off by less than 2 %. Histograms of the same layout
 merge by adding counts, which is exact and independent of the order; an earlier state of a histogram that only grew is
-subtracted as exactly. Old samples fade in `controlplane.core.fading`, where there is a clock to fade by.
+subtracted as exactly. Old samples fade in `controlplane.core.estimate.fading`, where there is a clock to fade by.
 
 A sidecar has no numpy of its own, and an operator's `plr` none at all: only what the control plane computes with
 imports it, at its first use.

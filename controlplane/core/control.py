@@ -27,7 +27,9 @@ from controlplane.core.debounce import Change, Debounce
 from controlplane.core.departed import Departed, Departure, departure, last_known, why_removed
 from controlplane.core.departed_explanation import explain_departed
 from controlplane.core.drawing import MAX_INTERFACES, Drawing
-from controlplane.core.estimator import Estimator
+from controlplane.core.estimate.estimator import Estimator
+from controlplane.core.estimate.reached import Reached
+from controlplane.core.estimate.unanswered import Unanswered
 from controlplane.core.explanation import explain, find
 from controlplane.core.exploration import Exploration
 from controlplane.core.fleet_view import MemberView, view_of
@@ -42,7 +44,6 @@ from controlplane.core.policy.refused_offers import RefusedOffers
 from controlplane.core.policy.report_filter import believable
 from controlplane.core.problem import BlockKey, Problem
 from controlplane.core.publisher import Publisher
-from controlplane.core.reached import Reached
 from controlplane.core.reconcile import changed_robots
 from controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.registry.restlessness import Restlessness
@@ -50,7 +51,6 @@ from controlplane.core.returning import Returning
 from controlplane.core.stability import Stability
 from controlplane.core.status import is_met, is_offered, statuses
 from controlplane.core.stream_messages import Close, CloseReason, Send
-from controlplane.core.unanswered import Unanswered
 from protos.errors import DecodeError
 from protos.fleet_events import Why
 from protos.model import (

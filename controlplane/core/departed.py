@@ -19,7 +19,7 @@ from protos.model import RemovalReason
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from controlplane.core.network import PathState
+    from controlplane.core.estimate.network import PathState
     from controlplane.core.picture import BlockNotes, Picture
     from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.problem import Objective

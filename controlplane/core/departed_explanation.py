@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from controlplane.core.departed import Departure, LastKnown
-    from controlplane.core.estimator import Estimator, Evidence
+    from controlplane.core.estimate.estimator import Estimator, Evidence
+    from controlplane.core.estimate.shared_fate import CommonMisses
     from controlplane.core.mapping_history import MappingHistory
-    from controlplane.core.shared_fate import CommonMisses
     from protos.explanation import Explanation
     from protos.model import Assignment, InterfaceName, NodeName, PenaltyReport, ServiceName
 

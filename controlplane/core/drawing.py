@@ -20,7 +20,7 @@ from protos.model import Role
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
-    from controlplane.core.estimator import Estimator
+    from controlplane.core.estimate.estimator import Estimator
     from controlplane.core.policy.path_rules import PathRule
     from controlplane.core.policy.permits import Group, Permits
     from controlplane.core.problem import Block, Objective

@@ -9,7 +9,7 @@ import difflib
 from typing import TYPE_CHECKING, Protocol
 
 from controlplane.core import alternatives
-from controlplane.core.beta import intervals
+from controlplane.core.estimate.beta import intervals
 from controlplane.core.mode_miss import miss_of, predicted_miss
 from controlplane.core.picture import BlockNotes, interfaces_of
 from controlplane.core.problem import BlockKey
@@ -19,15 +19,15 @@ from protos.model import Assignment, Role
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
-    from controlplane.core.estimator import Evidence
+    from controlplane.core.estimate.estimator import Evidence
+    from controlplane.core.estimate.posterior import Estimate
+    from controlplane.core.estimate.shared_fate import CommonMisses
     from controlplane.core.mapping_history import History
     from controlplane.core.picture import Picture
     from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.policy.permits import Permits
-    from controlplane.core.posterior import Estimate
     from controlplane.core.problem import Block, Choice
     from controlplane.core.registry.registry import Registry, Sidecar
-    from controlplane.core.shared_fate import CommonMisses
     from protos.model import InterfaceName, NodeName, PenaltyReport, ServiceMapping, ServiceName, ServiceUse
     from protos.status import ResourceStatus
 

@@ -17,14 +17,14 @@ from protos.status import SyncState
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from controlplane.core.estimator import Estimator
-    from controlplane.core.network import PathView
+    from controlplane.core.estimate.estimator import Estimator
+    from controlplane.core.estimate.network import PathView
+    from controlplane.core.estimate.reached import Reached
+    from controlplane.core.estimate.unanswered import Unanswered
     from controlplane.core.picture import Picture
     from controlplane.core.plan import Plan
-    from controlplane.core.reached import Reached
     from controlplane.core.registry.registry import Sidecar
     from controlplane.core.snapshots import Snapshots
-    from controlplane.core.unanswered import Unanswered
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
 
 MAX_VIEWED = 512

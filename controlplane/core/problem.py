@@ -23,7 +23,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.posterior import Estimate
+from controlplane.core.estimate.posterior import Estimate
 from protos.preferences import EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:

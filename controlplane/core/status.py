@@ -11,11 +11,11 @@ from protos.status import SidecarStatus
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from controlplane.core.estimator import Estimator
+    from controlplane.core.estimate.estimator import Estimator
+    from controlplane.core.estimate.unanswered import Unanswered
     from controlplane.core.policy.permits import Permits
     from controlplane.core.publisher import Publisher
     from controlplane.core.registry.registry import Registry
-    from controlplane.core.unanswered import Unanswered
     from protos.model import NodeName, ServiceName
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from controlplane.core.posterior import Estimate
+    from controlplane.core.estimate.posterior import Estimate
     from controlplane.core.problem import Block
     from controlplane.core.registry.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceUse

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from google.protobuf import json_format
 
-from controlplane.core.distribution import Distribution
+from controlplane.core.estimate.distribution import Distribution
+from controlplane.core.estimate.posterior import IGNORANCE
 from controlplane.core.objectives import joint_miss, objective_costs
-from controlplane.core.posterior import IGNORANCE
 from controlplane.core.problem import Block, BlockKey, Objective
 from controlplane.planning.prospects import Prospect
 from protos.convert import explanation_from_proto

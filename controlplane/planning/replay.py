@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.posterior import IGNORANCE
+from controlplane.core.estimate.posterior import IGNORANCE
 from controlplane.planning.fifo import FifoPath
 from controlplane.planning.prospects import Prospect
 from controlplane.planning.traces import PATHS

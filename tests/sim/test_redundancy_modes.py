@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from controlplane.core.estimator import Estimator
+from controlplane.core.estimate.estimator import Estimator
 from protos.model import InterfaceName
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.rules.budget import Budget

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import pytest
 from scipy.stats import beta
 
-from controlplane.core.estimator import Estimator
+from controlplane.core.estimate.estimator import Estimator
 from protos.histogram import Histogram
 from protos.model import InterfaceName, LatencyReport, NodeName, PathReport, Report, ServiceName
 from protos.size_class import size_class

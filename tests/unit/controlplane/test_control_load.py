@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.core import control, drawing
-from controlplane.core.estimator import Estimator
+from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.publisher import INFORM_S
 from protos.model import Heartbeat, MappingSet, PeerSet
 from tests.sim.control_world import SETTLED_S

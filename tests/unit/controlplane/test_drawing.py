@@ -24,7 +24,7 @@ from controlplane.core.drawing import (
     Drawing,
     is_alike,
 )
-from controlplane.core.estimator import Estimator
+from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.picture import KEPT_PAIRS
 from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core import compute as compute_module
-from controlplane.core import estimator as estimator_module
-from controlplane.core import network as network_module
-from controlplane.core.estimator import LIVE_S, Estimator
+from controlplane.core.estimate import estimator as estimator_module
+from controlplane.core.estimate import network as network_module
+from controlplane.core.estimate import processing as compute_module
+from controlplane.core.estimate.estimator import LIVE_S, Estimator
 from protos.model import (
     Assignment,
     InterfaceJointReport,
@@ -26,7 +26,7 @@ from protos.model import (
 from tests.unit.controlplane.samples import PLAN, histogram, latency, path
 
 if TYPE_CHECKING:
-    from controlplane.core.posterior import Estimate
+    from controlplane.core.estimate.posterior import Estimate
 
 ROBOT = NodeName("robot")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")

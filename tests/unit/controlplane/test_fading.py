@@ -8,7 +8,7 @@ import random
 import numpy as np
 import pytest
 
-from controlplane.core.fading import FadedCount, FadedHistogram, FadedShares
+from controlplane.core.estimate.fading import FadedCount, FadedHistogram, FadedShares
 from protos.explanation import SAMPLE
 from protos.histogram import MAX_COUNT, Histogram
 from protos.size_class import SIZE_CLASSES

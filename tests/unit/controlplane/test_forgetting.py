@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.compute import ComputeTimes
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Settings
-from controlplane.core.estimator import Estimator
-from controlplane.core.forgetting import FORGET_S, forget_after_s
+from controlplane.core.estimate.estimator import Estimator
+from controlplane.core.estimate.forgetting import FORGET_S, forget_after_s
+from controlplane.core.estimate.processing import ComputeTimes
 from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import CloseReason
 from protos.model import CandidateSet, InterfaceName, NodeName, OutcomeReport, Report, Role, ServiceName, ServiceSet

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.interface_trouble import InterfaceTrouble
-from controlplane.core.posterior import Estimate
+from controlplane.core.estimate.interface_trouble import InterfaceTrouble
+from controlplane.core.estimate.posterior import Estimate
 from protos.model import InterfaceName, NodeName
 
 WLAN = InterfaceName("wlan0")

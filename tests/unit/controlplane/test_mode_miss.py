@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controlplane.core.late_fate import LateFate
+from controlplane.core.estimate.late_fate import LateFate
+from controlplane.core.estimate.posterior import USUAL_STREAK
 from controlplane.core.mode_miss import (
     DELAYS,
     TOGETHER,
@@ -20,7 +21,6 @@ from controlplane.core.mode_miss import (
     pair_timing,
 )
 from controlplane.core.objectives import joint_miss
-from controlplane.core.posterior import USUAL_STREAK
 from controlplane.core.problem import Block, BlockKey
 from protos.model import InterfaceName, NodeName
 from protos.redundancy_mode import RedundancyMode

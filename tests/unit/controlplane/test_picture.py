@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.core.drawing import Drawing
-from controlplane.core.estimator import Estimator
+from controlplane.core.estimate.estimator import Estimator
+from controlplane.core.estimate.penalties import LONGEST_S
 from controlplane.core.objectives import joint_miss
-from controlplane.core.penalties import LONGEST_S
 from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.policy.permits import Permits

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core import reached as module
-from controlplane.core.reached import Reached
+from controlplane.core.estimate import reached as module
+from controlplane.core.estimate.reached import Reached
 from protos.model import NodeName
 
 pytestmark = pytest.mark.audit("ops-12")

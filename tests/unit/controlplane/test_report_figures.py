@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from controlplane.core.distribution import Distribution
-from controlplane.core.estimator import Estimator
-from controlplane.core.fading import FadedCount, FadedHistogram
-from controlplane.core.posterior import IGNORANCE, MEMORIES, SCORE_HALF_LIFE, Estimate, FadedTrials
-from controlplane.core.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses
+from controlplane.core.estimate.distribution import Distribution
+from controlplane.core.estimate.estimator import Estimator
+from controlplane.core.estimate.fading import FadedCount, FadedHistogram
+from controlplane.core.estimate.posterior import IGNORANCE, MEMORIES, SCORE_HALF_LIFE, Estimate, FadedTrials
+from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses
 from protos.convert import parse_sidecar_message, sidecar_message_to_proto
 from protos.histogram import BUCKETS, EDGES, MAX_S, MIDS, Histogram
 from protos.model import NodeName, Report

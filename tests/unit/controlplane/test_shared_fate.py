@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.shared_fate import HALF_LIFE_S, SharedFate
+from controlplane.core.estimate.shared_fate import HALF_LIFE_S, SharedFate
 from protos.explanation import Correlation
 from protos.model import InterfaceJointReport, InterfaceName, ServiceName
 from sidecar.core.robot.measure.interface_outcomes import InterfacePair, JointCounts, PairOutcome
@@ -15,7 +15,7 @@ from sidecar.core.robot.measure.interface_outcomes import InterfacePair, JointCo
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.core.shared_fate import CommonMisses
+    from controlplane.core.estimate.shared_fate import CommonMisses
 
 RATE_HZ = 5
 PAIR = InterfacePair(ServiceName("/plan"), InterfaceName("wlan0"), InterfaceName("wwan0"), None)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.fading import FadedHistogram
-from controlplane.core.posterior import Estimate, FadedTrials
-from controlplane.core.silence import GRACE_S, HALF_LIFE_S, LONGEST_GAP_S, HeardClock, Silence
+from controlplane.core.estimate.fading import FadedHistogram
+from controlplane.core.estimate.posterior import Estimate, FadedTrials
+from controlplane.core.estimate.staleness import GRACE_S, HALF_LIFE_S, LONGEST_GAP_S, HeardClock, Silence
 from tests.unit.controlplane.samples import histogram
 
 STEP_S = 0.5

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane import group_solver
-from controlplane.core.compute import ComputeTimes
-from controlplane.core.forgetting import FORGET_S
+from controlplane.core.estimate.forgetting import FORGET_S
+from controlplane.core.estimate.processing import ComputeTimes
 from controlplane.core.problem import Block, BlockKey, FleetKey, Objective, Problem
 from controlplane.core.snapshots import VersionSource
 from controlplane.matcher import Matcher

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.compute import ComputeTimes
-from controlplane.core.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses, thinned
+from controlplane.core.estimate.processing import ComputeTimes
+from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses, thinned
 from protos.histogram import BUCKETS, MAX_COUNT, Histogram
 from protos.model import NodeName
 from tests.unit.controlplane.samples import PLAN, histogram

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.estimator import Estimator
+from controlplane.core.estimate.estimator import Estimator
 from protos.convert import parse_in_parts, parse_sidecar_message, sidecar_message_to_proto
 from protos.convert.reports import PART_ENTRIES
 from protos.errors import DecodeError

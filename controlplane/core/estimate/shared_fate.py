@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.beta import quantiles
-from controlplane.core.posterior import BATCH_S, MAX_BATCH_CORRELATION, USUAL_STREAK, USUAL_STREAK_BATCHES
+from controlplane.core.estimate.beta import quantiles
+from controlplane.core.estimate.posterior import BATCH_S, MAX_BATCH_CORRELATION, USUAL_STREAK, USUAL_STREAK_BATCHES
 from protos.explanation import Correlation
 
 if TYPE_CHECKING:

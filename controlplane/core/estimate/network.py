@@ -15,9 +15,9 @@ from itertools import islice
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from controlplane.core.fading import FadedCount, FadedHistogram
-from controlplane.core.forgetting import forget_before
-from controlplane.core.silence import HeardClock
+from controlplane.core.estimate.fading import FadedCount, FadedHistogram
+from controlplane.core.estimate.forgetting import forget_before
+from controlplane.core.estimate.staleness import HeardClock
 from protos.histogram import Histogram
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from controlplane.core.distribution import Distribution
+    from controlplane.core.estimate.distribution import Distribution
     from protos.model import InterfaceName, LatencyReport, NodeName, PathReport
 
     PathKey = tuple[InterfaceName, NodeName]

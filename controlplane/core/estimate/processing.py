@@ -6,12 +6,12 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.distribution import Distribution
-from controlplane.core.fading import FadedCount, FadedHistogram
-from controlplane.core.forgetting import forget_after_s
-from controlplane.core.regime import ChangeWatch
-from controlplane.core.silence import HeardClock
-from controlplane.core.witnesses import COUNTS_ANYWAY, Witnesses
+from controlplane.core.estimate.change_detection import ChangeWatch
+from controlplane.core.estimate.distribution import Distribution
+from controlplane.core.estimate.fading import FadedCount, FadedHistogram
+from controlplane.core.estimate.forgetting import forget_after_s
+from controlplane.core.estimate.staleness import HeardClock
+from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, Witnesses
 from protos.histogram import Histogram
 
 if TYPE_CHECKING:

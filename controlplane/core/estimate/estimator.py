@@ -2,7 +2,7 @@
 often than by chance two of a robot's paths miss together.
 
 Requests of the service that really ran are the best witness. For pairs that carried few or none, what the network
-takes (`controlplane.core.network`) and what the server needs (`controlplane.core.compute`) are put together.
+takes (`controlplane.core.estimate.network`) and what the server needs (`controlplane.core.estimate.processing`) are put together.
 What is computed, and why: docs/theory.md.
 """
 
@@ -12,17 +12,17 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from controlplane.core.compute import ComputeTimes, ServerTimes
-from controlplane.core.fading import FadedCount, FadedShares
-from controlplane.core.forgetting import forget_after_s, forget_before
-from controlplane.core.interface_trouble import InterfaceTrouble
-from controlplane.core.late_fate import LateFate
-from controlplane.core.network import PathView, RobotNetwork
-from controlplane.core.parts import Asked, from_parts, parts_of, slower_than
-from controlplane.core.penalties import Penalties
-from controlplane.core.posterior import IGNORANCE, Estimate, FadedTrials
-from controlplane.core.shared_fate import SharedFate
-from controlplane.core.silence import HeardClock
+from controlplane.core.estimate.composed import Asked, from_parts, parts_of, slower_than
+from controlplane.core.estimate.fading import FadedCount, FadedShares
+from controlplane.core.estimate.forgetting import forget_after_s, forget_before
+from controlplane.core.estimate.interface_trouble import InterfaceTrouble
+from controlplane.core.estimate.late_fate import LateFate
+from controlplane.core.estimate.network import PathView, RobotNetwork
+from controlplane.core.estimate.penalties import Penalties
+from controlplane.core.estimate.posterior import IGNORANCE, Estimate, FadedTrials
+from controlplane.core.estimate.processing import ComputeTimes, ServerTimes
+from controlplane.core.estimate.shared_fate import SharedFate
+from controlplane.core.estimate.staleness import HeardClock
 from protos.explanation import SAMPLE
 from protos.histogram import Histogram
 from protos.size_class import SIZE_CLASSES
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from controlplane.core.network import PathState
-    from controlplane.core.parts import Parts
-    from controlplane.core.shared_fate import CommonMisses
+    from controlplane.core.estimate.composed import Parts
+    from controlplane.core.estimate.network import PathState
+    from controlplane.core.estimate.shared_fate import CommonMisses
     from protos.model import (
         Assignment,
         InterfaceName,

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from controlplane.core.posterior import IGNORANCE, Estimate
+from controlplane.core.estimate.posterior import IGNORANCE, Estimate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.compute import ServerTimes
-    from controlplane.core.network import RobotNetwork, Witness
+    from controlplane.core.estimate.network import RobotNetwork, Witness
+    from controlplane.core.estimate.processing import ServerTimes
     from protos.model import InterfaceName, NodeName
 
 MODEL_REQUESTS = 5.0

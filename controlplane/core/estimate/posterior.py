@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.silence import Silence
+from controlplane.core.estimate.staleness import Silence
 
 if TYPE_CHECKING:
-    from controlplane.core.silence import HeardClock
+    from controlplane.core.estimate.staleness import HeardClock
 
 MEMORIES = ((1.0, 1.0), (1 / 4, 0.3), (1 / 15, 0.3))
 """Half-lives of the memories beside each other, as parts of the configured one, and how likely each is to be the best

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from controlplane.core.posterior import Estimate
+from controlplane.core.estimate.posterior import Estimate
 
 if TYPE_CHECKING:
     from protos.model import InterfaceName, NodeName

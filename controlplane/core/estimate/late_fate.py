@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from controlplane.core.fading import FadedCount
-from controlplane.core.posterior import USUAL_STREAK
+from controlplane.core.estimate.fading import FadedCount
+from controlplane.core.estimate.posterior import USUAL_STREAK
 
 HALF_LIFE_S = 600.0
 """As of interfaces that fail together: places change, carriers do not."""

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.distribution import Distribution
-from controlplane.core.silence import Silence
+from controlplane.core.estimate.distribution import Distribution
+from controlplane.core.estimate.staleness import Silence
 from protos.histogram import BUCKETS, MAX_COUNT, MIDS, Histogram
 from protos.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.regime import ChangeWatch
-    from controlplane.core.silence import HeardClock
+    from controlplane.core.estimate.change_detection import ChangeWatch
+    from controlplane.core.estimate.staleness import HeardClock
 
 _FORGOTTEN = 1e-9
 """Samples that together weigh less are none: a few steps on, floats run out of range."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.fading import FadedCount
+from controlplane.core.estimate.fading import FadedCount
 from protos.histogram import Histogram
 
 if TYPE_CHECKING:
