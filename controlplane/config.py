@@ -8,7 +8,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from controlplane.core.control_events import Settings
 from controlplane.core.policy.path_rules import MAX_PATH_RULES, PathRule
-from controlplane.core.problem import Objective
+from controlplane.core.problem.problem import Objective
 from controlplane.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
 from controlplane.policy_config import PolicyConfig
 from protos.config_fields import AbsolutePath, ListenAddress, RemoteAddress, TlsDir, check_security, refuse_duplicates

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.decomposition import Decomposition, Relaxed
 from controlplane.core.limits import Limits
-from controlplane.core.plan import choice_of, relative_gap
+from controlplane.core.problem.plan import choice_of, relative_gap
 from controlplane.solver import RESOLUTION, Column, pick_columns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from controlplane.core.plan import Plan
-    from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from controlplane.core.problem.plan import Plan
+    from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
 
 log = logging.getLogger(__name__)
 

@@ -21,9 +21,9 @@ from controlplane.core.control_events import (
 )
 from controlplane.core.overload.line_share import LineShare
 from controlplane.core.overload.report_share import ReportShares
-from controlplane.core.plan import Plan
 from controlplane.core.policy.policy import OfferRule
-from controlplane.core.problem import Problem
+from controlplane.core.problem.plan import Plan
+from controlplane.core.problem.problem import Problem
 from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from controlplane.core.registry.registry import Refusal
 from controlplane.core.stream_messages import Close, CloseReason, Send

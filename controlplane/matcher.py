@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING
 from controlplane.core.decomposition import Decomposition
 from controlplane.core.grouping import independent_groups
 from controlplane.core.limits import Limits
-from controlplane.core.plan import Plan, make_plan
-from controlplane.core.problem import FleetKey, reachable
+from controlplane.core.problem.plan import Plan, make_plan
+from controlplane.core.problem.problem import FleetKey, reachable
 from controlplane.group_solver import SMALL_BLOCKS, solve_group
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from controlplane.core.problem import Block, BlockKey, Problem
+    from controlplane.core.problem.problem import Block, BlockKey, Problem
 
 CHANGED_SHARE = 0.02
 """Beyond this share of changed blocks all are solved: it costs little more, and moves others out of the way."""

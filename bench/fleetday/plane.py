@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from bench.fleetday.timeline import Timeline
     from controlplane.core.control_events import Settings
     from controlplane.core.picture import Picture
-    from controlplane.core.plan import Plan
     from controlplane.core.policy.policy import Policy
+    from controlplane.core.problem.plan import Plan
     from controlplane.core.registry.registry import StreamId
     from protos.model import Heartbeat, NodeName, Registration, RemovalReason, SidecarMessage
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.matcher.feed import PAIRS, REPORT_INTERVAL_S, ROBOT, SERVICE
-from controlplane.core.plan import Plan, make_plan
-from controlplane.core.problem import Block, BlockKey, Objective, Problem
+from controlplane.core.problem.plan import Plan, make_plan
+from controlplane.core.problem.problem import Block, BlockKey, Objective, Problem
 from controlplane.core.stability import Stability
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from bench.matcher.calibration import Arrays
     from bench.matcher.races import Races
-    from controlplane.core.problem import Choice
+    from controlplane.core.problem.problem import Choice
 
 RIVALS = ("best fixed", "random", "round robin", "lowest mean RTT")
 RTT_MEMORY = 0.98

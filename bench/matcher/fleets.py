@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from ortools.graph.python import min_cost_flow
 
-from controlplane.core.objectives import epsilon_matrix, path_costs
-from controlplane.core.problem import Block, BlockKey, FleetKey, Objective, Path, Problem
+from controlplane.core.problem.objectives import epsilon_matrix, path_costs
+from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Path, Problem
 from protos.model import InterfaceName, NodeName, ServiceName
 
 SERVICE = ServiceName("/bench")

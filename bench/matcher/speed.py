@@ -16,15 +16,15 @@ from bench.matcher.fleets import ROOM, flow_optimum, in_regions, random_fleet
 from bench.reporting.tables import Figure, Table
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.debounce import URGENT_DELAY_S
-from controlplane.core.plan import relative_gap
-from controlplane.core.problem import Objective
+from controlplane.core.problem.plan import relative_gap
+from controlplane.core.problem.problem import Objective
 from controlplane.matcher import Matcher
 from protos.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from controlplane.core.problem import Problem
+    from controlplane.core.problem.problem import Problem
 
 OVERLOAD_ROOM = 0.9
 """What servers can take, over what is wanted."""

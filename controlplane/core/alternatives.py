@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.choices import MAX_LISTED, list_choices, own_excess
-from controlplane.core.costs import block_cost, charge, choice_costs
-from controlplane.core.domains import shared_domains
-from controlplane.core.plan import choice_of
-from controlplane.core.problem import FleetKey, block_excess, loads, reachable
+from controlplane.core.problem.costs import block_cost, charge, choice_costs
+from controlplane.core.problem.domains import shared_domains
+from controlplane.core.problem.plan import choice_of
+from controlplane.core.problem.problem import FleetKey, block_excess, loads, reachable
 from protos.explanation import Alternative, AlternativeKind
 from protos.model import Assignment
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from controlplane.core.plan import Plan
-    from controlplane.core.problem import Block, Choice, Problem
+    from controlplane.core.problem.plan import Plan
+    from controlplane.core.problem.problem import Block, Choice, Problem
     from protos.model import NodeName
 
 OTHERS = 3

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem import Target
+from controlplane.core.problem.problem import Target
 from protos.preferences import InterfaceLabel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from controlplane.core.problem import Block
+    from controlplane.core.problem.problem import Block
     from controlplane.core.registry.registry import Sidecar
     from protos.model import ServiceName, ServiceUse
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from controlplane.core.domains import repeats
-from controlplane.core.objectives import epsilon_matrix, log_lift
+from controlplane.core.problem.domains import repeats
+from controlplane.core.problem.objectives import epsilon_matrix, log_lift
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.problem import Block
+    from controlplane.core.problem.problem import Block
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

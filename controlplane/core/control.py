@@ -37,12 +37,12 @@ from controlplane.core.mapping_history import MappingHistory
 from controlplane.core.overload.pacing import Pacing
 from controlplane.core.overload.urgency import Urgency
 from controlplane.core.picture import Picture
-from controlplane.core.plan import Plan
 from controlplane.core.policy.cut_off import cut_off
 from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.refused_offers import RefusedOffers
 from controlplane.core.policy.report_filter import believable
-from controlplane.core.problem import BlockKey, Problem
+from controlplane.core.problem.plan import Plan
+from controlplane.core.problem.problem import BlockKey, Problem
 from controlplane.core.publisher import Publisher
 from controlplane.core.reconcile import changed_robots
 from controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId

@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem import Objective
+from controlplane.core.problem.problem import Objective
 from controlplane.core.stream_messages import Close, Send
 
 if TYPE_CHECKING:

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.choices import MAX_LISTED, OWN_EXCESS_PRICE
-from controlplane.core.domains import chooses_interfaces, has_shared_regions
 from controlplane.core.pattern_stack import PatternStack
-from controlplane.core.plan import relative_gap
-from controlplane.core.problem import Objective
+from controlplane.core.problem.domains import chooses_interfaces, has_shared_regions
+from controlplane.core.problem.plan import relative_gap
+from controlplane.core.problem.problem import Objective
 from controlplane.core.stacks import EnumeratedStack, SeparableStack
 from controlplane.core.standing import Standing
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.limits import Limits
-    from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
     from controlplane.core.stacks import Best, Stack
 
     Floats = NDArray[np.float64]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem import BlockKey
+from controlplane.core.problem.problem import BlockKey
 from protos.fleet_events import DepartedSidecar, Why
 from protos.model import RemovalReason
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from controlplane.core.estimate.network import PathState
     from controlplane.core.picture import BlockNotes, Picture
-    from controlplane.core.plan import BlockPlan, Plan
-    from controlplane.core.problem import Objective
+    from controlplane.core.problem.plan import BlockPlan, Plan
+    from controlplane.core.problem.problem import Objective
     from controlplane.core.registry.registry import Sidecar
     from controlplane.core.snapshots import Snapshots
     from protos.model import InterfaceName, NodeName, Role, ServiceMapping, ServiceName

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.explanation import UnknownNameError, explain, find_use
 from controlplane.core.picture import Picture
-from controlplane.core.plan import Plan
-from controlplane.core.problem import BlockKey, Problem
+from controlplane.core.problem.plan import Plan
+from controlplane.core.problem.problem import BlockKey, Problem
 from protos.explanation import SAMPLE
 
 if TYPE_CHECKING:

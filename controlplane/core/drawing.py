@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from controlplane.core.picture import BlockNotes, Picture, draw_block, interfaces_of
 from controlplane.core.policy.path_rules import PathRules
-from controlplane.core.problem import BlockKey, FleetKey, Problem
+from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
 from protos.model import Role
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.estimator import Estimator
     from controlplane.core.policy.path_rules import PathRule
     from controlplane.core.policy.permits import Group, Permits
-    from controlplane.core.problem import Block, Objective
+    from controlplane.core.problem.problem import Block, Objective
     from controlplane.core.registry.registry import Sidecar
     from protos.model import InterfaceName, NodeName, Registration, Report, ServiceName, ServiceOffer, ServiceUse
     from protos.preferences import InterfaceLabel

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Protocol
 
 from controlplane.core import alternatives
 from controlplane.core.estimate.beta import intervals
-from controlplane.core.mode_miss import miss_of, predicted_miss
 from controlplane.core.picture import BlockNotes, interfaces_of
-from controlplane.core.problem import BlockKey
+from controlplane.core.problem.mode_miss import miss_of, predicted_miss
+from controlplane.core.problem.problem import BlockKey
 from protos.explanation import Belief, Explanation, JointExplanation, MappingChange, PairExplanation
 from protos.model import Assignment, Role
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.shared_fate import CommonMisses
     from controlplane.core.mapping_history import History
     from controlplane.core.picture import Picture
-    from controlplane.core.plan import BlockPlan, Plan
     from controlplane.core.policy.permits import Permits
-    from controlplane.core.problem import Block, Choice
+    from controlplane.core.problem.plan import BlockPlan, Plan
+    from controlplane.core.problem.problem import Block, Choice
     from controlplane.core.registry.registry import Registry, Sidecar
     from protos.model import InterfaceName, NodeName, PenaltyReport, ServiceMapping, ServiceName, ServiceUse
     from protos.status import ResourceStatus

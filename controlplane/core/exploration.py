@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.plan import choice_of
+from controlplane.core.problem.plan import choice_of
 from protos.model import Assignment
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.core.plan import BlockPlan, Plan
-    from controlplane.core.problem import Block, BlockKey, Choice, Problem
+    from controlplane.core.problem.plan import BlockPlan, Plan
+    from controlplane.core.problem.problem import Block, BlockKey, Choice, Problem
     from protos.model import InterfaceName, NodeName
 
 TRIALS = 6.0

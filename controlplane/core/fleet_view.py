@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from controlplane.core.mode_miss import NO_SENDING, predicted_miss
 from controlplane.core.picture import interfaces_of
-from controlplane.core.problem import BlockKey
+from controlplane.core.problem.mode_miss import NO_SENDING, predicted_miss
+from controlplane.core.problem.problem import BlockKey
 from protos.model import Role
 from protos.status import SyncState
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.reached import Reached
     from controlplane.core.estimate.unanswered import Unanswered
     from controlplane.core.picture import Picture
-    from controlplane.core.plan import Plan
+    from controlplane.core.problem.plan import Plan
     from controlplane.core.registry.registry import Sidecar
     from controlplane.core.snapshots import Snapshots
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem import FleetKey
+from controlplane.core.problem.problem import FleetKey
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from collections.abc import Set as AbstractSet
 
-    from controlplane.core.problem import Block, Problem
+    from controlplane.core.problem.problem import Block, Problem
 
 
 def independent_groups(problem: Problem) -> list[Problem]:

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem import FleetKey
+from controlplane.core.problem.problem import FleetKey
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem import Block, Problem
+    from controlplane.core.problem.problem import Block, Problem
 
 
 class Limits:

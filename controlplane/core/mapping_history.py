@@ -6,7 +6,7 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem import BlockKey
+from controlplane.core.problem.problem import BlockKey
 
 if TYPE_CHECKING:
     from protos.model import MappingSet, NodeName, ServiceMapping, Version

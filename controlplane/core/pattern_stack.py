@@ -22,8 +22,8 @@ from controlplane.core.choices import (
     nearest,
     tried_of_each,
 )
-from controlplane.core.costs import RULE_PRICE
 from controlplane.core.matching import forced_excess
+from controlplane.core.problem.costs import RULE_PRICE
 from controlplane.core.server_groups import ROWS_AT_ONCE, ServerGroups, violations
 from controlplane.core.stacked_costs import StackedCosts
 from controlplane.core.stacks import Best, Stack
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.choices import Near
     from controlplane.core.limits import Limits
-    from controlplane.core.problem import Block, Objective
+    from controlplane.core.problem.problem import Block, Objective
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

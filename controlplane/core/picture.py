@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.block_rules import with_rules
 from controlplane.core.estimate.posterior import Estimate
-from controlplane.core.mode_miss import NO_SENDING, Sending, asked_times, is_timed, pair_timing
-from controlplane.core.problem import Block, BlockKey, Problem
+from controlplane.core.problem.mode_miss import NO_SENDING, Sending, asked_times, is_timed, pair_timing
+from controlplane.core.problem.problem import Block, BlockKey, Problem
 from controlplane.core.surplus import most_promising
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
 
     from controlplane.core.estimate.estimator import Estimator
-    from controlplane.core.mode_miss import PairTiming
-    from controlplane.core.problem import Path
+    from controlplane.core.problem.mode_miss import PairTiming
+    from controlplane.core.problem.problem import Path
     from controlplane.core.registry.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceUse
 

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from controlplane.core.picture import Picture
-    from controlplane.core.plan import Plan
     from controlplane.core.policy.permits import Permits
+    from controlplane.core.problem.plan import Plan
     from controlplane.core.registry.registry import Registry, Sidecar, StreamId
     from protos.model import Ack, Nack, NodeName, Registration
     from protos.status import SyncState

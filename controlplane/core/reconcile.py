@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.mode_miss import predicted_miss
 from controlplane.core.picture import interfaces_of
-from controlplane.core.problem import BlockKey, Objective
+from controlplane.core.problem.mode_miss import predicted_miss
+from controlplane.core.problem.problem import BlockKey, Objective
 from controlplane.core.surplus import MAX_PLANNED
 from protos.model import NO_CALLS, Assignment, ServiceMapping
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from controlplane.core.picture import BlockNotes, Picture
-    from controlplane.core.plan import BlockPlan, Plan
+    from controlplane.core.problem.plan import BlockPlan, Plan
     from controlplane.core.registry.registry import Sidecar
     from protos.model import CallPermit, InterfaceName, NodeName, ServiceName
 

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.choices import combinations
-from controlplane.core.domains import beyond, chooses_interfaces
-from controlplane.core.objectives import log_lift
+from controlplane.core.problem.domains import beyond, chooses_interfaces
+from controlplane.core.problem.objectives import log_lift
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem import Block
+    from controlplane.core.problem.problem import Block
     from controlplane.core.stacked_costs import StackedCosts
 
     Floats = NDArray[np.float64]

@@ -14,17 +14,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.certainty import probability_better, probability_met
-from controlplane.core.costs import block_cost, charge
-from controlplane.core.domains import violations
-from controlplane.core.objectives import joint_miss, objective_cost
-from controlplane.core.plan import choice_of, make_plan
-from controlplane.core.problem import Objective, block_excess, limits_used
+from controlplane.core.problem.costs import block_cost, charge
+from controlplane.core.problem.domains import violations
+from controlplane.core.problem.objectives import joint_miss, objective_cost
+from controlplane.core.problem.plan import choice_of, make_plan
+from controlplane.core.problem.problem import Objective, block_excess, limits_used
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from controlplane.core.plan import BlockPlan, Plan
-    from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from controlplane.core.problem.plan import BlockPlan, Plan
+    from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
 
 IMPROVEMENT_SHARE = 0.1
 IMPROVEMENT_MIN = 0.002

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.costs import RULE_PRICE
-from controlplane.core.domains import beyond, chooses_interfaces, has_shared_regions, numbered, repeats
-from controlplane.core.objectives import PROBABILITY_FLOOR, cost_of_none, epsilon_matrix, path_costs
-from controlplane.core.problem import Objective
+from controlplane.core.problem.costs import RULE_PRICE
+from controlplane.core.problem.domains import beyond, chooses_interfaces, has_shared_regions, numbered, repeats
+from controlplane.core.problem.objectives import PROBABILITY_FLOOR, cost_of_none, epsilon_matrix, path_costs
+from controlplane.core.problem.problem import Objective
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem import Block
+    from controlplane.core.problem.problem import Block
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

@@ -25,11 +25,11 @@ from controlplane.core.choices import (
     own_excess,
     tried_of_each,
 )
-from controlplane.core.costs import choice_costs
-from controlplane.core.domains import repeats
 from controlplane.core.matching import cheapest_matching
-from controlplane.core.objectives import epsilon_matrix, path_costs
 from controlplane.core.path_bound import PathBound, path_bound
+from controlplane.core.problem.costs import choice_costs
+from controlplane.core.problem.domains import repeats
+from controlplane.core.problem.objectives import epsilon_matrix, path_costs
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.choices import Near
     from controlplane.core.limits import Limits
-    from controlplane.core.problem import Block, Choice, Objective
+    from controlplane.core.problem.problem import Block, Choice, Objective
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.costs import block_cost
-from controlplane.core.plan import size
-from controlplane.core.problem import block_excess
+from controlplane.core.problem.costs import block_cost
+from controlplane.core.problem.plan import size
+from controlplane.core.problem.problem import block_excess
 from controlplane.core.trades import trade
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.limits import Limits
-    from controlplane.core.problem import BlockKey, Choice, Objective
+    from controlplane.core.problem.problem import BlockKey, Choice, Objective
     from controlplane.core.stacks import Best, Stack
     from controlplane.core.trades import Move
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from controlplane.core.estimate.posterior import Estimate
-    from controlplane.core.problem import Block
+    from controlplane.core.problem.problem import Block
     from controlplane.core.registry.registry import Sidecar
     from protos.model import InterfaceName, NodeName, ServiceUse
 

@@ -11,8 +11,8 @@ from google.protobuf import json_format
 
 from controlplane.core.estimate.distribution import Distribution
 from controlplane.core.estimate.posterior import IGNORANCE
-from controlplane.core.objectives import joint_miss, objective_costs
-from controlplane.core.problem import Block, BlockKey, Objective
+from controlplane.core.problem.objectives import joint_miss, objective_costs
+from controlplane.core.problem.problem import Block, BlockKey, Objective
 from controlplane.planning.prospects import Prospect
 from protos.convert import explanation_from_proto
 from protos.errors import DecodeError
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem import Choice
-    from controlplane.core.problem import Path as PathIndex
+    from controlplane.core.problem.problem import Choice
+    from controlplane.core.problem.problem import Path as PathIndex
     from protos.explanation import Explanation, PairExplanation
     from protos.histogram import Histogram
     from protos.model import Assignment

@@ -9,7 +9,7 @@ import pytest
 from controlplane.core.control_events import Settings
 from controlplane.core.explanation import UnknownNameError
 from controlplane.core.policy.path_rules import PathRule
-from controlplane.core.problem import BlockKey
+from controlplane.core.problem.problem import BlockKey
 from controlplane.explanation_text import render
 from protos.explanation import AlternativeKind, Correlation, Explanation
 from protos.model import (

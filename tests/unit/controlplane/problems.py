@@ -7,10 +7,10 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.costs import RULE_PRICE, TIE_PRICE
-from controlplane.core.objectives import PROBABILITY_FLOOR
-from controlplane.core.plan import Price
-from controlplane.core.problem import (
+from controlplane.core.problem.costs import RULE_PRICE, TIE_PRICE
+from controlplane.core.problem.objectives import PROBABILITY_FLOOR
+from controlplane.core.problem.plan import Price
+from controlplane.core.problem.problem import (
     Block,
     BlockKey,
     Choice,

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.stats import beta
 
 from controlplane.core.certainty import probability_better
-from controlplane.core.problem import Block, Objective
+from controlplane.core.problem.problem import Block, Objective
 from tests.unit.controlplane.problems import block
 
 

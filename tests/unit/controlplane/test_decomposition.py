@@ -12,9 +12,9 @@ from ortools.graph.python import min_cost_flow
 from controlplane.core.choices import OWN_EXCESS_PRICE
 from controlplane.core.decomposition import Decomposition, stack_blocks
 from controlplane.core.limits import Limits
-from controlplane.core.objectives import path_costs
-from controlplane.core.plan import price
-from controlplane.core.problem import Block, FleetKey, Objective, Problem, block_excess, is_valid
+from controlplane.core.problem.objectives import path_costs
+from controlplane.core.problem.plan import price
+from controlplane.core.problem.problem import Block, FleetKey, Objective, Problem, block_excess, is_valid
 from controlplane.core.stacks import EnumeratedStack
 from tests.unit.controlplane.problems import PLAN, best_price, block, fleet, plain_cost, random_problem, valid_choices
 

@@ -28,7 +28,7 @@ from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.picture import KEPT_PAIRS
 from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.problem import Block, BlockKey, Objective
+from controlplane.core.problem.problem import Block, BlockKey, Objective
 from controlplane.core.registry.registry import Sidecar
 from protos.model import InterfaceName, NodeName, Report, Role, ServiceName, ServiceSet
 from protos.preferences import InterfaceLabel

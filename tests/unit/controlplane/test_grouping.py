@@ -7,7 +7,7 @@ import random
 import pytest
 
 from controlplane.core.grouping import independent_groups
-from controlplane.core.problem import FleetKey, Problem
+from controlplane.core.problem.problem import FleetKey, Problem
 from protos.model import NodeName
 from tests.unit.controlplane.problems import PLAN, best_price, block, random_problem
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.core import mapping_history
 from controlplane.core.mapping_history import MAX_CHANGES, MappingHistory
-from controlplane.core.problem import BlockKey
+from controlplane.core.problem.problem import BlockKey
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, ServiceMapping, Version
 from tests.unit.controlplane.samples import PLAN
 

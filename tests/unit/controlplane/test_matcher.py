@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from controlplane.core.plan import price
-from controlplane.core.problem import Block, FleetKey, Objective, Problem, Target, is_valid
+from controlplane.core.problem.plan import price
+from controlplane.core.problem.problem import Block, FleetKey, Objective, Problem, Target, is_valid
 from controlplane.matcher import Matcher, solve
 from controlplane.solver import RESOLUTION
 from protos.model import NodeName

@@ -10,7 +10,7 @@ import pytest
 
 from controlplane.core.estimate.late_fate import LateFate
 from controlplane.core.estimate.posterior import USUAL_STREAK
-from controlplane.core.mode_miss import (
+from controlplane.core.problem.mode_miss import (
     DELAYS,
     TOGETHER,
     TOGETHER_MISSES,
@@ -20,8 +20,8 @@ from controlplane.core.mode_miss import (
     miss_of,
     pair_timing,
 )
-from controlplane.core.objectives import joint_miss
-from controlplane.core.problem import Block, BlockKey
+from controlplane.core.problem.objectives import joint_miss
+from controlplane.core.problem.problem import Block, BlockKey
 from protos.model import InterfaceName, NodeName
 from protos.redundancy_mode import RedundancyMode
 from tests.unit.controlplane.samples import PLAN, use

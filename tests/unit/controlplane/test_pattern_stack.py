@@ -13,14 +13,14 @@ import pytest
 from controlplane.core.choices import OWN_EXCESS_PRICE
 from controlplane.core.limits import Limits
 from controlplane.core.pattern_stack import PatternStack
-from controlplane.core.problem import Block, Objective, Problem, block_excess, is_valid
+from controlplane.core.problem.problem import Block, Objective, Problem, block_excess, is_valid
 from protos.preferences import Copies
 from tests.unit.controlplane.problems import block, plain_cost, random_problem, valid_choices
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.core.problem import Choice
+    from controlplane.core.problem.problem import Choice
 
 
 def random_stacks(rng: random.Random, objective: Objective) -> Iterator[list[Block]]:

@@ -10,12 +10,12 @@ import pytest
 from controlplane.core.drawing import Drawing
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.penalties import LONGEST_S
-from controlplane.core.objectives import joint_miss
 from controlplane.core.picture import BlockNotes, Picture
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.problem import BlockKey, FleetKey, Objective, Target
+from controlplane.core.problem.objectives import joint_miss
+from controlplane.core.problem.problem import BlockKey, FleetKey, Objective, Target
 from controlplane.core.registry.registry import Sidecar
 from protos.model import (
     Assignment,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from controlplane.core.problem import FleetKey, Problem, fleet_excess, is_valid
+from controlplane.core.problem.problem import FleetKey, Problem, fleet_excess, is_valid
 from protos.model import NodeName
 from tests.unit.controlplane.problems import PLAN, block
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from controlplane.core.picture import BlockNotes, Picture
-from controlplane.core.plan import BlockPlan, Plan
-from controlplane.core.problem import BlockKey, FleetKey, Problem
+from controlplane.core.problem.plan import BlockPlan, Plan
+from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
 from controlplane.core.reconcile import differs, mapping_of, reads_differently
 from controlplane.core.registry.registry import Sidecar
 from protos.model import (

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.objectives import PROBABILITY_FLOOR, joint_miss
-from controlplane.core.problem import Objective, Target
-from controlplane.core.shortfall import shortfall
+from controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
+from controlplane.core.problem.problem import Objective, Target
+from controlplane.core.problem.shortfall import shortfall
 from protos.model import InterfaceName, NodeName
 from protos.preferences import Copies
 from tests.unit.controlplane.problems import block, random_problem, valid_choices

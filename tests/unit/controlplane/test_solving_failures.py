@@ -14,7 +14,7 @@ import pytest
 from controlplane import group_solver
 from controlplane.core.estimate.forgetting import FORGET_S
 from controlplane.core.estimate.processing import ComputeTimes
-from controlplane.core.problem import Block, BlockKey, FleetKey, Objective, Problem
+from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
 from controlplane.core.snapshots import VersionSource
 from controlplane.matcher import Matcher
 from protos.convert import use_from_proto, use_to_proto
@@ -25,8 +25,8 @@ from tests.unit.controlplane.samples import histogram, use
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from controlplane.core.plan import Plan
-    from controlplane.core.problem import FleetKey as Key
+    from controlplane.core.problem.plan import Plan
+    from controlplane.core.problem.problem import FleetKey as Key
 
 SERVICE = ServiceName("/plan")
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.plan import Plan, make_plan, price
-from controlplane.core.problem import FleetKey, Objective, Problem, Target
+from controlplane.core.problem.plan import Plan, make_plan, price
+from controlplane.core.problem.problem import FleetKey, Objective, Problem, Target
 from controlplane.core.stability import CHANGE_WINDOW_S, MAX_CHANGES, Stability
 from controlplane.matcher import solve
 from protos.model import NodeName

@@ -6,7 +6,7 @@ import pytest
 
 from controlplane.core.decomposition import stack_blocks
 from controlplane.core.limits import Limits
-from controlplane.core.problem import Block, BlockKey, FleetKey, Objective, Problem
+from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
 from controlplane.core.standing import Standing
 from controlplane.core.trades import trade
 from protos.model import InterfaceName, NodeName

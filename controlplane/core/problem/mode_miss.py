@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.objectives import PROBABILITY_FLOOR, joint_miss
+from controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
 from protos.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from controlplane.core.plan import BlockPlan
-    from controlplane.core.problem import Block, Choice, Path
+    from controlplane.core.problem.plan import BlockPlan
+    from controlplane.core.problem.problem import Block, Choice, Path
     from protos.model import InterfaceName, NodeName, ServiceUse
 
     Pair = tuple[InterfaceName, NodeName]

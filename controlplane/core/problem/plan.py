@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.costs import block_cost, charge, without_rules
-from controlplane.core.domains import shared_domains
-from controlplane.core.objectives import joint_miss
-from controlplane.core.problem import block_excess, fleet_excess, is_valid
-from controlplane.core.shortfall import shortfall
+from controlplane.core.problem.costs import block_cost, charge, without_rules
+from controlplane.core.problem.domains import shared_domains
+from controlplane.core.problem.objectives import joint_miss
+from controlplane.core.problem.problem import block_excess, fleet_excess, is_valid
+from controlplane.core.problem.shortfall import shortfall
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
     from protos.model import Assignment, InterfaceName, NodeName
 
 

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem import Objective
+from controlplane.core.problem.problem import Objective
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.problem import Block, Choice
+    from controlplane.core.problem.problem import Block, Choice
 
 PROBABILITY_FLOOR = 1e-9
 """Probabilities and lifts below this count as this, so that their logarithms are finite: no posterior mean over less
