@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from controlplane.config import ControlPlaneConfig
     from controlplane.core.departed import Departed
     from controlplane.core.fleet_view import MemberView
-    from controlplane.core.picture import Picture
+    from controlplane.core.formulation.block import Picture
     from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import StreamId
     from controlplane.event_log import EventLog

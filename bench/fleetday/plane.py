@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from bench.fleetday.line import Line
     from bench.fleetday.timeline import Timeline
     from controlplane.core.control_events import Settings
-    from controlplane.core.picture import Picture
+    from controlplane.core.formulation.block import Picture
     from controlplane.core.policy.policy import Policy
     from controlplane.core.problem.plan import Plan
     from controlplane.core.registry.registry import StreamId

@@ -26,17 +26,17 @@ from controlplane.core.control_events import (
 from controlplane.core.debounce import Change, Debounce
 from controlplane.core.departed import Departed, Departure, departure, last_known, why_removed
 from controlplane.core.departed_explanation import explain_departed
-from controlplane.core.drawing import MAX_INTERFACES, Drawing
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.reached import Reached
 from controlplane.core.estimate.unanswered import Unanswered
 from controlplane.core.explanation import explain, find
 from controlplane.core.exploration import Exploration
 from controlplane.core.fleet_view import MemberView, view_of
+from controlplane.core.formulation.block import Picture
+from controlplane.core.formulation.problem_builder import MAX_INTERFACES, Drawing
 from controlplane.core.mapping_history import MappingHistory
 from controlplane.core.overload.pacing import Pacing
 from controlplane.core.overload.urgency import Urgency
-from controlplane.core.picture import Picture
 from controlplane.core.policy.cut_off import cut_off
 from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.refused_offers import RefusedOffers

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from controlplane.core.estimate.network import PathState
-    from controlplane.core.picture import BlockNotes, Picture
+    from controlplane.core.formulation.block import BlockNotes, Picture
     from controlplane.core.problem.plan import BlockPlan, Plan
     from controlplane.core.problem.problem import Objective
     from controlplane.core.registry.registry import Sidecar

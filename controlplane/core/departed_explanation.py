@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from controlplane.core.explanation import UnknownNameError, explain, find_use
-from controlplane.core.picture import Picture
+from controlplane.core.formulation.block import Picture
 from controlplane.core.problem.plan import Plan
 from controlplane.core.problem.problem import BlockKey, Problem
 from protos.explanation import SAMPLE

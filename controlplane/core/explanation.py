@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from controlplane.core import alternatives
 from controlplane.core.estimate.beta import intervals
-from controlplane.core.picture import BlockNotes, interfaces_of
+from controlplane.core.formulation.block import BlockNotes, interfaces_of
 from controlplane.core.problem.mode_miss import miss_of, predicted_miss
 from controlplane.core.problem.problem import BlockKey
 from protos.explanation import Belief, Explanation, JointExplanation, MappingChange, PairExplanation
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.estimator import Evidence
     from controlplane.core.estimate.posterior import Estimate
     from controlplane.core.estimate.shared_fate import CommonMisses
+    from controlplane.core.formulation.block import Picture
     from controlplane.core.mapping_history import History
-    from controlplane.core.picture import Picture
     from controlplane.core.policy.permits import Permits
     from controlplane.core.problem.plan import BlockPlan, Plan
     from controlplane.core.problem.problem import Block, Choice

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from controlplane.core.picture import interfaces_of
+from controlplane.core.formulation.block import interfaces_of
 from controlplane.core.problem.mode_miss import NO_SENDING, predicted_miss
 from controlplane.core.problem.problem import BlockKey
 from protos.model import Role
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.network import PathView
     from controlplane.core.estimate.reached import Reached
     from controlplane.core.estimate.unanswered import Unanswered
-    from controlplane.core.picture import Picture
+    from controlplane.core.formulation.block import Picture
     from controlplane.core.problem.plan import Plan
     from controlplane.core.registry.registry import Sidecar
     from controlplane.core.snapshots import Snapshots

@@ -34,7 +34,7 @@ from protos.model import POLICY_PENDING, ResourceKind, Role, Version
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from controlplane.core.picture import Picture
+    from controlplane.core.formulation.block import Picture
     from controlplane.core.policy.permits import Permits
     from controlplane.core.problem.plan import Plan
     from controlplane.core.registry.registry import Registry, Sidecar, StreamId

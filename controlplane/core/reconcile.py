@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.picture import interfaces_of
+from controlplane.core.formulation.block import interfaces_of
+from controlplane.core.formulation.surplus import MAX_PLANNED
 from controlplane.core.problem.mode_miss import predicted_miss
 from controlplane.core.problem.problem import BlockKey, Objective
-from controlplane.core.surplus import MAX_PLANNED
 from protos.model import NO_CALLS, Assignment, ServiceMapping
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from controlplane.core.picture import BlockNotes, Picture
+    from controlplane.core.formulation.block import BlockNotes, Picture
     from controlplane.core.problem.plan import BlockPlan, Plan
     from controlplane.core.registry.registry import Sidecar
     from protos.model import CallPermit, InterfaceName, NodeName, ServiceName

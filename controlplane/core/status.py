@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.picture import interfaces_of
+from controlplane.core.formulation.block import interfaces_of
 from protos.status import SidecarStatus
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import pytest
 from bench.fleetday.day import Day, Scale
 from bench.fleetday.held import HeldPeers
 from bench.fleetday.sizes import Sizes, grown, measure
-from controlplane.core.drawing import Drawing
+from controlplane.core.formulation.problem_builder import Drawing
 from controlplane.core.registry.registry import Registry
 from controlplane.core.snapshots import Track
 from controlplane.core.views import Views

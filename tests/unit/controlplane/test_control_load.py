@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core import control, drawing
+from controlplane.core import control
 from controlplane.core.estimate.estimator import Estimator
+from controlplane.core.formulation import problem_builder
 from controlplane.core.publisher import INFORM_S
 from protos.model import Heartbeat, MappingSet, PeerSet
 from tests.sim.control_world import SETTLED_S
@@ -89,7 +90,7 @@ def test_a_dead_server_costs_no_estimates_anew(world: World, monkeypatch: pytest
         return estimate(self, *asked)  # type: ignore[arg-type]  # passed through
 
     monkeypatch.setattr(Estimator, "estimate", counting)
-    monkeypatch.setattr(drawing, "ROUTINE_PAIRS", 0)
+    monkeypatch.setattr(problem_builder, "ROUTINE_PAIRS", 0)
     for robot in robots:
         world.report(
             robot, *(path(nic, server, up=server != "a") for nic in ("wlan0", "wwan0") for server in ("a", "b"))

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from controlplane.core import drawing
-from controlplane.core.drawing import (
+from controlplane.core.estimate.estimator import Estimator
+from controlplane.core.formulation import problem_builder
+from controlplane.core.formulation.block import KEPT_PAIRS
+from controlplane.core.formulation.problem_builder import (
     EPSILON_SHARE,
     FEW_ROBOTS,
     LIFT_SHARE,
@@ -24,8 +26,6 @@ from controlplane.core.drawing import (
     Drawing,
     is_alike,
 )
-from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.picture import KEPT_PAIRS
 from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem.problem import Block, BlockKey, Objective
@@ -262,7 +262,7 @@ AT_ONCE = 40
 def test_of_many_urgent_robots_a_part_is_drawn_at_once_and_those_that_lost_most_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(drawing, "URGENT_AT_ONCE", AT_ONCE)
+    monkeypatch.setattr(problem_builder, "URGENT_AT_ONCE", AT_ONCE)
     fleet = Fleet(3 * AT_ONCE)
     before = fleet.blocks()
     for name in fleet.names:
@@ -280,7 +280,7 @@ def test_of_many_urgent_robots_a_part_is_drawn_at_once_and_those_that_lost_most_
 
 @pytest.mark.audit("ops-20")
 def test_of_very_many_a_share_is_drawn_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawing, "URGENT_AT_ONCE", AT_ONCE)
+    monkeypatch.setattr(problem_builder, "URGENT_AT_ONCE", AT_ONCE)
     fleet = Fleet(8 * AT_ONCE)
     before = fleet.blocks()
     for name in fleet.names:
@@ -356,7 +356,7 @@ def cloud_of(name: str, capacity: int = 0) -> Sidecar:
 def test_whoever_changes_in_whatever_order_the_picture_is_that_of_who_looks_for_the_first_time(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drawing, "LOOKED_AT_ONCE", 2)
+    monkeypatch.setattr(problem_builder, "LOOKED_AT_ONCE", 2)
     rng = random.Random(seed)
     fleet = Fleet(8)
     fleet.sidecars[:2] = [cloud_of("a"), cloud_of("b")]
@@ -381,13 +381,13 @@ def test_whoever_changes_in_whatever_order_the_picture_is_that_of_who_looks_for_
 def test_a_change_of_one_robot_lets_the_others_be(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = Fleet(50)
     looked_at = []
-    inputs = drawing._inputs
+    inputs = problem_builder._inputs
 
-    def counted(robot: Sidecar, *rest: Any) -> drawing._Inputs:
+    def counted(robot: Sidecar, *rest: Any) -> problem_builder._Inputs:
         looked_at.append(robot.name)
         return inputs(robot, *rest)
 
-    monkeypatch.setattr(drawing, "_inputs", counted)
+    monkeypatch.setattr(problem_builder, "_inputs", counted)
     fleet.sidecars[7] = replace(fleet.sidecars[7], candidates=interfaces("wlan0"))
     fleet.drawing.members_changed()
     fleet.draw(routine=False)
@@ -404,7 +404,7 @@ def test_a_change_of_one_robot_lets_the_others_be(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.audit("ops-18")
 def test_a_large_fleet_is_looked_at_in_several_goes() -> None:
-    fleet = Fleet(2 * drawing.LOOKED_AT_ONCE + 1)
+    fleet = Fleet(2 * problem_builder.LOOKED_AT_ONCE + 1)
     fleet.permits = Permits(ALLOWED[2])
     fleet.drawing.members_changed()
     fleet.drawing.begin(routine=False)

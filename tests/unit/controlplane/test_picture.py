@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.drawing import Drawing
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.penalties import LONGEST_S
-from controlplane.core.picture import BlockNotes, Picture
+from controlplane.core.formulation.block import BlockNotes, Picture
+from controlplane.core.formulation.problem_builder import Drawing
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy

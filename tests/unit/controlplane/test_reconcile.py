@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.picture import BlockNotes, Picture
+from controlplane.core.formulation.block import BlockNotes, Picture
 from controlplane.core.problem.plan import BlockPlan, Plan
 from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
 from controlplane.core.reconcile import differs, mapping_of, reads_differently

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from controlplane.core.picture import BlockNotes, Picture, draw_block, interfaces_of
+from controlplane.core.formulation.block import BlockNotes, Picture, draw_block, interfaces_of
 from controlplane.core.policy.path_rules import PathRules
 from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
 from protos.model import Role

@@ -8,11 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.block_rules import with_rules
 from controlplane.core.estimate.posterior import Estimate
+from controlplane.core.formulation.block_rules import with_rules
+from controlplane.core.formulation.surplus import most_promising
 from controlplane.core.problem.mode_miss import NO_SENDING, Sending, asked_times, is_timed, pair_timing
 from controlplane.core.problem.problem import Block, BlockKey, Problem
-from controlplane.core.surplus import most_promising
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
