@@ -1,6 +1,6 @@
 """The plan of blocks that share servers: decomposition first, then what it leaves open.
 
-What the decomposition (`controlplane.core.decomposition`) leaves open between plan and bound is searched by CP-SAT, in
+What the decomposition (`controlplane.core.solve.decomposition`) leaves open between plan and bound is searched by CP-SAT, in
 a small group until the optimum is proven, in a large one only if the gap is wide.
 """
 
@@ -12,9 +12,9 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.decomposition import Decomposition, Relaxed
-from controlplane.core.limits import Limits
 from controlplane.core.problem.plan import choice_of, relative_gap
+from controlplane.core.solve.decomposition import Decomposition, Relaxed
+from controlplane.core.solve.limits import Limits
 from controlplane.solver import RESOLUTION, Column, pick_columns
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.decomposition import Decomposition
-from controlplane.core.grouping import independent_groups
-from controlplane.core.limits import Limits
 from controlplane.core.problem.plan import Plan, make_plan
 from controlplane.core.problem.problem import FleetKey, reachable
+from controlplane.core.solve.decomposition import Decomposition
+from controlplane.core.solve.grouping import independent_groups
+from controlplane.core.solve.limits import Limits
 from controlplane.group_solver import SMALL_BLOCKS, solve_group
 
 if TYPE_CHECKING:

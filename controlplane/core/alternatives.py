@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.choices import MAX_LISTED, list_choices, own_excess
 from controlplane.core.problem.costs import block_cost, charge, choice_costs
 from controlplane.core.problem.domains import shared_domains
 from controlplane.core.problem.plan import choice_of
 from controlplane.core.problem.problem import FleetKey, block_excess, loads, reachable
+from controlplane.core.solve.enumeration import MAX_LISTED, list_choices, own_excess
 from protos.explanation import Alternative, AlternativeKind
 from protos.model import Assignment
 

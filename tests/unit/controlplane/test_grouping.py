@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from controlplane.core.grouping import independent_groups
 from controlplane.core.problem.problem import FleetKey, Problem
+from controlplane.core.solve.grouping import independent_groups
 from protos.model import NodeName
 from tests.unit.controlplane.problems import PLAN, best_price, block, random_problem
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from controlplane.core.choices import OWN_EXCESS_PRICE
-from controlplane.core.limits import Limits
-from controlplane.core.pattern_stack import PatternStack
 from controlplane.core.problem.problem import Block, Objective, Problem, block_excess, is_valid
+from controlplane.core.solve.enumeration import OWN_EXCESS_PRICE
+from controlplane.core.solve.limits import Limits
+from controlplane.core.solve.pattern_batch import PatternStack
 from protos.preferences import Copies
 from tests.unit.controlplane.problems import block, plain_cost, random_problem, valid_choices
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.decomposition import stack_blocks
-from controlplane.core.limits import Limits
 from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
-from controlplane.core.standing import Standing
-from controlplane.core.trades import trade
+from controlplane.core.solve.decomposition import stack_blocks
+from controlplane.core.solve.exchange import trade
+from controlplane.core.solve.incumbent import Standing
+from controlplane.core.solve.limits import Limits
 from protos.model import InterfaceName, NodeName
 from tests.unit.controlplane.samples import PLAN
 

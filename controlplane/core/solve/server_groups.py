@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.choices import combinations
 from controlplane.core.problem.domains import beyond, chooses_interfaces
 from controlplane.core.problem.objectives import log_lift
+from controlplane.core.solve.enumeration import combinations
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.problem.problem import Block
-    from controlplane.core.stacked_costs import StackedCosts
+    from controlplane.core.solve.batch_costs import StackedCosts
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

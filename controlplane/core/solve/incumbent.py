@@ -14,17 +14,17 @@ import numpy as np
 from controlplane.core.problem.costs import block_cost
 from controlplane.core.problem.plan import size
 from controlplane.core.problem.problem import block_excess
-from controlplane.core.trades import trade
+from controlplane.core.solve.exchange import trade
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.limits import Limits
     from controlplane.core.problem.problem import BlockKey, Choice, Objective
-    from controlplane.core.stacks import Best, Stack
-    from controlplane.core.trades import Move
+    from controlplane.core.solve.batch import Best, Stack
+    from controlplane.core.solve.exchange import Move
+    from controlplane.core.solve.limits import Limits
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from controlplane.core.choices import (
+from controlplane.core.problem.costs import choice_costs
+from controlplane.core.problem.domains import repeats
+from controlplane.core.problem.objectives import epsilon_matrix, path_costs
+from controlplane.core.solve.enumeration import (
     OWN_EXCESS_PRICE,
     combinations,
     list_choices,
@@ -25,20 +28,17 @@ from controlplane.core.choices import (
     own_excess,
     tried_of_each,
 )
-from controlplane.core.matching import cheapest_matching
-from controlplane.core.path_bound import PathBound, path_bound
-from controlplane.core.problem.costs import choice_costs
-from controlplane.core.problem.domains import repeats
-from controlplane.core.problem.objectives import epsilon_matrix, path_costs
+from controlplane.core.solve.matching import cheapest_matching
+from controlplane.core.solve.path_bound import PathBound, path_bound
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.choices import Near
-    from controlplane.core.limits import Limits
     from controlplane.core.problem.problem import Block, Choice, Objective
+    from controlplane.core.solve.enumeration import Near
+    from controlplane.core.solve.limits import Limits
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

@@ -1,0 +1,1 @@
+"""Solves the problem, and bounds how much better any plan could be. Imports `problem`."""
