@@ -12,7 +12,7 @@ import numpy as np
 from bench.matcher.feed import PAIRS, REPORT_INTERVAL_S, ROBOT, SERVICE
 from controlplane.core.problem.plan import Plan, make_plan
 from controlplane.core.problem.problem import Block, BlockKey, Objective, Problem
-from controlplane.core.stability import Stability
+from controlplane.core.settle.stability import Stability
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -30,7 +30,6 @@ from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.reached import Reached
 from controlplane.core.estimate.unanswered import Unanswered
 from controlplane.core.explanation import explain, find
-from controlplane.core.exploration import Exploration
 from controlplane.core.fleet_view import MemberView, view_of
 from controlplane.core.formulation.block import Picture
 from controlplane.core.formulation.problem_builder import MAX_INTERFACES, Drawing
@@ -48,7 +47,8 @@ from controlplane.core.reconcile import changed_robots
 from controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.registry.restlessness import Restlessness
 from controlplane.core.returning import Returning
-from controlplane.core.stability import Stability
+from controlplane.core.settle.explored_pair import Exploration
+from controlplane.core.settle.stability import Stability
 from controlplane.core.status import is_met, is_offered, statuses
 from controlplane.core.stream_messages import Close, CloseReason, Send
 from protos.errors import DecodeError

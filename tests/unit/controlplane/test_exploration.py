@@ -8,9 +8,9 @@ from statistics import fmean
 
 import pytest
 
-from controlplane.core.exploration import TRIALS, Exploration, knowledge_gradient, most_instructive
 from controlplane.core.problem.plan import BlockPlan, Plan, make_plan
 from controlplane.core.problem.problem import Block, Choice, Problem
+from controlplane.core.settle.explored_pair import TRIALS, Exploration, knowledge_gradient, most_instructive
 from protos.model import Assignment, InterfaceName, NodeName
 from tests.unit.controlplane.problems import block
 

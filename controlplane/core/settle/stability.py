@@ -13,12 +13,12 @@ from collections import Counter, deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.certainty import probability_better, probability_met
 from controlplane.core.problem.costs import block_cost, charge
 from controlplane.core.problem.domains import violations
 from controlplane.core.problem.objectives import joint_miss, objective_cost
 from controlplane.core.problem.plan import choice_of, make_plan
 from controlplane.core.problem.problem import Objective, block_excess, limits_used
+from controlplane.core.settle.certainty import probability_better, probability_met
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
