@@ -24,9 +24,9 @@ from controlplane.core.overload.report_share import ReportShares
 from controlplane.core.policy.policy import OfferRule
 from controlplane.core.problem.plan import Plan
 from controlplane.core.problem.problem import Problem
+from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from controlplane.core.registry.registry import Refusal
-from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.earliest_end import EarliestEnd
 from controlplane.fleet_metrics import MAX_GONE, Fleet
 from controlplane.garbage import Collector

@@ -12,7 +12,7 @@ from protos.model import MappingSet, PeerSet, Welcome
 from protos.peer_changes import put_together
 
 if TYPE_CHECKING:
-    from controlplane.core.stream_messages import CloseReason
+    from controlplane.core.publish.messages import CloseReason
     from protos.model import ControlMessage
 
 _ORDER = (Welcome, PeerSet, MappingSet)

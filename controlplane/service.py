@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 import grpc
 
+from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
-from controlplane.core.stream_messages import CloseReason
 from controlplane.limits import (
     MAX_FIRST_BYTES,
     MAX_STREAMS_PER_NAME,

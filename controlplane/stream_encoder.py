@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.told_peers import ToldPeers
+from controlplane.core.publish.told_peers import ToldPeers
 from protos.convert.control import control_message_to_proto, peer_set_header_to_proto
 from protos.convert.types import peer_to_proto
 from protos.model import TOKEN_BYTES, PeerSet

@@ -19,9 +19,9 @@ from controlplane.core.control_events import Settings
 from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED
 from controlplane.core.estimate.processing import MAX_PROCESSING
 from controlplane.core.estimate.reached import MAX_PAIRS
-from controlplane.core.mapping_history import MAX_CHANGES, MAX_HISTORIES
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.publisher import MAX_GONE_SNAPSHOTS
+from controlplane.core.publish.history import MAX_CHANGES, MAX_HISTORIES
+from controlplane.core.publish.publisher import MAX_GONE_SNAPSHOTS
 from controlplane.core.registry.registry import MAX_REMEMBERED_REMOVALS
 from protos.model import InterfaceName, NodeName, RemovalReason, Role, ServiceName, ServiceOffer, ServiceSet, ServiceUse
 

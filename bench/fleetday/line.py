@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
+from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
-from controlplane.core.stream_messages import CloseReason
 from controlplane.mailbox import Mailbox
 from protos.convert import (
     control_message_to_proto,

@@ -15,8 +15,8 @@ from controlplane.core.control_events import (
     StreamLostNotice,
     UnmetNotice,
 )
+from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.registry import Refusal
-from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.event_log import EventLog
 from controlplane.matcher import Matcher
 from controlplane.remembered import departures

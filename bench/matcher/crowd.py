@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Settings
-from controlplane.core.stream_messages import Send
+from controlplane.core.publish.messages import Send
 from controlplane.matcher import Matcher
 from protos.histogram import Histogram
 from protos.model import (

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from bench.matcher.feed import REPORT_INTERVAL_S, ROBOT, SERVICE
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Settings
+from controlplane.core.publish.messages import Send
 from controlplane.core.registry.registry import Refusal
-from controlplane.core.stream_messages import Send
 from controlplane.matcher import Matcher
 from protos.model import (
     PROTOCOL_VERSION,

@@ -33,7 +33,6 @@ from controlplane.core.explanation import explain, find
 from controlplane.core.fleet_view import MemberView, view_of
 from controlplane.core.formulation.block import Picture
 from controlplane.core.formulation.problem_builder import MAX_INTERFACES, Drawing
-from controlplane.core.mapping_history import MappingHistory
 from controlplane.core.overload.pacing import Pacing
 from controlplane.core.overload.urgency import Urgency
 from controlplane.core.policy.cut_off import cut_off
@@ -42,15 +41,16 @@ from controlplane.core.policy.refused_offers import RefusedOffers
 from controlplane.core.policy.report_filter import believable
 from controlplane.core.problem.plan import Plan
 from controlplane.core.problem.problem import BlockKey, Problem
-from controlplane.core.publisher import Publisher
-from controlplane.core.reconcile import changed_robots
+from controlplane.core.publish.history import MappingHistory
+from controlplane.core.publish.mappings import changed_robots
+from controlplane.core.publish.messages import Close, CloseReason, Send
+from controlplane.core.publish.publisher import Publisher
 from controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.registry.restlessness import Restlessness
 from controlplane.core.returning import Returning
 from controlplane.core.settle.explored_pair import Exploration
 from controlplane.core.settle.stability import Stability
 from controlplane.core.status import is_met, is_offered, statuses
-from controlplane.core.stream_messages import Close, CloseReason, Send
 from protos.errors import DecodeError
 from protos.fleet_events import Why
 from protos.model import (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from controlplane.core.problem.problem import Objective
-from controlplane.core.stream_messages import Close, Send
+from controlplane.core.publish.messages import Close, Send
 
 if TYPE_CHECKING:
     from controlplane.core.departed import Departure

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from controlplane.core.formulation.block import BlockNotes, Picture
     from controlplane.core.problem.plan import BlockPlan, Plan
     from controlplane.core.problem.problem import Objective
+    from controlplane.core.publish.snapshots import Snapshots
     from controlplane.core.registry.registry import Sidecar
-    from controlplane.core.snapshots import Snapshots
     from protos.model import InterfaceName, NodeName, Role, ServiceMapping, ServiceName
     from protos.status import ResourceStatus
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from controlplane.core.departed import Departure, LastKnown
     from controlplane.core.estimate.estimator import Estimator, Evidence
     from controlplane.core.estimate.shared_fate import CommonMisses
-    from controlplane.core.mapping_history import MappingHistory
+    from controlplane.core.publish.history import MappingHistory
     from protos.explanation import Explanation
     from protos.model import Assignment, InterfaceName, NodeName, PenaltyReport, ServiceName
 

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.posterior import Estimate
     from controlplane.core.estimate.shared_fate import CommonMisses
     from controlplane.core.formulation.block import Picture
-    from controlplane.core.mapping_history import History
     from controlplane.core.policy.permits import Permits
     from controlplane.core.problem.plan import BlockPlan, Plan
     from controlplane.core.problem.problem import Block, Choice
+    from controlplane.core.publish.history import History
     from controlplane.core.registry.registry import Registry, Sidecar
     from protos.model import InterfaceName, NodeName, PenaltyReport, ServiceMapping, ServiceName, ServiceUse
     from protos.status import ResourceStatus

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.unanswered import Unanswered
     from controlplane.core.formulation.block import Picture
     from controlplane.core.problem.plan import Plan
+    from controlplane.core.publish.snapshots import Snapshots
     from controlplane.core.registry.registry import Sidecar
-    from controlplane.core.snapshots import Snapshots
     from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
 
 MAX_VIEWED = 512

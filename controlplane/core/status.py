@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.estimator import Estimator
     from controlplane.core.estimate.unanswered import Unanswered
     from controlplane.core.policy.permits import Permits
-    from controlplane.core.publisher import Publisher
+    from controlplane.core.publish.publisher import Publisher
     from controlplane.core.registry.registry import Registry
     from protos.model import NodeName, ServiceName
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import grpc
 import pytest
 
-from controlplane.core.snapshots import MAX_LIFTED
+from controlplane.core.publish.snapshots import MAX_LIFTED
 from protos.model import (
     Ack,
     Drain,

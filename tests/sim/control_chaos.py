@@ -17,7 +17,7 @@ import zlib
 from typing import TYPE_CHECKING
 
 from controlplane.core.control_events import Settings
-from controlplane.core.stream_messages import CloseReason
+from controlplane.core.publish.messages import CloseReason
 from protos.model import (
     CandidateSet,
     InterfaceName,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import DepartureNotice, NackNotice, Settings
+from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.registry import Refusal, StreamId
-from controlplane.core.stream_messages import Close, CloseReason, Send
 from controlplane.matcher import solve
 from protos.model import (
     Ack,

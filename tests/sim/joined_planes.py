@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import OffersRefusedNotice, Settings
+from controlplane.core.publish.messages import Send
 from controlplane.core.registry.registry import Refusal
-from controlplane.core.stream_messages import Send
 from controlplane.matcher import solve
 from protos.convert import control_message_to_proto, parse_control_message
 from protos.model import (

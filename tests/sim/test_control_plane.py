@@ -9,7 +9,7 @@ import pytest
 
 from controlplane.core.control_events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.stream_messages import CloseReason
+from controlplane.core.publish.messages import CloseReason
 from protos.model import CandidateSet, InterfaceName, MappingSet, PeerSet, Role, ServiceSet, Version
 from protos.preferences import AT_MOST_EVERY_INTERFACE, Copies, InterfaceLabel
 from tests.sim.control_chaos import Chaos

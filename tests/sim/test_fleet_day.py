@@ -14,15 +14,15 @@ from bench.fleetday.day import Day, Scale
 from bench.fleetday.held import HeldPeers
 from bench.fleetday.sizes import Sizes, grown, measure
 from controlplane.core.formulation.problem_builder import Drawing
+from controlplane.core.publish.snapshots import Track
+from controlplane.core.publish.views import Views
 from controlplane.core.registry.registry import Registry
-from controlplane.core.snapshots import Track
-from controlplane.core.views import Views
 from protos.status import SyncState
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from controlplane.core.snapshots import VersionSource
+    from controlplane.core.publish.snapshots import VersionSource
     from protos.model import PeerSet, Version
 
 pytestmark = pytest.mark.audit("ops-24h")

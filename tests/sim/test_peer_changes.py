@@ -16,9 +16,9 @@ from controlplane import stream_encoder
 from controlplane.core.control import ControlCore
 from controlplane.core.control_events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.publisher import RESEND_S
+from controlplane.core.publish.messages import Close, Send
+from controlplane.core.publish.publisher import RESEND_S
 from controlplane.core.registry.registry import Refusal, StreamId
-from controlplane.core.stream_messages import Close, Send
 from controlplane.stream_encoder import StreamEncoder
 from protos.convert import parse_control_message
 from protos.model import (

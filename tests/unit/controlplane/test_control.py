@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.publisher import INFORM_S
+from controlplane.core.publish.publisher import INFORM_S
 from protos.model import (
     Heartbeat,
     NodeName,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.publisher import RESEND_S
+from controlplane.core.publish.publisher import RESEND_S
 from protos.model import Ack, MappingSet, PeerSet, RemovalReason, ResourceKind
 from protos.status import SyncState
 from tests.sim.control_world import SETTLED_S

@@ -10,7 +10,7 @@ import pytest
 from controlplane.core import control
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.formulation import problem_builder
-from controlplane.core.publisher import INFORM_S
+from controlplane.core.publish.publisher import INFORM_S
 from protos.model import Heartbeat, MappingSet, PeerSet
 from tests.sim.control_world import SETTLED_S
 from tests.unit.controlplane.samples import path

@@ -7,8 +7,8 @@ import dataclasses
 import pytest
 
 from controlplane.core import control
+from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
-from controlplane.core.stream_messages import CloseReason
 from protos.errors import DecodeError
 from protos.model import (
     CandidateSet,

@@ -9,8 +9,8 @@ from controlplane.core.control_events import Settings
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.forgetting import FORGET_S, forget_after_s
 from controlplane.core.estimate.processing import ComputeTimes
+from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
-from controlplane.core.stream_messages import CloseReason
 from protos.model import CandidateSet, InterfaceName, NodeName, OutcomeReport, Report, Role, ServiceName, ServiceSet
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 

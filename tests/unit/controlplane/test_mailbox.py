@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from controlplane.core.stream_messages import CloseReason
+from controlplane.core.publish.messages import CloseReason
 from controlplane.mailbox import Mailbox
 from protos.model import (
     MappingSet,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core import mapping_history
-from controlplane.core.mapping_history import MAX_CHANGES, MappingHistory
 from controlplane.core.problem.problem import BlockKey
+from controlplane.core.publish import history as mapping_history
+from controlplane.core.publish.history import MAX_CHANGES, MappingHistory
 from protos.model import Assignment, InterfaceName, MappingSet, NodeName, ServiceMapping, Version
 from tests.unit.controlplane.samples import PLAN
 

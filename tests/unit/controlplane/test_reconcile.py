@@ -9,7 +9,7 @@ import pytest
 from controlplane.core.formulation.block import BlockNotes, Picture
 from controlplane.core.problem.plan import BlockPlan, Plan
 from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
-from controlplane.core.reconcile import differs, mapping_of, reads_differently
+from controlplane.core.publish.mappings import differs, mapping_of, reads_differently
 from controlplane.core.registry.registry import Sidecar
 from protos.model import (
     ALL_CALLS,

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from controlplane.core.snapshots import MAX_LIFTED, PeerView, Snapshots, Track, VersionSource
-from controlplane.core.told_peers import ToldPeers
+from controlplane.core.publish.snapshots import MAX_LIFTED, PeerView, Snapshots, Track, VersionSource
+from controlplane.core.publish.told_peers import ToldPeers
 from protos.model import (
     MAX_VERSION,
     Ack,

@@ -15,7 +15,7 @@ from controlplane import group_solver
 from controlplane.core.estimate.forgetting import FORGET_S
 from controlplane.core.estimate.processing import ComputeTimes
 from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
-from controlplane.core.snapshots import VersionSource
+from controlplane.core.publish.snapshots import VersionSource
 from controlplane.matcher import Matcher
 from protos.convert import use_from_proto, use_to_proto
 from protos.model import MAX_VERSION, InterfaceName, NodeName, ServiceName, Version

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controlplane import stream_encoder
-from controlplane.core.told_peers import ToldPeers
+from controlplane.core.publish.told_peers import ToldPeers
 from controlplane.stream_encoder import StreamEncoder
 from protos.convert import parse_control_message
 from protos.model import (

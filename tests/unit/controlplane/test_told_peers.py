@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
-from controlplane.core.told_peers import ToldPeers
+from controlplane.core.publish.told_peers import ToldPeers
 from protos.model import ALL_CALLS, NodeName, Peer, Role, SessionId
 from protos.pair_token import pair_token
 from tests.unit.controlplane.samples import interfaces, offer

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from controlplane.core.publish.views import KnownPeers, Views
 from controlplane.core.registry.registry import Registry, Sidecar
-from controlplane.core.views import KnownPeers, Views
 from protos.model import (
     ALL_CALLS,
     CallPermit,

@@ -23,12 +23,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from controlplane.core import reconcile
+from controlplane.core.publish import mappings
+from controlplane.core.publish.messages import Send
+from controlplane.core.publish.snapshots import PeerView, Snapshots, VersionSource
+from controlplane.core.publish.told_peers import ToldPeers
+from controlplane.core.publish.views import KnownPeers, Views
 from controlplane.core.registry.registry import MAX_SIDECARS
-from controlplane.core.snapshots import PeerView, Snapshots, VersionSource
-from controlplane.core.stream_messages import Send
-from controlplane.core.told_peers import ToldPeers
-from controlplane.core.views import KnownPeers, Views
 from protos.model import POLICY_PENDING, ResourceKind, Role, Version
 
 if TYPE_CHECKING:
@@ -249,13 +249,13 @@ class Publisher:
     ) -> Iterator[Send]:
         snapshots = self._snapshots[robot.name]
         sent = snapshots.mapping.sent
-        mapping = reconcile.mapping_of(robot, views.servers_of(robot.name), plan, picture, sent or ())
+        mapping = mappings.mapping_of(robot, views.servers_of(robot.name), plan, picture, sent or ())
         if sent is None:
             # Nothing to say yet is no reason to take away what the sidecar holds from before.
             worth_sending = bool(mapping)
         else:
-            worth_sending = snapshots.mapping.send_again or reconcile.differs(mapping, sent)
-            if not worth_sending and reconcile.reads_differently(mapping, sent):
+            worth_sending = snapshots.mapping.send_again or mappings.differs(mapping, sent)
+            if not worth_sending and mappings.reads_differently(mapping, sent):
                 inform_at = snapshots.mapped_at + INFORM_S
                 worth_sending = inform_at <= now
                 if not worth_sending:

@@ -10,7 +10,7 @@ from protos.model import MAX_VERSION, POLICY_PENDING, MappingSet, PeerSet, Resou
 from protos.status import ResourceStatus, SyncState
 
 if TYPE_CHECKING:
-    from controlplane.core.told_peers import ToldPeers
+    from controlplane.core.publish.told_peers import ToldPeers
     from protos.model import Ack, Nack, NodeName, Peer, RemovedPeer, ServiceMapping
 
 C = TypeVar("C")

@@ -1,0 +1,1 @@
+"""What each sidecar is told, and whether it took it. Imports `registry`, `policy`, `problem` and `formulation`."""
