@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import grpc
 
-from controlplane.core.explanation import UnknownNameError
+from controlplane.core.explain.explanation import UnknownNameError
 from protos.convert import (
     departed_to_proto,
     event_query_from_proto,

@@ -21,7 +21,7 @@ from bisect import bisect_left
 from collections import deque
 from typing import IO, TYPE_CHECKING
 
-from controlplane.core.event_memory import EventMemory
+from controlplane.core.explain.event_memory import EventMemory
 from controlplane.event_lines import decode, encode
 from protos import own_folder
 from protos.errors import DecodeError

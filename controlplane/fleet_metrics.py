@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from prometheus_client import Metric
 
-    from controlplane.core.fleet_view import MemberView, MissView, ServedView
+    from controlplane.core.explain.fleet_view import MemberView, MissView, ServedView
     from protos.fleet_events import DepartedSidecar
     from protos.model import NodeName
 

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from controlplane.config import ControlPlaneConfig
-    from controlplane.core.departed import Departed
-    from controlplane.core.fleet_view import MemberView
+    from controlplane.core.explain.departed import Departed
+    from controlplane.core.explain.fleet_view import MemberView
     from controlplane.core.formulation.block import Picture
     from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import StreamId

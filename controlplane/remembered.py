@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.departed import Departure
+from controlplane.core.explain.departed import Departure
 from protos.fleet_events import EventKind, FleetEvent, Why
 
 if TYPE_CHECKING:

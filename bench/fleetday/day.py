@@ -16,9 +16,9 @@ from bench.fleetday.sizes import Sizes, grown, measure
 from bench.fleetday.timeline import Timeline
 from controlplane.core.base.member_table import MAX_MEMBERS
 from controlplane.core.control_events import Settings
-from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED
 from controlplane.core.estimate.processing import MAX_PROCESSING
 from controlplane.core.estimate.reached import MAX_PAIRS
+from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publish.history import MAX_CHANGES, MAX_HISTORIES
 from controlplane.core.publish.publisher import MAX_GONE_SNAPSHOTS

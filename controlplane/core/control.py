@@ -24,13 +24,15 @@ from controlplane.core.control_events import (
     UnmetNotice,
 )
 from controlplane.core.debounce import Change, Debounce
-from controlplane.core.departed import Departed, Departure, departure, last_known, why_removed
-from controlplane.core.departed_explanation import explain_departed
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.reached import Reached
 from controlplane.core.estimate.unanswered import Unanswered
-from controlplane.core.explanation import explain, find
-from controlplane.core.fleet_view import MemberView, view_of
+from controlplane.core.explain.departed import Departed, Departure, departure, last_known, why_removed
+from controlplane.core.explain.departed_explanation import explain_departed
+from controlplane.core.explain.explanation import explain, find
+from controlplane.core.explain.fleet_view import MemberView, view_of
+from controlplane.core.explain.returning import Returning
+from controlplane.core.explain.status import is_met, is_offered, statuses
 from controlplane.core.formulation.block import Picture
 from controlplane.core.formulation.problem_builder import MAX_INTERFACES, Drawing
 from controlplane.core.overload.pacing import Pacing
@@ -47,10 +49,8 @@ from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.publish.publisher import Publisher
 from controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
 from controlplane.core.registry.restlessness import Restlessness
-from controlplane.core.returning import Returning
 from controlplane.core.settle.explored_pair import Exploration
 from controlplane.core.settle.stability import Stability
-from controlplane.core.status import is_met, is_offered, statuses
 from protos.errors import DecodeError
 from protos.fleet_events import Why
 from protos.model import (

@@ -10,7 +10,7 @@ from controlplane.core.problem.problem import Objective
 from controlplane.core.publish.messages import Close, Send
 
 if TYPE_CHECKING:
-    from controlplane.core.departed import Departure
+    from controlplane.core.explain.departed import Departure
     from controlplane.core.policy.path_rules import PathRule
     from controlplane.core.policy.policy import Policy
     from protos.model import Nack, NodeName, ResourceKind, Role, ServiceName

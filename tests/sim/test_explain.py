@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from controlplane.core.control_events import Settings
-from controlplane.core.explanation import UnknownNameError
+from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.problem.problem import BlockKey
 from controlplane.explanation_text import render

@@ -15,7 +15,7 @@ from tests.sim.mesh import SERVICE, Mesh, Node, rule
 from tests.sim.test_redundancy_modes import stall
 
 if TYPE_CHECKING:
-    from controlplane.core.fleet_view import MissView
+    from controlplane.core.explain.fleet_view import MissView
 
 pytestmark = pytest.mark.audit("ops-12")
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.core.control_events import UnmetNotice
-from controlplane.core.explanation import UnknownNameError
+from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.status_table import render
 from protos.model import NodeName, ServiceName, ServiceSet

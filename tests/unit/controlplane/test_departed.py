@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from controlplane.core.control_events import Settings
-from controlplane.core.departed import MAX_DEPARTED, MAX_EXPLAINED, Departed, Departure
-from controlplane.core.explanation import UnknownNameError
+from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED, Departed, Departure
+from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.explanation_text import render
 from protos.fleet_events import Why

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.event_memory import EVENTS_BURST, EVENTS_PER_S, MAX_EVENTS, EventMemory
+from controlplane.core.explain.event_memory import EVENTS_BURST, EVENTS_PER_S, MAX_EVENTS, EventMemory
 from protos.fleet_events import EventKind, FleetEvent
 from protos.model import NodeName
 

@@ -13,11 +13,11 @@ import pytest
 from controlplane import turns
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.control_events import Settings
-from controlplane.core.departed import Departure
 from controlplane.core.estimate.fading import FadedHistogram
 from controlplane.core.estimate.network import PathView
 from controlplane.core.estimate.unanswered import LATELY_S
-from controlplane.core.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
+from controlplane.core.explain.departed import Departure
+from controlplane.core.explain.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.registry.registry import Refusal
 from controlplane.event_log import EventLog

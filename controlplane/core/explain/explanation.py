@@ -8,8 +8,8 @@ from __future__ import annotations
 import difflib
 from typing import TYPE_CHECKING, Protocol
 
-from controlplane.core import alternatives
 from controlplane.core.estimate.beta import intervals
+from controlplane.core.explain import alternatives
 from controlplane.core.formulation.block import BlockNotes, interfaces_of
 from controlplane.core.problem.mode_miss import miss_of, predicted_miss
 from controlplane.core.problem.problem import BlockKey

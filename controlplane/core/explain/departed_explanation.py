@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.explanation import UnknownNameError, explain, find_use
+from controlplane.core.explain.explanation import UnknownNameError, explain, find_use
 from controlplane.core.formulation.block import Picture
 from controlplane.core.problem.plan import Plan
 from controlplane.core.problem.problem import BlockKey, Problem
@@ -14,9 +14,9 @@ from protos.explanation import SAMPLE
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from controlplane.core.departed import Departure, LastKnown
     from controlplane.core.estimate.estimator import Estimator, Evidence
     from controlplane.core.estimate.shared_fate import CommonMisses
+    from controlplane.core.explain.departed import Departure, LastKnown
     from controlplane.core.publish.history import MappingHistory
     from protos.explanation import Explanation
     from protos.model import Assignment, InterfaceName, NodeName, PenaltyReport, ServiceName

@@ -17,7 +17,7 @@ from protos.model import Role
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
 
-    from controlplane.core.departed import Departure
+    from controlplane.core.explain.departed import Departure
     from protos.model import NodeName
 
 TEXT = "it was there before the control plane was restarted, and did not come back"
