@@ -24,7 +24,7 @@ from collections import Counter
 from ipaddress import IPv6Address
 from typing import TYPE_CHECKING, Any
 
-from controlplane.core.stun_responder import StunOutcome, StunResponder
+from controlplane.core.stun.responder import StunOutcome, StunResponder
 from protos.stun import MAX_MESSAGE_BYTES
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import pytest
 
 from bench.attacker.wire import Captured
 from bench.system import STUN_PORT
-from controlplane.core.source_limits import ANSWERS_BURST, ANSWERS_PER_S
+from controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
 from protos.stun import MessageClass, StunMessage, decode, encode, is_stun
 from tests.attacks.world import ATTACKER, ATTACKERS_PORT, World, is_ours, send_all
 

@@ -9,7 +9,7 @@ from ipaddress import IPv4Address, IPv6Address
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.stun_responder import StunOutcome, StunResponder
+from controlplane.core.stun.responder import StunOutcome, StunResponder
 from protos.errors import DecodeError
 from protos.stun import (
     HEADER_BYTES,

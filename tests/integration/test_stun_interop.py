@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.stun_responder import StunOutcome
+from controlplane.core.stun.responder import StunOutcome
 from controlplane.stun_server import SHARE, StunServer, start_stun_server
 from protos.stun import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun.client import StunClient

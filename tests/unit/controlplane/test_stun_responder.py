@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.source_limits import ANSWERS_BURST, ANSWERS_PER_S
-from controlplane.core.stun_responder import StunOutcome, StunResponder
+from controlplane.core.stun.responder import StunOutcome, StunResponder
+from controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
 from protos.stun import MessageClass, StunMessage, decode, encode
 
 TRANSACTION_ID = bytes(range(12))

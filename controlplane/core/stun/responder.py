@@ -11,7 +11,7 @@ import enum
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from controlplane.core.source_limits import SourceLimits
+from controlplane.core.stun.source_limits import SourceLimits
 from protos.errors import DecodeError
 from protos.stun import MessageClass, StunMessage, decode, encode, is_stun
 

@@ -1,0 +1,1 @@
+"""Answers STUN Binding requests. Stands by itself."""
