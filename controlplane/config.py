@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.policy.path_rules import MAX_PATH_RULES, PathRule
 from controlplane.core.problem.problem import Objective
 from controlplane.pattern_fields import InterfacePatterns, NodePatterns, one_or_list

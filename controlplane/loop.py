@@ -10,8 +10,8 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.control import ControlCore, Settled
-from controlplane.core.control_events import (
+from controlplane.core.control.control import ControlCore, Settled
+from controlplane.core.control.events import (
     CutOffNotice,
     DepartureNotice,
     NackNotice,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from prometheus_client import Metric
 
-    from controlplane.core.control import ControlCore
+    from controlplane.core.control.control import ControlCore
     from controlplane.fleet_metrics import Fleet
     from controlplane.stun_server import StunServer
     from protos.identity import Identity, RevocationList

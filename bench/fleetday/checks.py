@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from bench.fleetday.member import Member
     from bench.fleetday.plane import Plane
-    from controlplane.core.control import ControlCore
+    from controlplane.core.control.control import ControlCore
     from controlplane.core.policy.policy import Policy
     from protos.model import NodeName, Peer, ServiceMapping
 

@@ -15,7 +15,7 @@ from bench.fleetday.plane import Plane
 from bench.fleetday.sizes import Sizes, grown, measure
 from bench.fleetday.timeline import Timeline
 from controlplane.core.base.member_table import MAX_MEMBERS
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.estimate.processing import MAX_PROCESSING
 from controlplane.core.estimate.reached import MAX_PAIRS
 from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED

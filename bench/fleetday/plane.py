@@ -6,8 +6,8 @@ import dataclasses
 from functools import partial
 from typing import TYPE_CHECKING
 
-from controlplane.core.control import ControlCore
-from controlplane.core.control_events import (
+from controlplane.core.control.control import ControlCore
+from controlplane.core.control.events import (
     CutOffNotice,
     DepartureNotice,
     NackNotice,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from bench.fleetday.line import Line
     from bench.fleetday.timeline import Timeline
-    from controlplane.core.control_events import Settings
+    from controlplane.core.control.events import Settings
     from controlplane.core.formulation.block import Picture
     from controlplane.core.policy.policy import Policy
     from controlplane.core.problem.plan import Plan

@@ -7,8 +7,8 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from controlplane.core.control import ControlCore
-from controlplane.core.control_events import Settings
+from controlplane.core.control.control import ControlCore
+from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import Send
 from controlplane.matcher import Matcher
 from protos.histogram import Histogram

@@ -6,8 +6,8 @@ import zlib
 from typing import TYPE_CHECKING
 
 from bench.matcher.feed import REPORT_INTERVAL_S, ROBOT, SERVICE
-from controlplane.core.control import ControlCore
-from controlplane.core.control_events import Settings
+from controlplane.core.control.control import ControlCore
+from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import Send
 from controlplane.core.registry.registry import Refusal
 from controlplane.matcher import Matcher

@@ -18,7 +18,7 @@ import yaml
 from controlplane.__main__ import EXIT_USAGE
 from controlplane.cli import main as plr
 from controlplane.config import load_config as load_controlplane_config
-from controlplane.core.control import ControlCore
+from controlplane.core.control.control import ControlCore
 from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics
 from protos.host_port import split_host_port

@@ -16,7 +16,7 @@ import random
 import zlib
 from typing import TYPE_CHECKING
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import CloseReason
 from protos.model import (
     CandidateSet,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.control import ControlCore
-from controlplane.core.control_events import DepartureNotice, NackNotice, Settings
+from controlplane.core.control.control import ControlCore
+from controlplane.core.control.events import DepartureNotice, NackNotice, Settings
 from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.registry import Refusal, StreamId
 from controlplane.matcher import solve

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from controlplane.core.control import ControlCore
-from controlplane.core.control_events import OffersRefusedNotice, Settings
+from controlplane.core.control.control import ControlCore
+from controlplane.core.control.events import OffersRefusedNotice, Settings
 from controlplane.core.publish.messages import Send
 from controlplane.core.registry.registry import Refusal
 from controlplane.matcher import solve

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from protos.model import NodeName, Role, ServiceName, ServiceOffer
 from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S

@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publish.messages import CloseReason
 from protos.model import CandidateSet, InterfaceName, MappingSet, PeerSet, Role, ServiceSet, Version

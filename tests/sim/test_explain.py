@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.problem.problem import BlockKey

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.explanation_text import render
 from protos.histogram import MAX_COUNT, Histogram

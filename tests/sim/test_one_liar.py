@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.fleet_metrics import families
 from protos.model import NodeName, RemovalReason, Report, Role, ServiceSet

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane import stream_encoder
-from controlplane.core.control import ControlCore
-from controlplane.core.control_events import Settings
+from controlplane.core.control.control import ControlCore
+from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publish.messages import Close, Send
 from controlplane.core.publish.publisher import RESEND_S
@@ -39,7 +39,7 @@ from sidecar.core.control.session import Apply, ControlSession, ControlState
 from tests.unit.controlplane.samples import candidate, offer, registration, use
 
 if TYPE_CHECKING:
-    from controlplane.core.control_events import Event
+    from controlplane.core.control.events import Event
     from protos.model import ControlMessage
 
 STEPS = 300

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.registry.registry import Refusal
 from controlplane.core.registry.restlessness import BYTES_BURST, BYTES_PER_S
 from protos.model import CandidateSet, Drain, NodeName, PeerSet, Role, ServiceSet

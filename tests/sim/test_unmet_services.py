@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.control_events import UnmetNotice
+from controlplane.core.control.events import UnmetNotice
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.status_table import render
@@ -15,7 +15,7 @@ from tests.sim.control_world import SETTLED_S, World
 from tests.unit.controlplane.samples import offer, use
 
 if TYPE_CHECKING:
-    from controlplane.core.control_events import Event
+    from controlplane.core.control.events import Event
 
 pytestmark = pytest.mark.audit("ops-5")
 

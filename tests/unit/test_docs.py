@@ -18,7 +18,7 @@ from controlplane.ca import key_file, passphrase
 from controlplane.ca.authority import DEFAULT_DAYS
 from controlplane.ca.request import MAX_REQUEST_BYTES
 from controlplane.config import ControlPlaneConfig
-from controlplane.core.control import ControlCore
+from controlplane.core.control.control import ControlCore
 from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics
 from protos.convert.fields import MAX_CRL_BYTES
@@ -146,7 +146,7 @@ def _sidecar_metrics() -> Iterator[Metric]:
 
 
 def _control_metrics() -> Iterator[Metric]:
-    from controlplane.core.control_events import Settings
+    from controlplane.core.control.events import Settings
 
     metrics = Metrics()
     metrics.watch_fleet(lambda: Fleet((), (), {}, 0.0, 0.0))

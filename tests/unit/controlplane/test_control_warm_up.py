@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from protos.convert import parse_in_parts, sidecar_message_to_proto
 from protos.convert.reports import PART_ENTRIES
 from protos.model import CandidateSet, NodeName, Report, Role, ServiceSet

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.control_events import Settings
+from controlplane.core.control.events import Settings
 from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED, Departed, Departure
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy

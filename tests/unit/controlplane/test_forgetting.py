@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control import ControlCore
-from controlplane.core.control_events import Settings
+from controlplane.core.control.control import ControlCore
+from controlplane.core.control.events import Settings
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.forgetting import FORGET_S, forget_after_s
 from controlplane.core.estimate.processing import ComputeTimes

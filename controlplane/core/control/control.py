@@ -12,7 +12,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, assert_never
 
-from controlplane.core.control_events import (
+from controlplane.core.control.events import (
     Counters,
     CutOffNotice,
     DepartureNotice,
@@ -23,7 +23,7 @@ from controlplane.core.control_events import (
     StreamLostNotice,
     UnmetNotice,
 )
-from controlplane.core.debounce import Change, Debounce
+from controlplane.core.control.schedule import Change, Debounce
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.reached import Reached
 from controlplane.core.estimate.unanswered import Unanswered
