@@ -1,7 +1,7 @@
 """The plan of blocks that share servers: decomposition first, then what it leaves open.
 
-What the decomposition (`controlplane.core.solve.decomposition`) leaves open between plan and bound is searched by CP-SAT, in
-a small group until the optimum is proven, in a large one only if the gap is wide.
+What the decomposition leaves open between plan and bound is searched by CP-SAT, in a small group
+until the optimum is proven, in a large one only if the gap is wide.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The thread that decodes, so that no interface's own thread does: it would keep all other requests of that interface.
 
-It takes slices of some milliseconds, from each peer in turn (`sidecar/core/message/decoding.py`), with nothing locked; the
+It takes slices of some milliseconds, from each peer in turn (`core/message/decoding.py`), with nothing locked; the
 codec lets go of the interpreter as well.
 """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.link.link import datagrams
+from sidecar.core.link import datagrams
 from sidecar.core.seam.links import LinkCommand, SendFinished
 from tests.sim.mesh import Mesh, rule
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.link.link import datagrams
+from sidecar.core.link import datagrams
 from sidecar.core.message import reassembly
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, MIN_SYMBOL_BYTES

@@ -44,7 +44,7 @@ from sidecar.core.crypto import session
 from sidecar.core.crypto.key_schedule import pair_keys
 from sidecar.core.engine.peers import RESTART_GAP_S
 from sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
-from sidecar.core.link.link import path_table
+from sidecar.core.link import path_table
 from sidecar.core.message import reassembly
 from sidecar.core.path import address, key_exchange
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS

@@ -2,7 +2,7 @@
 often than by chance two of a robot's paths miss together.
 
 Requests of the service that really ran are the best witness. For pairs that carried few or none, what the network
-takes (`controlplane.core.estimate.network`) and what the server needs (`controlplane.core.estimate.processing`) are put together.
+takes (`network`) and what the server needs (`processing`) are put together.
 What is computed, and why: docs/theory.md.
 """
 

@@ -1,1 +1,1 @@
-"""The sidecar's end of the control stream, and over which way it is reached. Stands by itself."""
+"""The sidecar's end of the control stream, and over which way it is reached. Imports `base`."""

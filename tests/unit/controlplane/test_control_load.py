@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.control.control import control
+from controlplane.core.control import control
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.formulation import problem_builder
 from controlplane.core.publish.publisher import INFORM_S

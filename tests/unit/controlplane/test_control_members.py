@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from controlplane.core.control.control import control
+from controlplane.core.control import control
 from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
 from protos.errors import DecodeError

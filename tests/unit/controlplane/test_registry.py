@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from controlplane.core.overload.postponed import COUNTED_BURST
+from controlplane.core.registry import registry as registry_module
 from controlplane.core.registry.registry import MAX_POSTPONED, POSTPONE_S, Admission, Refusal, Registry
-from controlplane.core.registry.registry import registry as registry_module
 from protos.model import CandidateSet, NodeName, RemovalReason, Role, ServiceSet
 from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 

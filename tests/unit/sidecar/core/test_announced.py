@@ -14,8 +14,8 @@ from protos.clock_floor import ClockFloor
 from protos.identity import IdentityRole
 from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, NodeName, Peer, PeerSet, Role, Version
 from sidecar.core.crypto import session
+from sidecar.core.engine import announced as module
 from sidecar.core.engine.announced import Announced
-from sidecar.core.engine.engine import announced as module
 from sidecar.core.engine.peers import Peers
 from sidecar.start_session import start_session
 from tests.sessions import session_of

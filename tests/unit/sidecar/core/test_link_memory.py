@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from protos.model import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.link.link import memory as link_memory
+from sidecar.core.link import memory as link_memory
 from sidecar.core.link.memory import MAX_PATHS_OF_A_PEER, LinkMemory
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.keys import PathKeys, make_path_keys
