@@ -4,7 +4,7 @@ So a robot that asks a thousand things at once delays another's request by one e
 events stay in their order. What belongs to no robot has its turn as if it were one.
 
 There is no cap of its own: a request is here only while the engine counts it as running, where each robot has its share
-of MAX_RUNNING and MAX_RUNNING_BYTES (`dedup.py`), and is followed by two events at most.
+of MAX_RUNNING and MAX_RUNNING_BYTES (`executions.py`), and is followed by two events at most.
 """
 
 from __future__ import annotations

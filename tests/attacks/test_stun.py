@@ -27,7 +27,7 @@ QUESTIONS = 3000
 ANSWERS = 300
 QUESTION = encode(StunMessage(MessageClass.REQUEST, bytes(range(12))))
 EXTRA_BYTES = 12
-"""An answer over IPv4 is so much longer than its question (stun_responder.py)."""
+"""An answer over IPv4 is so much longer than its question (responder.py)."""
 OUTCOMES = "plr_stun_datagrams_total"
 UNASKED = "stun_unknown_transaction"
 

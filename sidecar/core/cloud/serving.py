@@ -1,5 +1,5 @@
 """Cloud side: robots' requests from their arrival to their answers (paper, figure "Workflow Diagram", request steps 7
-to 9). Which of them run is `dedup.py`'s."""
+to 9). Which of them run is `executions.py`'s."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ that nothing pauses.
 
 The nonce is the last 12 of the 20 clear bytes: half of the sender's session, and the packet number, which never
 repeats within a session. A path's keys belong to one session, path and direction (`key_schedule.py`), so no nonce
-repeats under a key. What a path numbered and opened outlives it (`link_memory.py`).
+repeats under a key. What a path numbered and opened outlives it (`memory.py`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How much may be under way to one peer: what it can put together, and how many messages.
 
-A peer puts unfinished messages together in MAX_PEER_BYTES (`fragments.py`), each copy of a payload in a buffer of its
+A peer puts unfinished messages together in MAX_PEER_BYTES (`reassembly.py`), each copy of a payload in a buffer of its
 own. Large messages and small ones have parts of it that are theirs alone: neither waits for the other, however many
 there are. A message of one datagram is never unfinished, so only its number counts.
 """

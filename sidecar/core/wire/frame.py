@@ -17,7 +17,7 @@ Datagram::
     +---------------------------------------------------------------+
 
 The first 20 bytes stay in clear; they are the associated data, and the last 12 of them the nonce. Flags: bit 0 says
-sealed and is always 1, bit 1 is the phase of the keys (path_keys.py), bit 2 says introduction (introduction.py: another
+sealed and is always 1, bit 1 is the phase of the keys (keys.py), bit 2 says introduction (introduction.py: another
 key, and no frames); the others are 0. The first byte tells our datagrams (0xD3) from STUN's (0x00 to 0x3F, RFC 8489
 section 5) on the same socket.
 

@@ -51,7 +51,7 @@ class MappingTable:
         """Return the paths for a new request's copies; empty when nothing reaches any of the `servers`.
 
         `servers` are the live ones that offer the service. Requests that are not idempotent get one server only
-        (over every interface that reaches it: the server runs them once, `dedup.py`).
+        (over every interface that reaches it: the server runs them once, `executions.py`).
         """
         chosen = self._mapped(service, servers)
         if not any(route.state is PathState.UP for route in chosen):
