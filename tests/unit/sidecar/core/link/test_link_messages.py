@@ -23,7 +23,7 @@ from tests.unit.sidecar.core.builders import (
     A,
     message,
 )
-from tests.unit.sidecar.core.test_link import (
+from tests.unit.sidecar.core.link.test_link import (
     PATH,
     fragment,
     numbers,

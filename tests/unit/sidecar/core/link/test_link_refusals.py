@@ -16,7 +16,7 @@ from tests.unit.sidecar.core.builders import (
     Bench,
     message,
 )
-from tests.unit.sidecar.core.test_link import (
+from tests.unit.sidecar.core.link.test_link import (
     ELSEWHERE,
     OTHER_SESSION,
     PATH,

@@ -21,7 +21,7 @@ from tests.unit.sidecar.core.builders import (
     A,
     Bench,
 )
-from tests.unit.sidecar.core.test_link import (
+from tests.unit.sidecar.core.link.test_link import (
     ELSEWHERE,
     OUR_CREDENTIAL,
     PROBE,

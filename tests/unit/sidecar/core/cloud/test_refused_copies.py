@@ -12,7 +12,7 @@ from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import RejectionMessage
 from tests.unit.sidecar.core.builders import request, request_id
-from tests.unit.sidecar.core.test_dedup import ROBOT, ROBOT_2ND, run, table
+from tests.unit.sidecar.core.cloud.test_executions import ROBOT, ROBOT_2ND, run, table
 
 
 @pytest.mark.audit("dp-14")

@@ -12,7 +12,7 @@ from sidecar.core.seam.links import FragmentsLost, PeerClosed, PeerRestarted, Re
 from sidecar.core.wire.messages import ResponseMessage
 from tests.sessions import credential_of
 from tests.unit.sidecar.core.builders import ECHO, A, peer, request, request_id
-from tests.unit.sidecar.core.test_engine import ROBOT, Sidecar, cloud, robot
+from tests.unit.sidecar.core.engine.test_engine import ROBOT, Sidecar, cloud, robot
 
 
 def cancelled(sidecar: Sidecar) -> int:

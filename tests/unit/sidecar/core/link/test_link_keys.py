@@ -21,7 +21,7 @@ from sidecar.core.wire.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Pro
 from sidecar.core.wire.introduction import encode_introduction
 from tests.sessions import credential_of, seal, session_of
 from tests.unit.sidecar.core.builders import OUR_ID, OUR_TOKEN, PEER_ADDRESS, WLAN, Bench, peer
-from tests.unit.sidecar.core.test_link import PROBE, fragment, up
+from tests.unit.sidecar.core.link.test_link import PROBE, fragment, up
 
 if TYPE_CHECKING:
     from sidecar.core.path.keys import PathKeys

@@ -7,7 +7,7 @@ from sidecar.core.seam.links import FragmentsLost, Send, SendFinished
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, AckFrame, Finished, Fragment
 from tests.unit.sidecar.core.builders import message
-from tests.unit.sidecar.core.test_link import PATH, fragment, numbers, up
+from tests.unit.sidecar.core.link.test_link import PATH, fragment, numbers, up
 
 
 def test_a_finished_that_may_wait_waits_for_a_moment_only() -> None:
