@@ -28,7 +28,7 @@ setup: ## Debian packages, .venv, locked dependencies, example interfaces (the o
 	@deploy/dev/setup.sh
 
 demo: setup ## a robot keeps its deadline while a link, a server and the control plane die (about two minutes)
-	@$(PY) -m bench.demo $(DEMO_ARGS)
+	@$(PY) -m lab.demo $(DEMO_ARGS)
 
 test: setup ## all tests
 	@deploy/dev/test.sh $(PYTEST_ARGS)

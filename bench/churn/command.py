@@ -14,14 +14,14 @@ from bench.churn.hands import Hands
 from bench.churn.runner import SAMPLE_EVERY_S, Runner
 from bench.churn.schedule import SERVERS, make_schedule
 from bench.churn.workloads import WORKLOADS
-from bench.system import SystemFailureError, read_json
+from lab.system import SystemFailureError, read_json
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator
 
     from bench.churn.workloads import Workload
-    from bench.system import Part
+    from lab.system import Part
 
 OURS = ("robot.sidecar", *(f"{cloud}.sidecar" for cloud in SERVERS), "controlplane")
 BAD_LINES = ("Traceback", "internal error")

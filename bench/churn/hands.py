@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from bench.churn.schedule import PATHS, SERVERS, Kind, Lane, Trouble
 from bench.churn.workloads import SERVICES
-from bench.netlab import Lab, LabConfig, LinkProfile
-from bench.system import System
+from lab import Lab, LabConfig, LinkProfile
+from lab.system import System
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -146,7 +146,7 @@ class Hands:
 
     def _start_ros(self, cloud: str) -> None:
         for service in SERVICES:
-            argv = ["-m", "bench.echo", "serve", "--name", service.part, "--service", service.name]
+            argv = ["-m", "lab.echo", "serve", "--name", service.part, "--service", service.name]
             argv += ["--delay-ms", str(service.takes_ms)]
             self.system.start_node(f"{cloud}.{service.part}", cloud, argv)
 

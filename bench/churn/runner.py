@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from bench.churn.hands import Hands
-    from bench.system import Part
+    from lab.system import Part
 
 TURN_S = 0.05
 LOOK_EVERY_S = 0.5

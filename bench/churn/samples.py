@@ -12,7 +12,7 @@ from bench.churn.machine import processor_s
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from bench.system import Part
+    from lab.system import Part
 
 MAX_GROWTH_MB = 4.0
 """Over the second half of a run, by a straight line through the least of each minute, less twice its standard error:

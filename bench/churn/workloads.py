@@ -52,7 +52,7 @@ class Workload:
 
     def argv(self, length_s: float) -> list[str]:
         """Of its program, without where the result goes."""
-        argv = ["-m", "bench.echo", "call", "--service", self.service.name, "--size", str(self.size)]
+        argv = ["-m", "lab.echo", "call", "--service", self.service.name, "--size", str(self.size)]
         argv += ["--answer-bytes", *map(str, self.answer_bytes)]
         argv += ["--rate", str(self.rate_hz), "--duration", str(length_s)]
         argv += ["--deadline-ms", str(self.service.deadline_ms), "--grace-s", str(self.grace_s)]

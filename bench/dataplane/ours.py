@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from bench.netlab import Host, Lab
+    from lab import Host, Lab
 
 Service = dict[str, Any]
 SERVICE: Service = {"name": "/bench", "deadline_ms": 1_000.0, "lifetime_ms": 30_000.0, "idempotent": True}

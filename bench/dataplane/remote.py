@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from bench.netlab import Host
+    from lab import Host
 
 ANSWER_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 5.0

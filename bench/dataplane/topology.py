@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bench.netlab import HostSpec, InterfaceSpec, LabConfig, LabError, LinkProfile, server
+from lab import HostSpec, InterfaceSpec, LabConfig, LabError, LinkProfile, server
 
 if TYPE_CHECKING:
-    from bench.netlab import Host, Lab
+    from lab import Host, Lab
 
 ROBOT = "robot"
 CLOUDS = ("cloud_a", "cloud_b")

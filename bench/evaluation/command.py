@@ -21,10 +21,10 @@ from bench.evaluation.redundancy_costs import mode_costs
 from bench.evaluation.report import RUNS, modes_table, read_records, window_table
 from bench.evaluation.runner import run as run_in_lab
 from bench.evaluation.scenario import Scenario, read_scenarios
-from bench.netlab import LabConfigError
-from bench.netlab.trace_folder import read_folder
 from bench.reporting.machine import machine
 from bench.reporting.terminal import rich_table
+from lab import LabConfigError
+from lab.trace_folder import read_folder
 from protos.errors import ConfigError
 
 if TYPE_CHECKING:

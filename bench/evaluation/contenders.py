@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.dataplane.remote import Remote
 from bench.dataplane.topology import CARRIERS, CLOUDS, ROBOT, allow_multipath
-from bench.netlab import HostSpec, InterfaceSpec, LabConfig, LinkProfile, server
-from bench.system import System
+from lab import HostSpec, InterfaceSpec, LabConfig, LinkProfile, server
+from lab.system import System
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bench.evaluation.scenario import Traffic
-    from bench.netlab import Host, Lab
+    from lab import Host, Lab
 
     Clients = Sequence[Remote]
     """Each sends every request, at the same moments; the first answer counts."""
 
 SERVICE = "/echo"
-"""As of `bench.echo`, which needs ROS."""
+"""As of `lab.echo`, which needs ROS."""
 PATHS = dict(zip(CARRIERS, ("a", "b"), strict=True))
 """The robot's interface -> the path of the trace behind it."""
 WARM = LinkProfile(delay_ms=20.0, rate_kbps=50_000.0)
@@ -72,7 +72,7 @@ class World:
     def start_ros_server(self, host: Host, **environment: str) -> None:
         """Start a ROS server; how long it computes it is told with each request."""
         stall = self.traffic.compute(first=host.name == CLOUDS[0])
-        argv = [sys.executable, "-m", "bench.echo", "serve"]
+        argv = [sys.executable, "-m", "lab.echo", "serve"]
         if stall["stall_every"]:
             argv += ["--delay-ms", f"{stall['stall_s'] * 1e3:g}", "--delay-every", str(stall["stall_every"])]
         host.popen(argv, env=environment, log_path=self.folder / f"{host.name}.echo.log")
@@ -80,7 +80,7 @@ class World:
     def start_fallback(self, host: Host) -> None:
         """Start the robot's own ROS server, which is told how long to compute for the clouds."""
         delay_ms = max(0.0, FALLBACK_TAKES * self.traffic.deadline_ms - self.traffic.compute_ms)
-        argv = [sys.executable, "-m", "bench.echo", "serve", "--service", FALLBACK, "--delay-ms", f"{delay_ms:g}"]
+        argv = [sys.executable, "-m", "lab.echo", "serve", "--service", FALLBACK, "--delay-ms", f"{delay_ms:g}"]
         host.popen(argv, log_path=self.folder / f"{host.name}.echo.log")
 
     @contextlib.contextmanager

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from bench.evaluation.scenario import Scenario
-    from bench.netlab import Trace
-    from bench.netlab.trace_folder import TraceEntry
+    from lab import Trace
+    from lab.trace_folder import TraceEntry
 
     Rates = Mapping[str, Sequence[float]]
     """Network -> downlink rate in each step, as recorded; uplink rates are made of them."""

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from bench.evaluation.kinds import DEAD_ZONE_FACTOR, KINDS
-from bench.netlab import LinkProfile, Trace, TraceStep
+from lab import LinkProfile, Trace, TraceStep
 
 if TYPE_CHECKING:
     from bench.evaluation.carriers import Carrier, Floats

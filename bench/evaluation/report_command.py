@@ -14,9 +14,9 @@ from bench.evaluation.drives import Drives
 from bench.evaluation.measured import Measured
 from bench.evaluation.scenario import read_scenarios
 from bench.evaluation.targets import TARGETS
-from bench.netlab import LabConfigError
-from bench.netlab.trace_folder import read_folder
 from bench.reporting.terminal import show_verdicts
+from lab import LabConfigError
+from lab.trace_folder import read_folder
 
 if TYPE_CHECKING:
     import argparse

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from bench.dataplane.statistics import MS, Calls, quantile
 from bench.evaluation.contenders import PATHS, WARM, World
 from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request
-from bench.netlab import Lab
 from bench.pressure import BUSY_SHARE, CpuPressure
+from lab import Lab
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from bench.dataplane.remote import Remote
     from bench.evaluation.contenders import Contender
     from bench.evaluation.scenario import Scenario
-    from bench.netlab import LinkStats
+    from lab import LinkStats
 
 WARM_UP_S = 3.0
 """Of the scenario's requests, on the good network, before the window."""

@@ -25,8 +25,8 @@ from protos.config_file import parse_yaml, read_text, validate
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from bench.netlab import Trace
-    from bench.netlab.trace_folder import TraceEntry
+    from lab import Trace
+    from lab.trace_folder import TraceEntry
 
 FOLDER = Path(__file__).with_name("scenarios")
 HEADER_BYTES = 16

@@ -12,10 +12,10 @@ from bench.evaluation.ideal import IDEALS, compute
 from bench.evaluation.kinds import KINDS
 from bench.evaluation.scenario import Scenario, read_scenarios
 from bench.evaluation.trace_statistics import LAGS_S, SHOWN, PairStatistics, measure, stated
-from bench.netlab import LabConfigError
-from bench.netlab.trace_folder import TraceEntry, read_folder
 from bench.reporting.tables import Figure, Table
 from bench.reporting.terminal import rich_table
+from lab import LabConfigError
+from lab.trace_folder import TraceEntry, read_folder
 from protos.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from bench.evaluation.carriers import Carrier, Floats
     from bench.evaluation.kinds import Kind
-    from bench.netlab import Trace
+    from lab import Trace
 
 SHOWN = (0.05, 0.25, 0.5, 0.75, 0.95)
 LAGS_S = (1.0, 5.0, 20.0)

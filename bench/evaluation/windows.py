@@ -11,12 +11,12 @@ import fnmatch
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from bench.netlab import Trace, TraceStep
+from lab import Trace, TraceStep
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from bench.netlab.trace_folder import TraceEntry
+    from lab.trace_folder import TraceEntry
 
 
 @dataclass(frozen=True, slots=True)

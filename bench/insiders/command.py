@@ -16,14 +16,14 @@ from bench.churn.samples import Watch
 from bench.insiders import report
 from bench.insiders.report import Outcome, Phase
 from bench.insiders.stage import HONEST, INSIDERS, WORKLOADS, Stage, make_lab
-from bench.system import SystemFailureError, read_json
+from lab.system import SystemFailureError, read_json
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Iterator
 
     from bench.insiders.stage import Workload
-    from bench.system import Part
+    from lab.system import Part
 
 SAMPLE_EVERY_S = 5.0
 SHOW_EVERY_S = 0.5

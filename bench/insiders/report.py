@@ -7,7 +7,6 @@ import re
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from bench.attacker.hostile_link import spoofed
 from bench.churn.report import FLAWS
 from bench.churn.samples import Life, Sample, growth
 from bench.dataplane.statistics import Calls, interval, p99_ratio, quantile
@@ -16,6 +15,7 @@ from bench.insiders.stage import CLOUDS, PROFILES, ROBOTS
 from bench.reporting.machine import machine
 from bench.reporting.tables import Table
 from bench.reporting.terminal import rich_table
+from lab.attacker.hostile_link import spoofed
 from sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
 
 if TYPE_CHECKING:

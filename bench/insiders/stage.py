@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.attacker.orders import ORDERS, TALLY, Orders
-from bench.attacker.wire import Tap
-from bench.netlab import Lab, LabConfig, LinkProfile, robot, server
-from bench.system import CONTROL_METRICS_PORT, CONTROL_PORT, METRICS_PORT, System, read_json
+from lab import Lab, LabConfig, LinkProfile, robot, server
+from lab.attacker.orders import ORDERS, TALLY, Orders
+from lab.attacker.wire import Tap
+from lab.system import CONTROL_METRICS_PORT, CONTROL_PORT, METRICS_PORT, System, read_json
 from protos.identity import IdentityRole
 
 if TYPE_CHECKING:
-    from bench.netlab import HostSpec
-    from bench.system import Part
+    from lab import HostSpec
+    from lab.system import Part
 
 
 def name_of(host: str) -> str:
@@ -109,16 +109,16 @@ class Stage:
                 self._lab.link(interface, host=name).set(profile)
         self.system.start_control_plane(policy=POLICY)
         for name in (*CLOUDS, ROGUE_CLOUD):
-            self.system.start_node(f"{name}.echo", name, ["-m", "bench.echo", "serve"])
+            self.system.start_node(f"{name}.echo", name, ["-m", "lab.echo", "serve"])
         for name in CLOUDS:
             self.system.start_cloud(name, [{"name": "/echo"}])
-        self.system.start_cloud(ROGUE_CLOUD, [{"name": "/echo"}], module="bench.attacker.insider")
+        self.system.start_cloud(ROGUE_CLOUD, [{"name": "/echo"}], module="lab.attacker.insider")
         rogue = self.system.start_robot(
             [SERVICE],
             name=name_of(ROGUE_ROBOT),
             host=ROGUE_ROBOT,
             interfaces=["eth0"],
-            module="bench.attacker.insider",
+            module="lab.attacker.insider",
         )
         # Parts go by their hosts' names.
         self.system.parts[f"{ROGUE_ROBOT}.sidecar"] = self.system.parts.pop(rogue.name)
@@ -153,12 +153,12 @@ class Stage:
         certificates = [
             f"{self.system.tls_dir(name_of(name), role)}={name_of(name)}={role.value}" for name, role in who
         ]
-        argv = ["-m", "bench.attacker.insider_streams", target, str(self._file(STREAMS, ".yaml")), *certificates]
+        argv = ["-m", "lab.attacker.insider_streams", target, str(self._file(STREAMS, ".yaml")), *certificates]
         self.system.start_node(STREAMS, ROGUE_ROBOT, argv)
 
     def start_client(self, workload: Workload, length_s: float) -> Part:
         """Let an honest robot call for so long."""
-        argv = ["-m", "bench.echo", "call", "--size", str(workload.size), "--rate", str(workload.rate_hz)]
+        argv = ["-m", "lab.echo", "call", "--size", str(workload.size), "--rate", str(workload.rate_hz)]
         argv += ["--duration", str(length_s), "--deadline-ms", str(SERVICE["deadline_ms"]), "--queue-depth", "200"]
         argv += ["--grace-s", "40", "--json", str(self.result_file(workload))]
         return self.system.start_node(workload.part, workload.robot, argv)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from bench.netlab.traces import Trace
+    from lab.traces import Trace
 
 SHOWN_MISFITS = 12
 

@@ -12,9 +12,9 @@ from rich.console import Console
 from bench.dataplane.section import Findings
 from bench.matcher import calibrated, live, speed, useful
 from bench.matcher.targets import TARGETS
-from bench.netlab.errors import LabConfigError
 from bench.reporting.machine import machine
 from bench.reporting.terminal import rich_table, show_verdicts
+from lab.errors import LabConfigError
 
 if TYPE_CHECKING:
     import argparse

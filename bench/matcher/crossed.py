@@ -24,7 +24,7 @@ from protos.model import Assignment, InterfaceName, NodeName
 
 if TYPE_CHECKING:
     from bench.matcher.races import Workload
-    from bench.netlab.traces import Trace
+    from lab.traces import Trace
 
 EXTRA_RTT_S = (0.0, 0.01, 0.03)
 """How much farther than the trace's own server each server is: in the city, in the country, on the continent."""

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.dataplane.section import Findings
-from bench.netlab import Lab, LabConfig, LinkProfile
 from bench.reporting.tables import Figure, Table
-from bench.system import System, read_json
+from lab import Lab, LabConfig, LinkProfile
+from lab.system import System, read_json
 from protos.errors import DecodeError
 from protos.model import NodeName
 from sidecar.state_file import decode_last_good
@@ -97,13 +97,13 @@ def _swap(system: System, links: tuple[str, ...], clouds: tuple[str, ...], befor
     _burden(system, clouds, busy="")
     system.start_control_plane()
     for cloud in clouds:
-        argv = ["-m", "bench.echo", "serve", "--burden", str(_burden_file(system, cloud))]
+        argv = ["-m", "lab.echo", "serve", "--burden", str(_burden_file(system, cloud))]
         system.start_node(f"{cloud}.server", cloud, argv)
         system.start_cloud(cloud, [{"name": SERVICE}])
     rule = {"name": SERVICE, "deadline_ms": DEADLINE_MS, "lifetime_ms": 30_000, "idempotent": True}
     system.wait_for_offer(system.start_robot([rule], interfaces=links))
     out = system.folder / "call.json"
-    argv = ["-m", "bench.echo", "call", "--rate", str(RATE_HZ), "--duration", "600", "--grace-s", "25"]
+    argv = ["-m", "lab.echo", "call", "--rate", str(RATE_HZ), "--duration", "600", "--grace-s", "25"]
     client = system.start_node("client", "robot", [*argv, "--deadline-ms", str(DEADLINE_MS), "--json", str(out)])
     system.wait("the mapping", lambda: len(_mapped(system)) == len(links))
     (idle,) = (cloud for cloud in clouds if _named(cloud) not in _mapped(system))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from controlplane.planning.fifo import FifoPath
 
 if TYPE_CHECKING:
-    from bench.netlab.traces import Trace
+    from lab.traces import Trace
 
 ANSWER_BYTES = 1000
 PROCESSING_MEDIAN_S = 0.02

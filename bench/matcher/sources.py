@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bench.evaluation.generator import generate
-from bench.netlab.trace_folder import DEFAULT_FOLDER, INDEX, read_folder
+from lab.trace_folder import DEFAULT_FOLDER, INDEX, read_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from bench.netlab.traces import Trace
+    from lab.traces import Trace
 
 MADE_UP = 6
 MADE_UP_S = 600.0

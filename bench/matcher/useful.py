@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bench.matcher.races import Workload
-    from bench.netlab.traces import Trace
+    from lab.traces import Trace
 
 SERVERS = (2, 3)
 LARGE_BYTES = 100_000

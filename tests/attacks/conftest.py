@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.system import System
+from lab.system import System
 from tests.attacks.world import World, attack_lab
 
 if TYPE_CHECKING:

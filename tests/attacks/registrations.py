@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bench.attacker import registration as attacker
+from lab.attacker import registration as attacker
 
 if TYPE_CHECKING:
     from controlplane.ca import Issued

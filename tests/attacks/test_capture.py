@@ -17,7 +17,7 @@ from tests.attacks.world import CLOUDS, World, is_ours
 from tests.netns.calling import Call, assert_flawless
 
 if TYPE_CHECKING:
-    from bench.attacker.wire import Captured
+    from lab.attacker.wire import Captured
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 

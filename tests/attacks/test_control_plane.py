@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bench.attacker.control_client import CONNECT, CONTROL_PLANE_DNS
-from bench.system import CONTROL_PORT
 from controlplane.ca import Authority, Validity
 from controlplane.ca.files import write_tls_files
+from lab.attacker.control_client import CONNECT, CONTROL_PLANE_DNS
+from lab.system import CONTROL_PORT
 from protos.identity import IdentityRole
 from protos.model import Role
 from tests.attacks.registrations import registration
@@ -58,7 +58,7 @@ class Intruder:
     def call(self, method: str, *messages: bytes, tls: bool = True, stay_s: float = 5.0) -> dict[str, Any]:
         """Call the control plane from the attacker's host; returns how that ended."""
         host, port = target(self.world)
-        argv = [sys.executable, "-m", "bench.attacker.control_client", f"{host}:{port}", method, "--stay", str(stay_s)]
+        argv = [sys.executable, "-m", "lab.attacker.control_client", f"{host}:{port}", method, "--stay", str(stay_s)]
         argv += ["--tls-dir", str(self.folder)] if tls else []
         lines = "".join(base64.b64encode(message).decode() + "\n" for message in messages)
         done = self.world.lab.host(ATTACKER).run(argv, input=lines, timeout=60.0, check=True)

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.attacker.junk import flipped, headed, mangled
+from lab.attacker.junk import flipped, headed, mangled
 from tests.attacks.world import ATTACKER, World, is_ours, send_all
 
 if TYPE_CHECKING:
-    from bench.attacker.wire import Captured
+    from lab.attacker.wire import Captured
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 

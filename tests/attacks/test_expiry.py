@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.system import read_json
 from controlplane.ca.certificates import Validity
+from lab.system import read_json
 from protos.identity import IdentityRole
 from tests.attacks.world import SERVICES
 
@@ -36,7 +36,7 @@ def test_a_certificate_that_ends_takes_its_living_session_with_it(world: World) 
     robot = system.start_robot(SERVICES, name=ROBOT_2, host="robot_2", interfaces=["eth9"])
     system.wait_for_offer(robot)
     out = system.folder / "expiry.json"
-    argv = ["-m", "bench.echo", "call", "--rate", "5", "--duration", str(CALLS_S), "--json", str(out)]
+    argv = ["-m", "lab.echo", "call", "--rate", "5", "--duration", str(CALLS_S), "--json", str(out)]
     with world.calls():
         system.start_node("expiry.client", "robot_2", argv).process.wait(CALLS_S + 60)
         del system.parts["expiry.client"]

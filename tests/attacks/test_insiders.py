@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.system import CONTROL_PORT, System, read_json
 from controlplane.ca import Authority
+from lab.system import CONTROL_PORT, System, read_json
 from protos.identity import IdentityRole
 from tests.attacks.world import ATTACKER, World, attack_lab, is_ours
 
@@ -52,7 +52,7 @@ def test_a_cloud_that_offers_what_is_not_its_own(world: World) -> None:
     """Its server answers everything at once, and wrongly; nobody asks it."""
     journal = world.system.folder / "rogue.journal"
     with world.calls():
-        world.system.start_node("rogue.echo", ATTACKER, ["-m", "bench.echo", "serve", "--journal", str(journal)])
+        world.system.start_node("rogue.echo", ATTACKER, ["-m", "lab.echo", "serve", "--journal", str(journal)])
         rogue = world.system.start_cloud(ATTACKER, [{"name": "/echo"}])
         world.wait_until_counted("plr_offers_refused_total", 1)
         world.system.wait(
@@ -67,7 +67,7 @@ def test_a_cloud_that_offers_what_is_not_its_own(world: World) -> None:
 def test_a_robot_that_calls_what_it_may_not(world: World) -> None:
     """Its sidecar asks cloud-a for /echo over the session that it has for /plan_path."""
     rogue = world.system.start_robot(
-        [PLAN], name=ROBOT_2, host="robot_2", interfaces=["eth9"], module="bench.attacker.rogue_sidecar"
+        [PLAN], name=ROBOT_2, host="robot_2", interfaces=["eth9"], module="lab.attacker.rogue_sidecar"
     )
     world.system.wait_for_offer(rogue)
     reached = world.counter("cloud_a", "plr_bridge_messages_total", direction="request_to_server", service="/plan_path")
@@ -123,7 +123,7 @@ def test_a_stand_in_for_the_control_plane(world: World, tmp_path: Path, whose: s
         world.system.authority.write_tls_dir(tmp_path / "tls", f"false-{whose}", IdentityRole.ROBOT)
     else:
         Authority.create().write_tls_dir(tmp_path / "tls", "control", IdentityRole.CONTROL_PLANE)
-    argv = ["-m", "bench.attacker.stand_in", str(CONTROL_PORT), str(tmp_path / "tls")]
+    argv = ["-m", "lab.attacker.stand_in", str(CONTROL_PORT), str(tmp_path / "tls")]
     stand_in = world.system.start_node(f"stand-in-{whose}", ATTACKER, argv)
     world.system.wait("the stand-in to listen", lambda: "listens" in stand_in.log.read_text())
     target = f"{world.lab.host(ATTACKER).address()}:{CONTROL_PORT}"

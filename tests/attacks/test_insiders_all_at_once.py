@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 from rich.console import Console
 
-from bench.attacker.hostile_link import ATTACKS
 from bench.insiders.command import insiders
 from bench.insiders.report import show
+from lab.attacker.hostile_link import ATTACKS
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.attacker.rogue_cloud import SHARE
-from bench.system import System
+from lab.attacker.rogue_cloud import SHARE
+from lab.system import System
 from tests.attacks.world import World, attack_lab
 from tests.netns.calling import Call
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.system import CONTROL_METRICS_PORT, METRICS_PORT, System
 from controlplane.ca import Authority
 from controlplane.ca.files import write_atomically, write_tls_files
+from lab.system import CONTROL_METRICS_PORT, METRICS_PORT, System
 from protos.tls_files import CA_FILE, CRL_FILE
 from tests.attacks.world import World, attack_lab, is_ours
 from tests.netns.calling import Call, assert_flawless
@@ -19,8 +19,8 @@ from tests.netns.calling import Call, assert_flawless
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bench.attacker.wire import Captured
     from controlplane.ca import Issued
+    from lab.attacker.wire import Captured
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(600)]
 

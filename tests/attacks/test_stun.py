@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.attacker.wire import Captured
-from bench.system import STUN_PORT
 from controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
+from lab.attacker.wire import Captured
+from lab.system import STUN_PORT
 from protos.stun import MessageClass, StunMessage, decode, encode, is_stun
 from tests.attacks.world import ATTACKER, ATTACKERS_PORT, World, is_ours, send_all
 
 if TYPE_CHECKING:
-    from bench.attacker.wire import Tap
+    from lab.attacker.wire import Tap
     from protos.model import Address
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]

@@ -15,10 +15,10 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from bench.attacker.wire import Tap
-from bench.netlab import Lab, LabConfig, LinkProfile, robot, server
-from bench.system import CONTROL_METRICS_PORT, METRICS_PORT
 from controlplane.ca.files import write_atomically
+from lab import Lab, LabConfig, LinkProfile, robot, server
+from lab.attacker.wire import Tap
+from lab.system import CONTROL_METRICS_PORT, METRICS_PORT
 from protos.tls_files import CRL_FILE
 from tests.netns.calling import Call
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from bench.attacker.wire import Captured
-    from bench.system import Part, System
+    from lab.attacker.wire import Captured
+    from lab.system import Part, System
 
 CLOUDS = ("cloud_a", "cloud_b")
 ATTACKER = "attacker"
@@ -70,14 +70,14 @@ class World:
     def start(self, policy: dict[str, Any] | None = None, *, rogue: str | None = None, **sidecars: Any) -> None:
         """Everything a user would start; `sidecars` go to the configuration of all of them.
 
-        `rogue`: the cloud whose program somebody has changed (`bench.attacker.rogue_cloud`).
+        `rogue`: the cloud whose program somebody has changed (`lab.attacker.rogue_cloud`).
         """
         for name, profile in (("wlan0", WLAN), ("wwan0", WWAN)):
             self.lab.link(name, host="robot").set(profile)
         self.system.start_control_plane(**({} if policy is None else {"policy": policy}))
         for cloud in CLOUDS:
-            self.system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
-            module = "bench.attacker.rogue_cloud" if cloud == rogue else "sidecar"
+            self.system.start_node(f"{cloud}.echo", cloud, ["-m", "lab.echo", "serve"])
+            module = "lab.attacker.rogue_cloud" if cloud == rogue else "sidecar"
             self.system.start_cloud(cloud, OFFERS, module=module, **sidecars)
         self.system.wait_for_offer(self.start_robot(**sidecars))
 

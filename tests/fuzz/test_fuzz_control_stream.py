@@ -15,8 +15,8 @@ import grpc
 import psutil
 import pytest
 
-from bench.attacker.control_client import CONNECT
-from bench.attacker.junk import mangled, noise
+from lab.attacker.control_client import CONNECT
+from lab.attacker.junk import mangled, noise
 from protos.convert import sidecar_message_to_proto
 from protos.identity import CONTROL_PLANE_DNS, IdentityRole
 from protos.model import CandidateSet, Drain, Heartbeat, NodeName, Report, Role, ServiceSet

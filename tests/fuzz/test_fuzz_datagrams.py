@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
-from bench.attacker.junk import flipped, headed, mangled, noise
+from lab.attacker.junk import flipped, headed, mangled, noise
 from protos.model import InterfaceName
 from sidecar.core.wire.frame import HEADER_BYTES
 from tests.fuzz.test_engine_fuzz import ATTACKS, Rogue, arena, assert_bounded

@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.attacker.junk import flipped, mangled, noise
+from lab.attacker.junk import flipped, mangled, noise
 from protos.convert import (
     control_message_to_proto,
     explanation_from_proto,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from bench.netlab import Host, Lab
+    from lab import Host, Lab
 
 
 def plug_in(lab: Lab, host: str, interface: str, *, network: int = 77) -> None:

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from bench.system import read_json
+from lab.system import read_json
 
 if TYPE_CHECKING:
-    from bench.system import System
+    from lab.system import System
 
 
 class Call:
     """A client of /echo in the background."""
 
-    def __init__(self, system: System, *options: str, module: str = "bench.echo call") -> None:
+    def __init__(self, system: System, *options: str, module: str = "lab.echo call") -> None:
         self._out = system.folder / "call.json"
         self._out.unlink(missing_ok=True)
         self._system = system
         (system.folder / "client.log").unlink(missing_ok=True)
         # A client that a busy machine does not let run keeps no more answers than its queue holds, ours or any other's.
-        queue = ["--queue-depth", "200"] if module.startswith("bench.echo") else []
+        queue = ["--queue-depth", "200"] if module.startswith("lab.echo") else []
         argv = ["-m", *module.split(), *queue, "--grace-s", "25", "--json", str(self._out), *options]
         self._part = system.start_node("client", "robot", argv)
 

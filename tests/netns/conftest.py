@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.netlab import Lab
+from lab import Lab
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

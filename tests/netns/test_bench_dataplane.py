@@ -11,7 +11,7 @@ import pytest
 from bench import __main__ as bench
 from bench.dataplane.ours import Ours
 from bench.dataplane.topology import CARRIERS, SilentCut, cables
-from bench.netlab import Lab
+from lab import Lab
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.netlab import Lab, LabConfig, LinkProfile
-from bench.system import CONTROL_PORT, STUN_PORT, System
+from lab import Lab, LabConfig, LinkProfile
+from lab.system import CONTROL_PORT, STUN_PORT, System
 from tests.netns.calling import Call, assert_flawless
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
-    from bench.system import Part
+    from lab.system import Part
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180), pytest.mark.audit("dp-12")]
 
@@ -46,7 +46,7 @@ def system(order: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> 
             stun_listen=[f"[::]:{STUN_PORT}"],
             stun_servers=[f"{control.address()}:{STUN_PORT}", f"[{control.address(family=6)}]:{STUN_PORT}"],
         )
-        running.start_node("cloud_a.echo", "cloud_a", ["-m", "bench.echo", "serve"])
+        running.start_node("cloud_a.echo", "cloud_a", ["-m", "lab.echo", "serve"])
         running.start_cloud("cloud_a", [{"name": "/echo"}])
         yield running
         running.close()

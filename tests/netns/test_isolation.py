@@ -12,14 +12,14 @@ import pytest
 
 from bench.dataplane.ours import Ours
 from bench.dataplane.topology import CARRIERS, ROBOT, SilentCut, cables
-from bench.netlab import Lab
+from lab import Lab
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
     from bench.dataplane.statistics import Calls
-    from bench.netlab import Host
+    from lab import Host
 
 pytestmark = pytest.mark.netns
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.netlab import Lab, LabConfig
-from bench.system import System
+from lab import Lab, LabConfig
+from lab.system import System
 from tests.netns.calling import Call
 from tests.netns.two_clouds import CLOUDS, executed, make_links_good
 
@@ -47,7 +47,7 @@ def serve(system: System, cloud: str, *before: str) -> None:
     """Start a server and wait until the robot may use it; `before`: what starts it in turn."""
     log = system.parts[f"{cloud}.sidecar"].log
     times = offers(log.read_text())
-    argv = ["-m", "bench.echo", "serve", "--delay-ms", "30", "--delay-every", "1"]
+    argv = ["-m", "lab.echo", "serve", "--delay-ms", "30", "--delay-every", "1"]
     journal = ["--journal", str(system.folder / f"{cloud}.journal")]
     system.start_node(f"{cloud}.echo", cloud, [*before, *argv, *journal])
     system.wait(f"{cloud} to offer /echo", lambda: offers(log.read_text()) > times)

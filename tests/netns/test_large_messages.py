@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bench.dataplane.ours import SERVICE, Ours
-from bench.netlab import HostSpec, InterfaceSpec, Lab, LabConfig, LinkProfile, server
+from lab import HostSpec, InterfaceSpec, Lab, LabConfig, LinkProfile, server
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bench.dataplane.ours import Ours
-from bench.netlab import HostSpec, InterfaceSpec, Lab, LabConfig, server
+from lab import HostSpec, InterfaceSpec, Lab, LabConfig, server
 from sidecar.core.path.pmtu import COMMON_MTUS, HEADERS_V4, HEADERS_V6
 
 if TYPE_CHECKING:

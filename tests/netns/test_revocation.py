@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.netlab import Lab, LabConfig
-from bench.system import System
+from lab import Lab, LabConfig
+from lab.system import System
 from protos.identity import IdentityRole
 
 if TYPE_CHECKING:

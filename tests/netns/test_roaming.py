@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bench.netlab import Lab, LabConfig, LinkProfile
-from bench.system import System
+from lab import Lab, LabConfig, LinkProfile
+from lab.system import System
 from tests.netns.cables import plug_in, pull_out
 from tests.netns.calling import Call, assert_flawless, counter
 
@@ -34,7 +34,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
             lab.link(name).set(LinkProfile(delay_ms=delay_ms))
         plug_in(lab, "robot", "usb0")
         running.start_control_plane()
-        running.start_node("cloud_a.echo", "cloud_a", ["-m", "bench.echo", "serve"])
+        running.start_node("cloud_a.echo", "cloud_a", ["-m", "lab.echo", "serve"])
         running.start_cloud("cloud_a", [{"name": "/echo"}])
         running.wait_for_offer(running.start_robot([SERVICE], interfaces=INTERFACES))
         yield running

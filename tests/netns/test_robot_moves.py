@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bench.netlab import Lab, LabConfig, LinkProfile
-from bench.system import CONTROL_PORT, STUN_PORT, System
+from lab import Lab, LabConfig, LinkProfile
+from lab.system import CONTROL_PORT, STUN_PORT, System
 from tests.netns.calling import Call, assert_flawless, counter
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
             listen=f"[::]:{CONTROL_PORT}", stun_listen=[f"[::]:{STUN_PORT}"], stun_servers=[f"{control}:{STUN_PORT}"]
         )
         over_ipv6: dict[str, Any] = {"control_plane": f"{control}:{CONTROL_PORT}"}
-        running.start_node("cloud_a.echo", "cloud_a", ["-m", "bench.echo", "serve"])
+        running.start_node("cloud_a.echo", "cloud_a", ["-m", "lab.echo", "serve"])
         running.start_cloud("cloud_a", [{"name": "/echo"}], **over_ipv6)
         running.wait_for_offer(running.start_robot([SERVICE], interfaces=INTERFACES, **over_ipv6))
         yield running

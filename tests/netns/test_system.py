@@ -13,7 +13,7 @@ from tests.netns.two_clouds import CLOUDS, executed, make_links_good, offered, t
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bench.system import System
+    from lab.system import System
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 

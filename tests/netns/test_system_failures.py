@@ -15,7 +15,7 @@ from tests.netns.two_clouds import CLOUDS, DEADLINE_MS, ROBOT_SERVICES, make_lin
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bench.system import System
+    from lab.system import System
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 
@@ -72,7 +72,7 @@ def test_only_the_ros_server_killed(system: System) -> None:
 
 def test_a_slow_server_beside_a_fast_one(system: System) -> None:
     """cloud_a, without echo server since the test before, gets one that needs longer than the deadline."""
-    argv = ["-m", "bench.echo", "serve", "--delay-ms", "700", "--delay-every", "1"]
+    argv = ["-m", "lab.echo", "serve", "--delay-ms", "700", "--delay-every", "1"]
     system.start_node("cloud_a.echo", "cloud_a", argv)
     system.wait("cloud_a to offer /echo", lambda: "/echo" in system.parts["cloud_a.sidecar"].log.read_text()[-2000:])
     run = Call(system, "--duration", "4", "--rate", "5").result()

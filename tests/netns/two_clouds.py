@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from bench.echo import journal_ids
-from bench.netlab import Lab, LabConfig, LinkProfile
-from bench.system import Part, System
+from lab import Lab, LabConfig, LinkProfile
+from lab.echo import journal_ids
+from lab.system import Part, System
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,7 +49,7 @@ def make_links_good(system: System) -> None:
 def start_cloud(system: System, cloud: str, *server_options: str) -> None:
     """Start the servers and the sidecar of a cloud."""
     journal = str(system.folder / f"{cloud}.journal")
-    argv = ["-m", "bench.echo", "serve", "--journal", journal, *server_options]
+    argv = ["-m", "lab.echo", "serve", "--journal", journal, *server_options]
     system.start_node(f"{cloud}.echo", cloud, argv)
     system.start_node(f"{cloud}.planner", cloud, ["-m", "examples.motion_planning.server"])
     system.start_cloud(cloud, CLOUD_SERVICES)

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.evaluation.scenario import Scenario, read_scenarios
-from bench.netlab.trace_folder import read_folder
 from controlplane.planning.fifo import FifoLink
+from lab.trace_folder import read_folder
 from protos.redundancy_mode import RedundancyMode
 from tests.sim.mesh import IPV6, Mesh, Node, rule
 from tests.sim.test_mesh import mapped

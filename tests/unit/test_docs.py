@@ -335,7 +335,7 @@ def test_every_page_is_linked_from_the_readme() -> None:
 
 
 def test_architecture_names_files_that_exist() -> None:
-    named = re.findall(r"`((?:sidecar|controlplane|protos|bench|tests|deploy)/[\w./]+)`", read("architecture.md"))
+    named = re.findall(r"`((?:sidecar|controlplane|protos|lab|bench|tests|deploy)/[\w./]+)`", read("architecture.md"))
     assert len(named) > 20
     assert [name for name in named if not (ROOT / name).exists()] == []
 
@@ -343,7 +343,7 @@ def test_architecture_names_files_that_exist() -> None:
 def test_sources_name_pages_that_exist() -> None:
     sources = [
         path
-        for folder in ("sidecar", "controlplane", "protos", "bench", "deploy")
+        for folder in ("sidecar", "controlplane", "protos", "lab", "bench", "deploy")
         for path in (ROOT / folder).rglob("*")
     ]
     broken = [

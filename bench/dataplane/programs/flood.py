@@ -9,9 +9,9 @@ import socket
 import time
 from typing import TYPE_CHECKING, Any
 
-from bench.attacker.junk import JunkKind, make_junk
-from bench.attacker.send_many import flood
 from bench.dataplane.remote import serve
+from lab.attacker.junk import JunkKind, make_junk
+from lab.attacker.send_many import flood
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""ROS 2, unmodified: an rclpy client that calls the echo service (`bench.echo`) of whatever serves it."""
+"""ROS 2, unmodified: an rclpy client that calls the echo service (`lab.echo`) of whatever serves it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
-from bench.echo import SERVICE
+from lab.echo import SERVICE
 
 SERVER_TIMEOUT_S = 40.0
 

@@ -12,7 +12,7 @@ from plr_demo_interfaces.srv import DetectPeople
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 
-from bench.echo import SERVICE, EchoRequests
+from lab.echo import SERVICE, EchoRequests
 
 WAIT_S = 30.0
 CHECK_PERIOD_S = 0.05

@@ -22,14 +22,14 @@ from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import Calls, Row, interval, median, median_ratio, p99, ratio, worst
 from bench.dataplane.steady import awake, realtime
 from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, SilentCut, allow_multipath, cables
-from bench.netlab import Lab
+from lab import Lab
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from bench.dataplane.section import Context
-    from bench.netlab import Host
     from bench.reporting.tables import Figure
+    from lab import Host
 
 SIZE = 1_000
 RATE_HZ = 50.0

@@ -17,7 +17,7 @@ from bench.dataplane.section import Findings, Section, table_of
 from bench.dataplane.statistics import Row, median, ratio
 from bench.dataplane.steady import realtime
 from bench.dataplane.topology import cables
-from bench.netlab import Lab
+from lab import Lab
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

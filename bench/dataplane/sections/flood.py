@@ -11,22 +11,22 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from bench.attacker.junk import JunkKind
-from bench.attacker.wire import Tap
 from bench.dataplane.ours import Ours
 from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import Row, interval, median, p99, ratio, worst
 from bench.dataplane.topology import CARRIERS, CLOUD, CLOUD_INTERFACE, CLOUDS, ROBOT, cables
-from bench.netlab import Lab
 from bench.reporting.tables import Table
+from lab import Lab
+from lab.attacker.junk import JunkKind
+from lab.attacker.wire import Tap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from bench.attacker.wire import Captured
     from bench.dataplane.section import Context
     from bench.dataplane.statistics import Calls
+    from lab.attacker.wire import Captured
 
 JUNK_HZ = 20_000.0
 SIZE = 1_000

@@ -11,8 +11,8 @@ from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section
 from bench.dataplane.statistics import MS, Calls, goodput_of_stretches, interval, median, median_ratio, ratio
 from bench.dataplane.topology import cables, ethernet_loopback
-from bench.netlab import Lab
 from bench.reporting.tables import Table
+from lab import Lab
 
 if TYPE_CHECKING:
     from bench.dataplane.section import Context

@@ -14,8 +14,8 @@ from bench.dataplane.section import Findings, Plot, Section
 from bench.dataplane.statistics import Calls, Row, difference, interval, median, p99, p99_ratio, quantile, ratio
 from bench.dataplane.targets import RTT_MS
 from bench.dataplane.topology import CARRIERS, emulated
-from bench.netlab import Lab, LinkProfile
 from bench.reporting.tables import Table
+from lab import Lab, LinkProfile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,8 +14,8 @@ from bench.dataplane.remote import Remote
 from bench.dataplane.section import Findings, Plot, Section
 from bench.dataplane.statistics import MS, Interval, interval, median, median_ratio, quantile, ratio, worst
 from bench.dataplane.topology import cables, ethernet_loopback
-from bench.netlab import Lab
 from bench.reporting.tables import Table
+from lab import Lab
 
 if TYPE_CHECKING:
     from collections.abc import Callable

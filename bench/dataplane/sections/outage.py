@@ -18,8 +18,8 @@ from bench.dataplane.ours import SERVICE, Ours
 from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import MS, Calls, Row, interval, median, quantile, ratio, worst
 from bench.dataplane.topology import CARRIERS, emulated
-from bench.netlab import Lab, LinkProfile
 from bench.reporting.tables import Table
+from lab import Lab, LinkProfile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,7 +12,7 @@ from bench.dataplane.ours import EVERY_CARRIER, Ours
 from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import Row, interval, median, p99_ratio, ratio, worst
 from bench.dataplane.topology import CARRIERS, emulated
-from bench.netlab import Lab, LinkProfile
+from lab import Lab, LinkProfile
 
 if TYPE_CHECKING:
     from bench.dataplane.section import Context

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from bench.dataplane.section import Findings, Plot, Section, table_of
 from bench.dataplane.statistics import Calls, Interval, Row, interval, median, median_ratio, ratio
 from bench.dataplane.topology import CARRIERS, CLOUDS, ROBOT, SilentCut, cables
-from bench.netlab import Lab
 from bench.reporting.tables import Table
-from bench.system import Part, System, read_json
+from lab import Lab
+from lab.system import Part, System, read_json
 
 if TYPE_CHECKING:
     from bench.dataplane.section import Context
@@ -95,9 +95,9 @@ def _bars(rows: dict[tuple[str, str], list[Row]]) -> dict[str, float | None]:
 def _start(system: System) -> None:
     system.start_control_plane()
     for cloud in CLOUDS:
-        system.start_node(f"{cloud}.echo", cloud, ["-m", "bench.echo", "serve"])
+        system.start_node(f"{cloud}.echo", cloud, ["-m", "lab.echo", "serve"])
         system.start_cloud(cloud, [{"name": "/echo"}])
-    system.start_node("direct.echo", ROBOT, ["-m", "bench.echo", "serve"], domain=DIRECT_DOMAIN)
+    system.start_node("direct.echo", ROBOT, ["-m", "lab.echo", "serve"], domain=DIRECT_DOMAIN)
     robot = system.start_robot([{"name": "/echo", "deadline_ms": DEADLINE_MS, "idempotent": True}])
     system.wait_for_offer(robot)
 
@@ -106,7 +106,7 @@ def _begin(system: System, size: int, rate_hz: float, seconds: float, domain: in
     out = system.folder / "calls.json"
     out.unlink(missing_ok=True)
     (system.folder / "calls.client.log").unlink(missing_ok=True)
-    argv = ["-m", "bench.echo", "call", "--size", str(size), "--rate", str(rate_hz), "--duration", str(seconds)]
+    argv = ["-m", "lab.echo", "call", "--size", str(size), "--rate", str(rate_hz), "--duration", str(seconds)]
     argv += ["--deadline-ms", str(DEADLINE_MS), "--grace-s", str(GRACE_S), "--json", str(out)]
     return system.start_node("calls.client", ROBOT, argv, domain=domain)
 

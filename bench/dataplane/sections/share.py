@@ -15,8 +15,8 @@ from bench.dataplane.ours import EVERY_CARRIER, SERVICE, Ours
 from bench.dataplane.section import Findings, Plot, Section
 from bench.dataplane.statistics import interval, median, ratio
 from bench.dataplane.topology import CARRIERS, CLOUD, ROBOT, emulated
-from bench.netlab import Lab, LinkProfile
 from bench.reporting.tables import Table
+from lab import Lab, LinkProfile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

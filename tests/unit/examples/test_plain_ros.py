@@ -9,7 +9,7 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 SOURCES = sorted(EXAMPLES.rglob("*.py"))
-OURS = {"sidecar", "controlplane", "protos", "bench", "tests"}
+OURS = {"sidecar", "controlplane", "protos", "lab", "bench", "tests"}
 
 
 def imported(source: str) -> set[str]:

@@ -1,0 +1,31 @@
+"""Sends UDP datagrams that claim to come from somebody else, out of raw sockets (raw(7)); no network here filters."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from typing import TYPE_CHECKING
+
+from lab.attacker.wire import ETHERNET_BYTES, Captured
+
+if TYPE_CHECKING:
+    from protos.model import Address
+
+THIRD_PARTYS_PORT = 4000
+
+
+class Spoofer:
+    """Somebody else's datagrams."""
+
+    def __init__(self) -> None:
+        self._sockets = {
+            family: socket.socket(family, socket.SOCK_RAW, socket.IPPROTO_RAW)
+            for family in (socket.AF_INET, socket.AF_INET6)
+        }
+
+    def send(self, datagram: bytes, claimed: tuple[str, str], to: Address) -> None:
+        """Send it to an address, from the one of these two (IPv4, IPv6) that is of its family."""
+        six = ":" in to[0]
+        made = Captured("", bytes(ETHERNET_BYTES), (claimed[six], THIRD_PARTYS_PORT), to, datagram, outgoing=True)
+        with contextlib.suppress(OSError):  # a full queue
+            self._sockets[socket.AF_INET6 if six else socket.AF_INET].sendto(made.frame()[ETHERNET_BYTES:], (to[0], 0))

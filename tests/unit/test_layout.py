@@ -1,0 +1,149 @@
+"""The layout that people find their way by: layers without an upward import, unit tests where their sources lie."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+UNIT = ROOT / "tests" / "unit"
+TOPS = ("sidecar", "controlplane", "protos", "lab", "bench")
+
+PLANTED = {
+    "sidecar/core/wire/frame.py": ("sidecar.core.message.partial", "the sidecar's core in layers"),
+    "sidecar/core/robot/measure/measurements.py": ("sidecar.core.robot.request_table", "a robot's requests in layers"),
+    "sidecar/core/path/congestion/rtt.py": ("sidecar.core.path.pmtu", "congestion control knows no path"),
+    "sidecar/core/path/probing.py": ("sidecar.core.transfer.routes", "links know nothing of requests"),
+    "sidecar/core/rules/budget.py": ("sidecar.core.path.path", "requests know nothing of links"),
+    "controlplane/core/registry/registry.py": ("controlplane.core.solve.batch", "the control plane's core in layers"),
+}
+"""A file, a module that it must not import, and the contract that says so."""
+
+
+def test_an_upward_import_breaks_the_contract_that_forbids_it(tmp_path: Path) -> None:
+    for top in ("sidecar", "controlplane", "protos"):
+        shutil.copytree(ROOT / top, tmp_path / top, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for file, (module, _) in PLANTED.items():
+        with (tmp_path / file).open("a") as source:
+            source.write(f"\nimport {module}\n")
+    command = [Path(sys.executable).parent / "lint-imports", "--no-cache"]
+    report = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert report.returncode == 1, report.stderr
+    broken = set(re.findall(r"^(.+) BROKEN", report.stdout, re.MULTILINE))
+    assert broken == {contract for _, contract in PLANTED.values()}
+    for file, (module, _) in PLANTED.items():
+        assert f"{file.removesuffix('.py').replace('/', '.')} -> {module} " in report.stdout
+
+
+def sources() -> list[Path]:
+    """The modules that unit tests may be about, relative to the root."""
+    found = (path.relative_to(ROOT) for top in TOPS for path in (ROOT / top).rglob("*.py"))
+    return [path for path in found if "plr" not in path.parts]
+
+
+def tested(test: Path, modules: set[Path]) -> Path | None:
+    """The module, or the package, that a test file is named after: `test_MODULE.py` or `test_MODULE_ASPECT.py`."""
+    folder, name = test.relative_to(UNIT).parent, test.stem.removeprefix("test_")
+    if name == folder.name:
+        return folder
+    words = name.split("_")
+    for count in range(len(words), 0, -1):
+        stem = "_".join(words[:count])
+        for candidate in (folder / f"{stem}.py", folder / f"__{stem}__.py"):
+            if candidate in modules:
+                return candidate
+    return None
+
+
+def unit_tests() -> list[Path]:
+    return sorted(path for top in TOPS for path in (UNIT / top).rglob("test_*.py"))
+
+
+@pytest.mark.parametrize("test", unit_tests(), ids=lambda path: str(path.relative_to(UNIT)))
+def test_a_unit_test_lies_where_its_source_does(test: Path) -> None:
+    assert tested(test, set(sources())), "name it test_MODULE.py or test_MODULE_ASPECT.py, in the folder of MODULE"
+
+
+def test_no_further_module_of_a_core_is_without_a_test_of_its_own() -> None:
+    modules = set(sources())
+    cores = {path for path in modules if path.parts[1] == "core" and path.stem != "__init__"}
+    without = {str(path) for path in cores} - {str(tested(test, modules)) for test in unit_tests()}
+    assert without == set(NO_TEST_OF_THEIR_OWN), "this list may only get shorter"
+
+
+NO_TEST_OF_THEIR_OWN = """
+controlplane/core/base/member_table.py
+controlplane/core/control/events.py
+controlplane/core/estimate/composed.py
+controlplane/core/estimate/late_fate.py
+controlplane/core/estimate/network.py
+controlplane/core/estimate/penalties.py
+controlplane/core/estimate/processing.py
+controlplane/core/explain/alternatives.py
+controlplane/core/explain/departed_explanation.py
+controlplane/core/explain/explanation.py
+controlplane/core/explain/fleet_view.py
+controlplane/core/explain/returning.py
+controlplane/core/explain/status.py
+controlplane/core/formulation/block_rules.py
+controlplane/core/formulation/surplus.py
+controlplane/core/overload/postponed.py
+controlplane/core/policy/cut_off.py
+controlplane/core/policy/explain.py
+controlplane/core/policy/path_rules.py
+controlplane/core/policy/permits.py
+controlplane/core/policy/refused_offers.py
+controlplane/core/policy/report_filter.py
+controlplane/core/problem/domains.py
+controlplane/core/publish/messages.py
+controlplane/core/publish/publisher.py
+controlplane/core/registry/restlessness.py
+controlplane/core/solve/batch.py
+controlplane/core/solve/batch_costs.py
+controlplane/core/solve/enumeration.py
+controlplane/core/solve/incumbent.py
+controlplane/core/solve/limits.py
+controlplane/core/solve/path_bound.py
+controlplane/core/solve/server_groups.py
+sidecar/core/base/report_scope.py
+sidecar/core/base/values.py
+sidecar/core/cloud/answer_cache.py
+sidecar/core/cloud/serving.py
+sidecar/core/engine/attention.py
+sidecar/core/engine/revocation_exchange.py
+sidecar/core/link/datagrams.py
+sidecar/core/link/liveness.py
+sidecar/core/link/opener.py
+sidecar/core/link/path_table.py
+sidecar/core/link/reader.py
+sidecar/core/message/partial.py
+sidecar/core/path/address.py
+sidecar/core/path/congestion/bandwidth_search.py
+sidecar/core/path/congestion/units.py
+sidecar/core/path/in_flight.py
+sidecar/core/path/key_exchange.py
+sidecar/core/path/view.py
+sidecar/core/robot/dispatch/context.py
+sidecar/core/robot/dispatch/path_records.py
+sidecar/core/robot/fallback/queue.py
+sidecar/core/robot/fallback/times.py
+sidecar/core/robot/request/index.py
+sidecar/core/robot/request/request.py
+sidecar/core/rules/budget.py
+sidecar/core/rules/fallback_rule.py
+sidecar/core/seam/application.py
+sidecar/core/seam/links.py
+sidecar/core/seam/stats.py
+sidecar/core/stun/events.py
+sidecar/core/stun/family.py
+sidecar/core/stun/transaction.py
+sidecar/core/transfer/inbound.py
+sidecar/core/transfer/room.py
+""".split()
+"""Tested through the modules that use them, and in tests/sim."""
