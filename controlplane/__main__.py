@@ -27,11 +27,11 @@ with extras.required("plr-controlplane", "controlplane"):
     from controlplane.certificates import load_own_files
     from controlplane.config import load_config, refuse_exposed
     from protos.arguments import OneLineParser
+    from protos.base.errors import ConfigError
+    from protos.base.printable import escaped
     from protos.certificate_term import term_problem
-    from protos.errors import ConfigError
     from protos.log_lines import line_formatter
     from protos.logging_setup import Logging
-    from protos.printable import escaped
     from protos.version_option import ShowVersion, describe
 
 if TYPE_CHECKING:

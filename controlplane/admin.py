@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import grpc
 
 from controlplane.core.explain.explanation import UnknownNameError
+from protos.base.errors import DecodeError
 from protos.convert import (
     departed_to_proto,
     event_query_from_proto,
@@ -22,7 +23,6 @@ from protos.convert import (
     status_query_from_proto,
     status_to_proto,
 )
-from protos.errors import DecodeError
 from protos.plr.v1 import admin_pb2
 from protos.status import StatusQuery
 

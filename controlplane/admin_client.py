@@ -11,11 +11,11 @@ import grpc
 
 from protos import tls_advice
 from protos.arguments import number
-from protos.errors import ConfigError, DecodeError
-from protos.host_port import check_remote
+from protos.base.errors import ConfigError, DecodeError
+from protos.base.host_port import check_remote
+from protos.base.printable import escaped
 from protos.identity import CONTROL_PLANE_DNS
 from protos.plr.v1 import admin_pb2_grpc
-from protos.printable import escaped
 from protos.tls_files import load_tls_files
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ import logging
 import ssl
 from typing import TYPE_CHECKING, NoReturn
 
+from protos.base.errors import ConfigError
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.errors import ConfigError
 from protos.identity import IdentityRole
 from protos.revocation_views import revocation_set
 from protos.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files

@@ -11,10 +11,10 @@ from controlplane.core.policy.path_rules import MAX_PATH_RULES, PathRule
 from controlplane.core.problem.problem import Objective
 from controlplane.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
 from controlplane.policy_config import PolicyConfig
+from protos.base.errors import ConfigError
+from protos.base.host_port import is_loopback
 from protos.config_fields import AbsolutePath, ListenAddress, RemoteAddress, TlsDir, check_security, refuse_duplicates
 from protos.config_file import parse_yaml, read_text, validate
-from protos.errors import ConfigError
-from protos.host_port import is_loopback
 
 if TYPE_CHECKING:
     from pathlib import Path

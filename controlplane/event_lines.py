@@ -6,10 +6,10 @@ import json
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
+from protos.base.names import clean_text, node_name
 from protos.fleet_events import EventKind, FleetEvent, Why
 from protos.model import Role
-from protos.names import clean_text, node_name
 
 if TYPE_CHECKING:
     import enum

@@ -24,9 +24,9 @@ from typing import IO, TYPE_CHECKING
 from controlplane.core.explain.event_memory import EventMemory
 from controlplane.event_lines import decode, encode
 from protos import own_folder
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
+from protos.base.names import clean_text
 from protos.fleet_events import EventKind, EventLogState, FleetEvent
-from protos.names import clean_text
 from protos.own_folder import OwnFolder
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from controlplane import explanation_text
 from controlplane.admin_client import AskError, add_options, ask
 from protos.arguments import checked
+from protos.base.names import node_name, service_name
 from protos.convert import explanation_from_proto
-from protos.names import node_name, service_name
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:

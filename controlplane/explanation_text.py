@@ -11,8 +11,8 @@ from protos.explanation import AlternativeKind, Correlation
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from protos.base.histogram import Histogram
     from protos.explanation import Alternative, Explanation, JointExplanation, MappingChange, PairExplanation
-    from protos.histogram import Histogram
     from protos.model import Assignment
 
 LEAST_SHOWN = 1e-9

@@ -33,11 +33,11 @@ from controlplane.garbage import Collector
 from controlplane.mailbox import Mailbox
 from controlplane.remembered import departures
 from controlplane.turns import Turns
+from protos.base.token_bucket import TokenBucket
 from protos.convert import status_to_proto
 from protos.fleet_events import EventKind
 from protos.identity import EXPIRED, REVOKED, CertificateError
 from protos.model import NO_REVOCATIONS, RemovalReason, Role
-from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -17,7 +17,7 @@ from controlplane.planning.traces import TraceError, read_trace
 from controlplane.planning.workload import DEFAULT, Compute, Workload
 from protos import extras
 from protos.arguments import whole
-from protos.printable import escaped
+from protos.base.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from controlplane.config import load_config
 from controlplane.core.policy.explain import explain
 from protos.arguments import checked
-from protos.errors import ConfigError
-from protos.names import node_name, service_name
+from protos.base.errors import ConfigError
+from protos.base.names import node_name, service_name
 
 if TYPE_CHECKING:
     import argparse

@@ -11,7 +11,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from controlplane.config import load_config
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -19,6 +19,8 @@ from controlplane.limits import (
     StreamRate,
 )
 from controlplane.stream_encoder import StreamEncoder
+from protos.base.errors import DecodeError, UnknownKindError
+from protos.base.protocol_versions import Spoken, refusal
 from protos.convert import (
     parse_in_parts,
     parse_sidecar_message,
@@ -26,10 +28,8 @@ from protos.convert import (
     sidecar_message_from_proto,
 )
 from protos.convert.reports import report_entries
-from protos.errors import DecodeError, UnknownKindError
 from protos.model import Heartbeat, Registration, Report
 from protos.plr.v1 import control_pb2
-from protos.protocol_versions import Spoken, refusal
 
 if TYPE_CHECKING:
     from controlplane.core.registry.registry import StreamId

@@ -13,6 +13,8 @@ import grpc
 from controlplane import event_text, status_table
 from controlplane.admin_client import EXIT_FAILED, AskError, add_options, ask
 from protos.arguments import checked
+from protos.base.errors import DecodeError
+from protos.base.names import node_name
 from protos.convert import (
     departed_from_proto,
     events_from_proto,
@@ -22,8 +24,6 @@ from protos.convert import (
     status_query_to_proto,
 )
 from protos.convert.fields import MAX_SIDECARS
-from protos.errors import DecodeError
-from protos.names import node_name
 from protos.plr.v1 import admin_pb2
 from protos.status import StatusQuery
 

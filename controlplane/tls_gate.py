@@ -30,8 +30,8 @@ from controlplane.earliest_end import EarliestEnd
 from controlplane.gate_pipe import PipeEnd
 from controlplane.half_open import HalfOpen
 from controlplane.handshakes import server_context, why_failed
+from protos.base.token_bucket import TokenBucket
 from protos.identity import CertificateError, IdentityRole
-from protos.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
-from protos.errors import DecodeError
-from protos.printable import escaped
+from protos.base.errors import DecodeError
+from protos.base.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,7 +28,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def checked(check: Callable[[str, str], N], what: str = "the name") -> Callable[[str], N]:
-    """An argument's type: what passes one of the checks of protos/names.py; `what` it is begins the error."""
+    """An argument's type: what passes one of the checks of protos/base/names.py; `what` it is begins the error."""
 
     def parse(text: str) -> N:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.durations import in_words
+from protos.base.durations import in_words
 from protos.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
 
 if TYPE_CHECKING:

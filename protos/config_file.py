@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.regular_file import read_regular
 
 if TYPE_CHECKING:

@@ -25,10 +25,10 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509 import load_der_x509_certificate
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
+from protos.base.names import node_name
 from protos.identity import MALFORMED, UNTRUSTED, WRONG_ROLE, CertificateError, Identity, IdentityRole
 from protos.model import MAX_CREDENTIAL_BYTES, NodeName, Role, SessionId
-from protos.names import node_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable

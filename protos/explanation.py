@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from protos.base.histogram import Histogram
     from protos.fleet_events import Why
-    from protos.histogram import Histogram
     from protos.model import Assignment, InterfaceName, NodeName, ServiceMapping, ServiceName, Version
     from protos.status import ResourceStatus
 

@@ -25,9 +25,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, SignatureAlgorithmOID
 
-from protos.durations import in_words
-from protos.errors import DecodeError
-from protos.names import node_name
+from protos.base.durations import in_words
+from protos.base.errors import DecodeError
+from protos.base.names import node_name
 
 if TYPE_CHECKING:
     from protos.model import NodeName

@@ -15,7 +15,7 @@ from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.histogram import Histogram
+    from protos.base.histogram import Histogram
     from protos.preferences import InterfaceLabel
 
 PROTOCOL_VERSION = 3
@@ -409,7 +409,7 @@ class LatencyReport:
     server: NodeName
     service: ServiceName
     size_class: int
-    """See `protos.size_class`."""
+    """See `protos.base.size_class`."""
     network: Histogram
     """From sending to the answer, without the processing; lost is what the server never had whole."""
     called_off: Histogram

@@ -45,7 +45,7 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import TYPE_CHECKING
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 
 if TYPE_CHECKING:
     from protos.model import Address

@@ -21,7 +21,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.identity import CertificateError, Identity, IdentityRole, Trust
 from protos.regular_file import open_regular
 

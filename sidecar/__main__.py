@@ -19,12 +19,12 @@ from protos import commit, extras, program
 
 with extras.required("plr-sidecar", "sidecar"):
     from protos.arguments import OneLineParser
+    from protos.base.errors import ConfigError, StartError
+    from protos.base.printable import escaped
     from protos.certificate_term import term_problem
-    from protos.errors import ConfigError, StartError
     from protos.log_lines import line_formatter
     from protos.logging_setup import Logging
     from protos.model import Role
-    from protos.printable import escaped
     from protos.tls_files import load_tls_files
     from protos.version_option import ShowVersion
     from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed

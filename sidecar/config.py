@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
+from protos.base.errors import ConfigError
+from protos.base.host_port import is_loopback
 from protos.config_fields import (
     AbsolutePath,
     IpAddress,
@@ -21,8 +23,6 @@ from protos.config_fields import (
     refuse_duplicates,
 )
 from protos.config_file import key_path, parse_yaml, read_text, validate
-from protos.errors import ConfigError
-from protos.host_port import is_loopback
 from protos.identity import IdentityRole
 from protos.model import NodeName, Role, ServiceName
 from protos.preferences import DEFAULT_CHARGE, InterfaceLabel

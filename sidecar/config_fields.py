@@ -7,11 +7,11 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
+from protos.base.errors import DecodeError
+from protos.base.host_port import check_remote
+from protos.base.names import domain_label, node_name
 from protos.config_fields import encoded_path, refuse_duplicates
 from protos.convert.fields import MAX_COPIES
-from protos.errors import DecodeError
-from protos.host_port import check_remote
-from protos.names import domain_label, node_name
 from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 
 _INTERFACE = re.compile(r"[!-.0-~]{1,15}")

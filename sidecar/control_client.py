@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import grpc
 
 from protos import tls_advice
+from protos.base.errors import DecodeError, UnknownKindError
+from protos.base.names import clean_text
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
-from protos.errors import DecodeError, UnknownKindError
 from protos.model import PeerSet, Report, ResourceKind, ServiceSet, Welcome
-from protos.names import clean_text
 from protos.plr.v1 import control_pb2_grpc
 from sidecar.control_channel import REFUSALS, open_channel
 from sidecar.core.control.session import Apply

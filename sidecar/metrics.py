@@ -14,7 +14,7 @@ from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.core import HistogramMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
-from protos.host_port import split_host_port
+from protos.base.host_port import split_host_port
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind
 from protos.revocation_views import revocation_gauges

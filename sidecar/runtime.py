@@ -11,9 +11,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from protos import interpreter
+from protos.base.errors import StartError
+from protos.base.host_port import split_host_port
 from protos.clock_floor import ClockFloor
-from protos.errors import StartError
-from protos.host_port import split_host_port
 from protos.model import (
     MAX_UNMET,
     OLDEST_PROTOCOL_VERSION,

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from protos.base.errors import ConfigError
 from protos.credential import Aead, SessionCredential, session_number, verify
-from protos.errors import ConfigError
 from sidecar.core.crypto.session import OwnSession, public_key
 from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
 

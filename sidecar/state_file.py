@@ -27,9 +27,9 @@ import struct
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from protos.base.errors import DecodeError
+from protos.base.host_port import canonical_ip
 from protos.convert import control_message_to_proto, parse_control_message
-from protos.errors import DecodeError
-from protos.host_port import canonical_ip
 from protos.model import TOKEN_BYTES, MappingSet, NodeName, PeerSet, Welcome
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, TypeVar
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import TOKEN_BYTES
 from protos.own_folder import OwnFolder
 from protos.regular_file import open_regular

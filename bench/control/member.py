@@ -6,9 +6,9 @@ import hashlib
 import time
 from typing import TYPE_CHECKING
 
+from protos.base.histogram import Histogram
 from protos.candidate_signature import sign_candidates
 from protos.credential import Aead, SessionCredential, session_number
-from protos.histogram import Histogram
 from protos.model import (
     PROTOCOL_VERSION,
     Candidate,

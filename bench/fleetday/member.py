@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from bench.fleetday.held import Held
 from bench.fleetday.line import Line
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import (
     PROTOCOL_VERSION,
     Candidate,

@@ -11,7 +11,7 @@ from controlplane.core.control.control import ControlCore
 from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import Send
 from controlplane.matcher import Matcher
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import (
     PROTOCOL_VERSION,
     Assignment,

@@ -9,7 +9,8 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
+from protos.base.size_class import size_class
 from protos.model import (
     Assignment,
     InterfaceName,
@@ -20,7 +21,6 @@ from protos.model import (
     Report,
     ServiceName,
 )
-from protos.size_class import size_class
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from bench.dataplane.section import Findings
 from bench.reporting.tables import Figure, Table
 from lab import Lab, LabConfig, LinkProfile
 from lab.system import System, read_json
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import NodeName
 from sidecar.state_file import decode_last_good
 from sidecar.state_store import LAST_GOOD_FILE

@@ -19,7 +19,7 @@ from controlplane.core.control.schedule import URGENT_DELAY_S
 from controlplane.core.problem.plan import relative_gap
 from controlplane.core.problem.problem import Objective
 from controlplane.matcher import Matcher
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -18,9 +18,9 @@ from controlplane.ca.authority import Authority, AuthorityError
 from controlplane.ca.files import refuse_planted, write_tls_files
 from controlplane.ca.folder import AuthorityFolder, Protection
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE, PassphraseSource
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
+from protos.base.printable import escaped
 from protos.identity import IdentityRole
-from protos.printable import escaped
 from protos.regular_file import read_regular
 from protos.tls_files import (
     CA_FILE,

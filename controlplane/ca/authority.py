@@ -21,8 +21,8 @@ from controlplane.ca.certificates import (
 from controlplane.ca.files import write_tls_files
 from controlplane.ca.index import Entry, Record
 from controlplane.ca.request import fingerprint
+from protos.base.names import node_name
 from protos.identity import MAX_CA_CERTIFICATES
-from protos.names import node_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

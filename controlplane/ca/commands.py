@@ -14,10 +14,10 @@ from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityEr
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
 from protos import program
 from protos.arguments import checked
-from protos.errors import ConfigError, DecodeError
+from protos.base.errors import ConfigError, DecodeError
+from protos.base.names import node_name, text
+from protos.base.printable import escaped
 from protos.identity import IdentityRole
-from protos.names import node_name, text
-from protos.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -26,7 +26,7 @@ from controlplane.ca.certificates import Issued
 from controlplane.ca.files import PRIVATE_FILE, PRIVATE_FOLDER, PUBLIC_FILE, write_atomically
 from controlplane.ca.index import decode_index, encode_index
 from controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.regular_file import read_regular
 from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
 

@@ -17,10 +17,10 @@ from pydantic import (
     model_validator,
 )
 
+from protos.base.errors import ConfigError
+from protos.base.names import node_name
 from protos.config_file import key_path
-from protos.errors import ConfigError
 from protos.identity import IdentityRole
-from protos.names import node_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.tls_files import read_guarded
 
 if TYPE_CHECKING:

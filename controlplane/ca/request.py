@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from cryptography.x509.oid import NameOID
 
 from controlplane.ca.certificates import alternative_names
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.identity import SIGNATURES, name_and_role
 
 if TYPE_CHECKING:

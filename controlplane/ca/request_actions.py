@@ -16,9 +16,9 @@ from controlplane.ca.files import PRIVATE_FILE, PUBLIC_FILE, make_private, write
 from controlplane.ca.folder import AuthorityFolder
 from controlplane.ca.key_file import clear_pem
 from controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_request, fingerprint, parse_request
-from protos.errors import ConfigError, DecodeError
+from protos.base.errors import ConfigError, DecodeError
+from protos.base.printable import escaped
 from protos.identity import IdentityRole
-from protos.printable import escaped
 from protos.regular_file import read_regular
 from protos.tls_files import KEY_FILE
 

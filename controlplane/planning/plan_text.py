@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.planning.prospects import least_set, paths_needed
 from controlplane.text_table import columns
-from protos.printable import escaped
+from protos.base.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

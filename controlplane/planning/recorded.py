@@ -14,8 +14,8 @@ from controlplane.core.estimate.posterior import IGNORANCE
 from controlplane.core.problem.objectives import joint_miss, objective_costs
 from controlplane.core.problem.problem import Block, BlockKey, Objective
 from controlplane.planning.prospects import Prospect
+from protos.base.errors import DecodeError
 from protos.convert import explanation_from_proto
-from protos.errors import DecodeError
 from protos.explanation import SAMPLE
 from protos.plr.v1 import admin_pb2
 from protos.regular_file import read_regular
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from controlplane.core.problem.problem import Choice
     from controlplane.core.problem.problem import Path as PathIndex
+    from protos.base.histogram import Histogram
     from protos.explanation import Explanation, PairExplanation
-    from protos.histogram import Histogram
     from protos.model import Assignment
 
 MAX_CHOICES = 20_000

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from lab.attacker.hostile_link import ESCAPES
 from lab.attacker.orders import Stage
+from protos.base.histogram import MAX_COUNT, Histogram
 from protos.candidate_signature import sign_candidates
-from protos.histogram import MAX_COUNT, Histogram
 from protos.model import (
     MAX_CANDIDATES_OF_INTERFACE,
     Candidate,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
+from protos.base.errors import DecodeError
+from protos.base.names import clean_text, node_name, text
 from protos.convert.control import revocations_from_proto, revocations_to_proto
 from protos.convert.fields import (
     MAX_MAPPED_SERVICES,
@@ -28,9 +30,7 @@ from protos.convert.types import (
     use_from_proto,
     use_to_proto,
 )
-from protos.errors import DecodeError
 from protos.model import MAX_PATHS, MAX_UNMET, NO_REVOCATIONS, RevocationSet
-from protos.names import clean_text, node_name, text
 from protos.plr.v1 import admin_pb2
 from protos.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
 

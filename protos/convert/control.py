@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, assert_never
 
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 
+from protos.base.errors import DecodeError, UnknownKindError
+from protos.base.names import clean_text, domain_label, node_name, text
 from protos.convert.fields import (
     MAX_CRL_BYTES,
     MAX_REMOVED,
@@ -40,7 +42,6 @@ from protos.convert.types import (
     use_from_proto,
     use_to_proto,
 )
-from protos.errors import DecodeError, UnknownKindError
 from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import (
     MAX_PEERS,
@@ -65,7 +66,6 @@ from protos.model import (
     SidecarMessage,
     Welcome,
 )
-from protos.names import clean_text, domain_label, node_name, text
 from protos.plr.v1 import control_pb2
 
 if TYPE_CHECKING:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Literal
 
+from protos.base.errors import DecodeError
+from protos.base.names import clean_text, interface_name, node_name, service_name, text
 from protos.convert.admin import resource_from_proto, resource_to_proto
 from protos.convert.events import why_from_proto, why_to_proto
 from protos.convert.fields import (
@@ -27,7 +29,6 @@ from protos.convert.mapping import (
     service_mapping_to_proto,
 )
 from protos.convert.types import histogram_from_proto, histogram_to_proto
-from protos.errors import DecodeError
 from protos.explanation import (
     Alternative,
     AlternativeKind,
@@ -39,7 +40,6 @@ from protos.explanation import (
     PairExplanation,
 )
 from protos.model import MAX_JOINTS
-from protos.names import clean_text, interface_name, node_name, service_name, text
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:

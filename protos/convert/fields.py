@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, TypeVar
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import MAX_VERSION, Version
 
 if TYPE_CHECKING:

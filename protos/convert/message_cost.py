@@ -6,8 +6,8 @@ seconds, and fill its memory. So the fields are counted first.
 
 from __future__ import annotations
 
+from protos.base.errors import DecodeError
 from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_OUTCOMES, MAX_USES
-from protos.errors import DecodeError
 from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES, MAX_UNMET
 from protos.plr.v1 import control_pb2

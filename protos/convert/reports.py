@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from protos.base.errors import DecodeError
+from protos.base.names import interface_name, node_name, service_name
+from protos.base.size_class import SIZE_CLASSES
 from protos.convert.fields import (
     MAX_EVENTS,
     MAX_OUTCOMES,
@@ -17,7 +20,6 @@ from protos.convert.fields import (
 )
 from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
-from protos.errors import DecodeError
 from protos.model import (
     MAX_GOODBYES,
     MAX_JOINTS,
@@ -32,9 +34,7 @@ from protos.model import (
     PenaltyReport,
     Report,
 )
-from protos.names import interface_name, node_name, service_name
 from protos.plr.v1 import control_pb2
-from protos.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -6,6 +6,9 @@ from collections import Counter
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import TYPE_CHECKING
 
+from protos.base.errors import DecodeError
+from protos.base.histogram import BUCKETS, LAYOUT, Histogram
+from protos.base.names import domain_label, interface_name, node_name, service_name, type_name
 from protos.convert.fields import (
     MAX_CANDIDATES,
     MAX_CAPACITY,
@@ -20,8 +23,6 @@ from protos.convert.fields import (
     probability,
     unique,
 )
-from protos.errors import DecodeError
-from protos.histogram import BUCKETS, LAYOUT, Histogram
 from protos.model import (
     ALL_CALLS,
     MAX_CANDIDATES_OF_INTERFACE,
@@ -41,7 +42,6 @@ from protos.model import (
     ServiceUse,
     SessionId,
 )
-from protos.names import domain_label, interface_name, node_name, service_name, type_name
 from protos.plr.v1 import types_pb2
 from protos.preferences import Copies, InterfaceLabel
 from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode

@@ -18,7 +18,7 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from protos.printable import escaped
+from protos.base.printable import escaped
 from sidecar.doctor.examination import examine
 from sidecar.doctor.finding import Level
 from sidecar.doctor.options import parser_of, where_of

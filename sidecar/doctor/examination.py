@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from protos.base.errors import ConfigError, DecodeError
 from protos.config_file import parse_yaml, read_text
-from protos.errors import ConfigError, DecodeError
 from protos.identity import Identity, IdentityRole
 from protos.model import NodeName, ServiceName
 from protos.regular_file import read_regular

@@ -14,8 +14,8 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.errors import DecodeError
-from protos.printable import escaped
+from protos.base.errors import DecodeError
+from protos.base.printable import escaped
 from sidecar.local.answers import decode_line
 from sidecar.local.entrance import MAX_SOCKET_BYTES, for_group
 from sidecar.local.peer import user_of

@@ -19,7 +19,7 @@ from protos.own_folder import refuse_strange
 from sidecar.local.shares import Rate
 
 if TYPE_CHECKING:
-    from protos.token_bucket import TokenBucket
+    from protos.base.token_bucket import TokenBucket
 
 GROUP_SUFFIX = ".group"
 LOCK_SUFFIX = ".lock"

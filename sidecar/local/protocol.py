@@ -16,8 +16,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from protos.errors import DecodeError
-from protos.names import node_name
+from protos.base.errors import DecodeError
+from protos.base.names import node_name
 from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 
 VERSION = 1

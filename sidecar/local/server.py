@@ -21,7 +21,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from sidecar.core.link.pinging import Pong
 from sidecar.local.entrance import Entrance, SocketLock, for_group
 from sidecar.local.peer import groups_of, user_of

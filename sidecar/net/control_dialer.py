@@ -18,7 +18,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.host_port import numeric_host
+from protos.base.host_port import numeric_host
 from sidecar.core.control.race import ControlRace
 from sidecar.core.control.watch import CHEAPER, GONE, SILENT, ControlWatch, Leave
 from sidecar.core.control.ways import STRANGER, ControlWays, Life, WayClass

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from sidecar.core.base.values import PathState
 from sidecar.core.engine.engine import Engine, EngineConfig
 from sidecar.core.link.pinging import Pong

@@ -12,8 +12,8 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from protos.host_port import numeric_host, split_host_port
-from protos.token_bucket import TokenBucket
+from protos.base.host_port import numeric_host, split_host_port
+from protos.base.token_bucket import TokenBucket
 from sidecar.net.sockets import normalise
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protos.base.errors import DecodeError
 from protos.convert import (
     control_message_to_proto,
     explanation_from_proto,
@@ -19,7 +20,6 @@ from protos.convert import (
     status_from_proto,
     status_to_proto,
 )
-from protos.errors import DecodeError
 from protos.plr.v1 import admin_pb2
 from tests.unit.protos import message_strategies as some
 

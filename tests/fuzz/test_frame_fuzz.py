@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import InterfaceId, SessionId
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import AckFrame, Finished, Fragment, Header, Probe, ProbeReply

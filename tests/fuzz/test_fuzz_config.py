@@ -8,7 +8,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from sidecar.config import SidecarConfig, parse_config
 
 _KEYS = st.sampled_from([*SidecarConfig.model_fields, "deadline_ms", "name", "servers", "address", "enabled"])

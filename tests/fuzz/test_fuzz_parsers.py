@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lab.attacker.junk import flipped, mangled, noise
+from protos.base.errors import DecodeError
 from protos.convert import (
     control_message_to_proto,
     explanation_from_proto,
@@ -27,7 +28,6 @@ from protos.convert import (
     status_from_proto,
     status_to_proto,
 )
-from protos.errors import DecodeError
 from protos.model import NodeName
 from protos.plr.v1 import admin_pb2
 from sidecar import state_file

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import MappingSet, NodeName, PeerSet, Version, Welcome
 from sidecar.state_file import (
     FORMAT_VERSION,

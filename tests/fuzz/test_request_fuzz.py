@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from controlplane.ca.certificates import generate_key
 from controlplane.ca.request import build_request, parse_request
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.identity import IdentityRole
 
 pytestmark = pytest.mark.audit("sec-11")

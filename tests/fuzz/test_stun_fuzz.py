@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controlplane.core.stun.responder import StunOutcome, StunResponder
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.stun import (
     HEADER_BYTES,
     MAX_TEXT_CHARACTERS,

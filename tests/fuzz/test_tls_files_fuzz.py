@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from controlplane.ca import Authority
 from controlplane.ca.index import decode_index, encode_index
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.identity import IdentityRole
 from protos.tls_files import load_tls_files
 

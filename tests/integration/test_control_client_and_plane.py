@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import (
     PROTOCOL_VERSION,
     Assignment,

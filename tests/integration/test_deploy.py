@@ -21,7 +21,7 @@ from controlplane.config import load_config as load_controlplane_config
 from controlplane.core.control.control import ControlCore
 from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics
-from protos.host_port import split_host_port
+from protos.base.host_port import split_host_port
 from protos.identity import Identity, IdentityRole, RevocationList
 from protos.model import NodeName, Role
 from sidecar.config import SidecarConfig, load_config

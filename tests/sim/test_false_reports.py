@@ -7,7 +7,7 @@ import pytest
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.explanation_text import render
-from protos.histogram import MAX_COUNT, Histogram
+from protos.base.histogram import MAX_COUNT, Histogram
 from protos.model import (
     Assignment,
     CandidateSet,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from protos.base.errors import DecodeError
 from protos.credential import Aead
-from protos.errors import DecodeError
 from protos.model import InterfaceId, PeerSet, Version
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.wire import frame

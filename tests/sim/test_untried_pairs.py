@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import beta
 
 from controlplane.core.estimate.estimator import Estimator
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
+from protos.base.size_class import size_class
 from protos.model import InterfaceName, LatencyReport, NodeName, PathReport, Report, ServiceName
-from protos.size_class import size_class
 
 ROBOT, OTHER_ROBOT = NodeName("robot"), NodeName("other")
 DETECT, SEGMENT = ServiceName("/detect"), ServiceName("/segment")

@@ -21,8 +21,8 @@ from controlplane.config import ControlPlaneConfig
 from controlplane.core.control.control import ControlCore
 from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics
+from protos.base.histogram import Histogram
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.histogram import Histogram
 from protos.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
 from protos.model import InterfaceName, NodeName, ServiceName
 from protos.tls_files import MAX_FILE_BYTES

@@ -23,9 +23,9 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from protos.base.errors import DecodeError
 from protos.candidate_signature import signed_bytes, verify_candidates
 from protos.credential import Aead, SessionCredential, decode_credential, session_number, verify
-from protos.errors import DecodeError
 from protos.identity import Trust
 from protos.model import (
     PROTOCOL_VERSION,

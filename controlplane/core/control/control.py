@@ -51,7 +51,7 @@ from controlplane.core.registry.registry import Admission, Refusal, Registry, St
 from controlplane.core.registry.restlessness import Restlessness
 from controlplane.core.settle.explored_pair import Exploration
 from controlplane.core.settle.stability import Stability
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.fleet_events import Why
 from protos.model import (
     Ack,

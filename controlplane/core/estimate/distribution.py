@@ -1,4 +1,4 @@
-"""Distributions of latencies over the buckets of `protos.histogram`, and how likely the sum of two is too slow."""
+"""Distributions of latencies over the buckets of `protos.base.histogram`, and how likely the sum of two is too slow."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protos.histogram import BUCKETS, EDGES, MAX_S, MIDS
+from protos.base.histogram import BUCKETS, EDGES, MAX_S, MIDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -23,9 +23,9 @@ from controlplane.core.estimate.posterior import IGNORANCE, Estimate, FadedTrial
 from controlplane.core.estimate.processing import ComputeTimes, ServerTimes
 from controlplane.core.estimate.shared_fate import SharedFate
 from controlplane.core.estimate.staleness import HeardClock
+from protos.base.histogram import Histogram
+from protos.base.size_class import SIZE_CLASSES
 from protos.explanation import SAMPLE
-from protos.histogram import Histogram
-from protos.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -12,8 +12,8 @@ import numpy as np
 
 from controlplane.core.estimate.distribution import Distribution
 from controlplane.core.estimate.staleness import Silence
-from protos.histogram import BUCKETS, MAX_COUNT, MIDS, Histogram
-from protos.size_class import SIZE_CLASSES
+from protos.base.histogram import BUCKETS, MAX_COUNT, MIDS, Histogram
+from protos.base.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -93,7 +93,7 @@ class FadedShares:
 
 
 class FadedHistogram:
-    """Weights by bucket of `protos.histogram`, and of the lost, fading with a half-life in seconds.
+    """Weights by bucket of `protos.base.histogram`, and of the lost, fading with a half-life in seconds.
 
     Samples that were called off count for as long as they lasted: `distribution` follows Kaplan and Meier. With the
     clock of its like they fade faster while only these are heard of.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 from controlplane.core.estimate.fading import FadedCount, FadedHistogram
 from controlplane.core.estimate.forgetting import forget_before
 from controlplane.core.estimate.staleness import HeardClock
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -12,7 +12,7 @@ from controlplane.core.estimate.fading import FadedCount, FadedHistogram
 from controlplane.core.estimate.forgetting import forget_after_s
 from controlplane.core.estimate.staleness import HeardClock
 from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, Witnesses
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
     from protos.model import NodeName, ServiceName

@@ -14,7 +14,7 @@ from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protos.histogram import MAX_COUNT
+from protos.base.histogram import MAX_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable

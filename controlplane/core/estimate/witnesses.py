@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.estimate.fading import FadedCount
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
     from protos.model import NodeName

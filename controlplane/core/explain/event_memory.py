@@ -8,7 +8,7 @@ from collections import OrderedDict, deque
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from protos.token_bucket import TokenBucket
+from protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

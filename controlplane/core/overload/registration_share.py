@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from controlplane.core.base.member_table import MemberTable
-from protos.token_bucket import TokenBucket
+from protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from protos.model import NodeName

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from controlplane.core.registry.registry import Refusal
+from protos.base.errors import DecodeError
 from protos.credential import decode_credential, verify
-from protos.errors import DecodeError
 
 if TYPE_CHECKING:
     from protos.identity import Identity

@@ -12,7 +12,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from controlplane.core.stun.source_limits import SourceLimits
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.stun import MessageClass, StunMessage, decode, encode, is_stun
 
 if TYPE_CHECKING:

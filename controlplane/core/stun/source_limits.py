@@ -10,7 +10,7 @@ from collections import OrderedDict
 from ipaddress import IPv6Address
 from typing import TYPE_CHECKING
 
-from protos.token_bucket import TokenBucket
+from protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from protos.model import Address

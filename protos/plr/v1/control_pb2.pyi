@@ -309,7 +309,7 @@ class LatencyReport(_message.Message):
     server: _builtins.str
     service: _builtins.str
     size_class: _builtins.int
-    """Class of their sizes; see protos/size_class.py."""
+    """Class of their sizes; see protos/base/size_class.py."""
     requests: _builtins.int
     """Requests whose outcome by the service's deadline is known since the last report, and those of them that missed it.
     The times of a late one come in a later report.

@@ -337,7 +337,7 @@ Global___Peer: _TypeAlias = Peer  # noqa: Y015
 
 @_typing.final
 class Histogram(_message.Message):
-    """Log-bucket latency histogram; see protos/histogram.py for the bucket layout."""
+    """Log-bucket latency histogram; see protos/base/histogram.py for the bucket layout."""
 
     DESCRIPTOR: _descriptor.Descriptor
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.identity import REVOKED, CertificateError
 from protos.model import MAX_CANDIDATES_OF_INTERFACE
 

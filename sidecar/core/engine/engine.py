@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from protos.errors import DecodeError, UnknownKindError
+from protos.base.errors import DecodeError, UnknownKindError
 from protos.model import MAX_PEERS, MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.slices import SLICE, Backlog, Step, rest

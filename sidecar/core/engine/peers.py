@@ -18,7 +18,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.identity import CertificateError
 from protos.model import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
 from sidecar.core.engine.announced import Announced

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.token_bucket import TokenBucket
+from protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Container

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from cryptography.exceptions import InvalidTag
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import InterfaceId, SessionId
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
+from protos.base.token_bucket import TokenBucket
 from protos.model import Role
-from protos.token_bucket import TokenBucket
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.link.memory import LinkMemory
 from sidecar.core.link.pinging import Pings

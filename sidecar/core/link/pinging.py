@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.token_bucket import TokenBucket
+from protos.base.token_bucket import TokenBucket
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import Role
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES

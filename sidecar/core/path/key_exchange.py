@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from sidecar.core.crypto.key_schedule import next_root, proof, proof_of_offer
 from sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 if TYPE_CHECKING:
     import random
 
-    from protos.token_bucket import TokenBucket
+    from protos.base.token_bucket import TokenBucket
     from sidecar.core.crypto.key_schedule import PairKeys
 
 RENEW_AFTER_S = 120.0

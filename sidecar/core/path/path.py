@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Collection
 
+    from protos.base.token_bucket import TokenBucket
     from protos.model import Address, InterfaceId, NodeName, SessionId
-    from protos.token_bucket import TokenBucket
     from sidecar.core.path.keys import PathKeys
     from sidecar.core.path.probing import SentPing
     from sidecar.core.wire.frame import KeyAnswer, KeyOffer

@@ -17,7 +17,7 @@ import heapq
 from functools import partial
 from typing import TYPE_CHECKING
 
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import Assignment
 from protos.redundancy_mode import RedundancyMode
 from sidecar.core.base.slices import GROUP, rest

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.histogram import Histogram
+    from protos.base.histogram import Histogram
     from protos.model import InterfaceName, NodeName, ServiceName
 
 

@@ -12,7 +12,7 @@ from collections import Counter
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.stun import MessageClass, decode, is_stun
 from sidecar.core.stun.events import StunDrop
 from sidecar.core.stun.family import StunClientConfig, StunFamilyClient, StunOutbox

@@ -50,7 +50,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, InterfaceId, SessionId
 from sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
 

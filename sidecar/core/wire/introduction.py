@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
+from protos.base.errors import DecodeError
 from protos.credential import decode_credential
-from protos.errors import DecodeError
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import expand
 from sidecar.core.wire.frame import (

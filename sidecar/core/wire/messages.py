@@ -25,11 +25,11 @@ import struct
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+from protos.base.errors import DecodeError, UnknownKindError
+from protos.base.names import clean_text
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.errors import DecodeError, UnknownKindError
 from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import ServiceName
-from protos.names import clean_text
 from sidecar.core.base.request_id import REQUEST_ID_BYTES
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 

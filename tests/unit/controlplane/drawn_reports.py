@@ -6,7 +6,7 @@ from __future__ import annotations
 import random
 from typing import TYPE_CHECKING
 
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import (
     Assignment,
     InterfaceJointReport,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 
 from controlplane.core.registry.registry import StreamId
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import (
     PROTOCOL_VERSION,
     Candidate,

@@ -13,9 +13,9 @@ from pydantic import ValidationError
 from controlplane.config import ControlPlaneConfig, load_config, parse_config
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from protos.base.errors import ConfigError
+from protos.base.host_port import check_remote, split_host_port
 from protos.config_file import MAX_CONFIG_BYTES
-from protos.errors import ConfigError
-from protos.host_port import check_remote, split_host_port
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,7 +16,7 @@ from controlplane.event_lines import decode, encode
 from controlplane.event_log import FILE, EventLog
 from controlplane.remembered import departures
 from protos import own_folder
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.fleet_events import EventKind, EventQuery, FleetEvent, Why
 from protos.model import NodeName, Role
 

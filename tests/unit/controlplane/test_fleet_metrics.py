@@ -33,8 +33,8 @@ from controlplane.fleet_metrics import (
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
 from controlplane.status_table import render
+from protos.base.histogram import Histogram
 from protos.fleet_events import DepartedSidecar, Why
-from protos.histogram import Histogram
 from protos.model import (
     Assignment,
     CandidateSet,

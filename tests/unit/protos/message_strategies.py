@@ -8,6 +8,8 @@ from typing import TypeVar
 
 from hypothesis import strategies as st
 
+from protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
+from protos.base.size_class import SIZE_CLASSES
 from protos.convert.control import MAX_WALL_S
 from protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS
 from protos.convert.types import LEAST_TARGET
@@ -22,7 +24,6 @@ from protos.explanation import (
     PairExplanation,
 )
 from protos.fleet_events import DepartedSidecar, EventKind, EventLogState, FleetEvent, Why
-from protos.histogram import BUCKETS, MAX_COUNT, Histogram
 from protos.model import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
@@ -73,7 +74,6 @@ from protos.model import (
 )
 from protos.preferences import Copies, InterfaceLabel
 from protos.redundancy_mode import RedundancyMode
-from protos.size_class import SIZE_CLASSES
 from protos.status import ResourceStatus, SidecarStatus, SyncState
 
 T = TypeVar("T")

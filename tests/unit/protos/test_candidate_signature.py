@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controlplane.ca import Authority
+from protos.base.errors import DecodeError
 from protos.candidate_signature import sign_candidates, signed_bytes, verify_candidates
-from protos.errors import DecodeError
 from protos.identity import CertificateError, IdentityRole
 from protos.model import MAX_SIGNATURE_BYTES, Candidate, CandidateKind, InterfaceId, InterfaceName, SessionId
 from tests.unit.protos import message_strategies as some

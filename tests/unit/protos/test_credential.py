@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protos.base.errors import DecodeError
 from protos.credential import Aead, SessionCredential, decode_credential, session_number, verify
-from protos.errors import DecodeError
 from protos.identity import CertificateError, Identity, IdentityRole
 from protos.model import MAX_CREDENTIAL_BYTES, NodeName, Role, SessionId
 from tests.unit.protos import message_strategies as some

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.size_class import SIZE_CLASSES, size_class
+from protos.base.size_class import SIZE_CLASSES, size_class
 
 
 @pytest.mark.parametrize(

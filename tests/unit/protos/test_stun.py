@@ -8,7 +8,7 @@ import struct
 
 import pytest
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.stun import (
     MAX_MESSAGE_BYTES,
     MAX_UNKNOWN_ATTRIBUTES,

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.identity import Identity, IdentityRole
 from protos.model import InterfaceName, NodeName, Role
 from sidecar.config import (

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import yaml
 
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from sidecar.config import parse_config
 from tests.unit.sidecar.configs import BACKED, CLOUD, ROBOT, SAFE, SOURCE, parse, with_service
 

@@ -10,7 +10,7 @@ import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import InterfaceName, NodeName, ResourceKind, ServiceName
 from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats, LinkStats, PathStats

@@ -11,9 +11,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
+from protos.base.errors import ConfigError, DecodeError
 from protos.clock_floor import ClockFloor
 from protos.credential import SessionCredential, verify
-from protos.errors import ConfigError, DecodeError
 from protos.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, CertificateError, IdentityRole, Trust
 from protos.model import Peer, Role, SessionId
 from protos.tls_files import TlsFiles, load_tls_files

@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING
 import pytest
 
 from protos import own_folder
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import (
     Assignment,
     Candidate,

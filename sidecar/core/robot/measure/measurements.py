@@ -6,7 +6,8 @@ from collections import Counter
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
+from protos.base.size_class import size_class
 from protos.model import (
     MAX_JOINTS,
     MAX_LATENCIES,
@@ -17,7 +18,6 @@ from protos.model import (
     PathReport,
     Report,
 )
-from protos.size_class import size_class
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.measure.interface_outcomes import JointCounts

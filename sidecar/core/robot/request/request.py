@@ -97,7 +97,7 @@ class Request:
     payload: bytes | None
     submitted_at: float
     size_class: int = 0
-    """Settled when it was submitted (`protos.size_class`)."""
+    """Settled when it was submitted (`protos.base.size_class`)."""
     size: int = 0
     """Bytes of the message that a copy of it is, settled when it was submitted."""
     held: int = field(init=False)

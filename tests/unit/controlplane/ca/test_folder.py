@@ -14,7 +14,7 @@ from controlplane.ca import Authority, AuthorityError, folder
 from controlplane.ca.actions import refuse_taken
 from controlplane.ca.files import write_atomically
 from controlplane.ca.folder import AuthorityFolder, Protection
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.identity import CertificateError, IdentityRole, Trust
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from controlplane.ca.actions import refuse_taken
 from controlplane.ca.files import write_atomically
 from controlplane.ca.folder import AuthorityFolder
 from controlplane.ca.index import Entry
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.identity import MAX_CA_CERTIFICATES, CertificateError, IdentityRole, Trust
 from tests.unit.controlplane.ca.test_authority import DAY_S, Clock
 

@@ -16,7 +16,7 @@ from cryptography.x509.oid import AttributeOID, ExtendedKeyUsageOID, NameOID
 from controlplane.ca.certificates import alternative_names, generate_key
 from controlplane.ca.key_file import clear_pem
 from controlplane.ca.request import MAX_REQUEST_BYTES, build_request, fingerprint, parse_request
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.identity import CONTROL_PLANE_DNS, IdentityRole
 
 if TYPE_CHECKING:

@@ -18,9 +18,9 @@ from controlplane.planning.recorded import RecordedService
 from controlplane.planning.replay import ReplayedTraces, replay
 from controlplane.planning.traces import COLUMNS, RecordedPaths, parse_trace
 from controlplane.planning.workload import Compute, Workload
+from protos.base.histogram import Histogram
 from protos.convert import explanation_to_proto
 from protos.explanation import SAMPLE, Belief, Correlation, Explanation, JointExplanation, PairExplanation
-from protos.histogram import Histogram
 from protos.model import Assignment, InterfaceName, NodeName, ServiceName
 from protos.status import ResourceStatus
 from tests.unit.controlplane.samples import histogram

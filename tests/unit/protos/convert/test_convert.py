@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protos.base.errors import DecodeError, UnknownKindError
+from protos.base.names import MAX_STRING_BYTES, clean_text
 from protos.convert import (
     control_message_from_proto,
     control_message_to_proto,
@@ -30,7 +32,6 @@ from protos.convert import (
     status_to_proto,
 )
 from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS
-from protos.errors import DecodeError, UnknownKindError
 from protos.fleet_events import EventList
 from protos.model import (
     ALL_CALLS,
@@ -58,7 +59,6 @@ from protos.model import (
     SidecarMessage,
     Version,
 )
-from protos.names import MAX_STRING_BYTES, clean_text
 from protos.plr.v1 import admin_pb2, control_pb2, types_pb2
 from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from protos.status import SidecarStatus

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protos.base.errors import DecodeError, UnknownKindError
+from protos.base.histogram import BUCKETS
 from protos.convert import message_cost, parse_sidecar_message, sidecar_message_to_proto
 from protos.convert.message_cost import CHEAP_BYTES, SPARE_FIELDS, check_cost
-from protos.errors import DecodeError, UnknownKindError
-from protos.histogram import BUCKETS
 from protos.model import MAX_LATENCIES, MAX_PATHS, Heartbeat, Report, SidecarMessage
 from protos.plr.v1 import control_pb2, types_pb2
 from tests.unit.controlplane.samples import histogram, latency, path

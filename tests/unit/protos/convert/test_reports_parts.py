@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.estimate.estimator import Estimator
+from protos.base.errors import DecodeError
 from protos.convert import parse_in_parts, parse_sidecar_message, sidecar_message_to_proto
 from protos.convert.reports import PART_ENTRIES
-from protos.errors import DecodeError
 from protos.model import (
     MAX_PATHS,
     Heartbeat,

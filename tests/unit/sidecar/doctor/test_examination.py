@@ -13,7 +13,7 @@ import yaml
 
 from controlplane.ca import Authority
 from protos import tls_files
-from protos.errors import ConfigError
+from protos.base.errors import ConfigError
 from protos.identity import IdentityRole
 from protos.tls_files import load_tls_files
 from sidecar.doctor import examination

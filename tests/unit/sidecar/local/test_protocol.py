@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from sidecar.local.protocol import PingRequest, StateRequest, decode_request
 
 pytestmark = pytest.mark.audit("ops-14")

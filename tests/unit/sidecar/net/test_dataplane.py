@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
     ALL_CALLS,

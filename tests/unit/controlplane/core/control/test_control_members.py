@@ -9,7 +9,7 @@ import pytest
 from controlplane.core.control import control
 from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import (
     CandidateSet,
     Drain,

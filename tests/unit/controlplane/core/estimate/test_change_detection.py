@@ -7,7 +7,7 @@ import random
 import pytest
 
 from controlplane.core.estimate.processing import ComputeTimes
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import NodeName
 from tests.unit.controlplane.samples import PLAN, histogram
 

@@ -15,8 +15,8 @@ from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.estimate.fading import FadedCount, FadedHistogram
 from controlplane.core.estimate.posterior import IGNORANCE, MEMORIES, SCORE_HALF_LIFE, Estimate, FadedTrials
 from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses
+from protos.base.histogram import BUCKETS, EDGES, MAX_S, MIDS, Histogram
 from protos.convert import parse_sidecar_message, sidecar_message_to_proto
-from protos.histogram import BUCKETS, EDGES, MAX_S, MIDS, Histogram
 from protos.model import NodeName, Report
 from tests.unit.controlplane.drawn_reports import DEADLINES_S, INTERFACES, ROBOTS, SERVERS, SERVICES, drawn_reports
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from controlplane.core.estimate.unanswered import LATELY_S, MAX_ANSWERED, MAX_WORDS_OF_ROBOT, REMEMBERED_S, Unanswered
-from protos.histogram import MAX_COUNT, Histogram
+from protos.base.histogram import MAX_COUNT, Histogram
 from protos.model import NodeName
 from tests.unit.controlplane.samples import PLAN, histogram, latency
 

@@ -4,7 +4,7 @@ import pytest
 
 from controlplane.core.base import member_table
 from controlplane.core.overload.line_share import LINES_BURST, LINES_PER_S, LineShare
-from protos.token_bucket import TokenBucket
+from protos.base.token_bucket import TokenBucket
 
 
 @pytest.mark.audit("ops-16")

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.histogram import Histogram
+from protos.base.histogram import Histogram
 from protos.model import (
     MAX_VERSION,
     PROTOCOL_VERSION,

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from protos.base.errors import DecodeError
 from protos.credential import SessionCredential, decode_credential
-from protos.errors import DecodeError
 from protos.model import NodeName, Peer, Role, SessionId
 from sidecar.core.crypto import session as session_module
 from sidecar.core.crypto.session import OwnSession

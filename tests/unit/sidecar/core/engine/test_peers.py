@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
     MAX_PEERS,

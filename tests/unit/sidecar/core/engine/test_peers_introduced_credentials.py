@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from protos.base.errors import DecodeError
 from protos.credential import decode_credential
-from protos.errors import DecodeError
 from protos.model import POLICY_PENDING, NodeName, PeerSet, Role, SessionId, Version
 from sidecar.core.crypto.session import OwnSession
 from sidecar.core.engine.peers import Peers

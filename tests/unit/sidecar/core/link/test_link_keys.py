@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import InterfaceId, NodeName, Role, SessionId
 from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link

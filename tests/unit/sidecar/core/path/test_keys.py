@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from cryptography.exceptions import InvalidTag
 
+from protos.base.errors import DecodeError
 from protos.credential import Aead
-from protos.errors import DecodeError
 from protos.model import InterfaceId, Role
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import proof_of_offer

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import InterfaceId, SessionId
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.wire import frame

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import InterfaceId, NodeName, Role, SessionId
 from sidecar.core.wire.frame import BASE_BYTES, Header, KeyOffer
 from sidecar.core.wire.introduction import (

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
+from protos.base.errors import DecodeError, UnknownKindError
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.errors import DecodeError, UnknownKindError
 from protos.model import ServiceName
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.wire.messages import (

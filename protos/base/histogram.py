@@ -26,7 +26,7 @@ from bisect import bisect_right
 from operator import lt
 from typing import TYPE_CHECKING
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from functools import lru_cache
 
-from protos.errors import DecodeError
+from protos.base.errors import DecodeError
 from protos.model import InterfaceName, NodeName, ServiceName
 
 MAX_STRING_BYTES = 255

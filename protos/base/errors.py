@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protos.printable import escaped
+from protos.base.printable import escaped
 
 
 class DecodeError(ValueError):

@@ -1,0 +1,1 @@
+"""The bottom of the contract: errors, histogram, size classes, versions. Imports nothing of ours."""
