@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.null_cipher import null_cipher
-from protos.clock_floor import ClockFloor
 from protos.model import (
     ALL_CALLS,
     Candidate,
@@ -31,7 +30,8 @@ from protos.model import (
     ServiceOffer,
     Version,
 )
-from protos.pair_token import pair_token
+from protos.trust.clock_floor import ClockFloor
+from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine.engine import Engine, EngineConfig
 from sidecar.core.link.datagrams import LinkIdentity

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from cryptography.utils import Buffer
 
-    from protos.credential import Aead
+    from protos.trust.credential import Aead
     from sidecar.core.crypto.aead import Cipher
 
 

@@ -29,9 +29,9 @@ with extras.required("plr-controlplane", "controlplane"):
     from protos.arguments import OneLineParser
     from protos.base.errors import ConfigError
     from protos.base.printable import escaped
-    from protos.certificate_term import term_problem
     from protos.log_lines import line_formatter
     from protos.logging_setup import Logging
+    from protos.trust.certificate_term import term_problem
     from protos.version_option import ShowVersion, describe
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import grpc
 
-from protos.certificate_term import with_remedy
-from protos.identity import WRONG_ROLE, IdentityRole
+from protos.trust.certificate_term import with_remedy
+from protos.trust.identity import WRONG_ROLE, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable

@@ -14,9 +14,9 @@ from protos.arguments import number
 from protos.base.errors import ConfigError, DecodeError
 from protos.base.host_port import check_remote
 from protos.base.printable import escaped
-from protos.identity import CONTROL_PLANE_DNS
 from protos.plr.v1 import admin_pb2_grpc
 from protos.tls_files import load_tls_files
+from protos.trust.identity import CONTROL_PLANE_DNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

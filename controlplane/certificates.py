@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NoReturn
 
 from protos.base.errors import ConfigError
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.identity import IdentityRole
 from protos.revocation_views import revocation_set
 from protos.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from controlplane.loop import ControlLoop
     from controlplane.metrics import Metrics
     from controlplane.tls_gate import TlsGate
-    from protos.clock_floor import ClockFloor
     from protos.model import NodeName
+    from protos.trust.clock_floor import ClockFloor
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import os
 import ssl
 from typing import TYPE_CHECKING
 
-from protos.identity import UNTRUSTED
+from protos.trust.identity import UNTRUSTED
 
 if TYPE_CHECKING:
     from protos.tls_files import TlsFiles

@@ -36,8 +36,8 @@ from controlplane.turns import Turns
 from protos.base.token_bucket import TokenBucket
 from protos.convert import status_to_proto
 from protos.fleet_events import EventKind
-from protos.identity import EXPIRED, REVOKED, CertificateError
 from protos.model import NO_REVOCATIONS, RemovalReason, Role
+from protos.trust.identity import EXPIRED, REVOKED, CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     from controlplane.stun_server import StunServer
     from controlplane.tls_gate import Caller
     from protos.explanation import Explanation
-    from protos.identity import Trust
     from protos.model import NodeName, Registration, RevocationSet, ServiceName, SidecarMessage
+    from protos.trust.identity import Trust
 
 log = logging.getLogger(__name__)
 

@@ -16,12 +16,12 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from controlplane import handshakes, limits, tls_gate
 from controlplane.fleet_metrics import FleetCollector
-from protos import identity
 from protos.fleet_events import EventLogState
 from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind, Role
 from protos.revocation_views import revocation_gauges
 from protos.status import SyncState
+from protos.trust import identity
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from controlplane.core.control.control import ControlCore
     from controlplane.fleet_metrics import Fleet
     from controlplane.stun_server import StunServer
-    from protos.identity import Identity, RevocationList
+    from protos.trust.identity import Identity, RevocationList
 
 SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 """A robot alone takes milliseconds, a hundred a quarter of a second, a thousand some seconds."""

@@ -27,8 +27,8 @@ from controlplane.metrics import Metrics
 from controlplane.stun_server import start_stun_server
 from controlplane.tls_gate import TlsGate
 from protos.base.host_port import split_host_port
-from protos.clock_floor import ClockFloor
 from protos.fleet_events import EventKind
+from protos.trust.clock_floor import ClockFloor
 from protos.version_option import describe
 
 if TYPE_CHECKING:

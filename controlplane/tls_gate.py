@@ -31,15 +31,15 @@ from controlplane.gate_pipe import PipeEnd
 from controlplane.half_open import HalfOpen
 from controlplane.handshakes import server_context, why_failed
 from protos.base.token_bucket import TokenBucket
-from protos.identity import CertificateError, IdentityRole
+from protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from protos.clock_floor import ClockFloor
-    from protos.identity import Identity, Trust
     from protos.model import NodeName
     from protos.tls_files import TlsFiles
+    from protos.trust.clock_floor import ClockFloor
+    from protos.trust.identity import Identity, Trust
 
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ from google.protobuf import json_format
 
 from controlplane.ca import Authority
 from protos.convert import explanation_from_proto
-from protos.identity import IdentityRole
 from protos.plr.v1 import admin_pb2
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -48,7 +48,7 @@ Address = tuple[str, int]
 """IP address in its canonical text form and UDP port; IPv4-mapped IPv6 addresses are written as IPv4."""
 
 TOKEN_BYTES = 16
-"""Size of the stable secret of a sidecar, and of what each peer is told of it (`protos/pair_token.py`)."""
+"""Size of the stable secret of a sidecar, and of what each peer is told of it (`protos/trust/pair_token.py`)."""
 
 POLICY_PENDING = 0
 """In place of a policy's fingerprint: nothing is to be judged by it yet, as peers may still be coming back."""
@@ -310,7 +310,7 @@ class CandidateSet:
     serial: int = 0
     """Grows within a session (64 bits)."""
     signature: bytes = field(default=b"", repr=False)
-    """Over candidates, serial and session, for the peers (`protos/candidate_signature.py`); none in insecure mode."""
+    """Over candidates, serial and session, for the peers (`protos/trust/candidate_signature.py`); none in insecure mode."""
     down: tuple[InterfaceLabel, ...] = ()
     """Interfaces that it would use and that carry nothing now; for the operator's eyes."""
 

@@ -10,7 +10,7 @@ from protos.model import HeldList, RevocationSet
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from protos.identity import RevocationList
+    from protos.trust.identity import RevocationList
 
 
 MAX_NUMBER = (1 << 64) - 1

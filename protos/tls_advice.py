@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.certificate_term import remedy
-from protos.identity import CONTROL_PLANE_DNS, CertificateError
+from protos.trust.certificate_term import remedy
+from protos.trust.identity import CONTROL_PLANE_DNS, CertificateError
 
 if TYPE_CHECKING:
     from protos.tls_files import TlsFiles

@@ -21,11 +21,11 @@ with extras.required("plr-sidecar", "sidecar"):
     from protos.arguments import OneLineParser
     from protos.base.errors import ConfigError, StartError
     from protos.base.printable import escaped
-    from protos.certificate_term import term_problem
     from protos.log_lines import line_formatter
     from protos.logging_setup import Logging
     from protos.model import Role
     from protos.tls_files import load_tls_files
+    from protos.trust.certificate_term import term_problem
     from protos.version_option import ShowVersion
     from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
     from sidecar.ros import environment
@@ -34,7 +34,7 @@ with extras.required("plr-sidecar", "sidecar"):
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.certificate_term import TermProblem
+    from protos.trust.certificate_term import TermProblem
 
 log = logging.getLogger("sidecar.main")
 

@@ -7,10 +7,10 @@ from collections import Counter
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from protos.candidate_signature import sign_candidates
 from protos.convert.fields import MAX_CANDIDATES
 from protos.model import MAX_CANDIDATES_OF_INTERFACE, CandidateSet
 from protos.preferences import InterfaceLabel
+from protos.trust.candidate_signature import sign_candidates
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

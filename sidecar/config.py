@@ -23,9 +23,9 @@ from protos.config_fields import (
     refuse_duplicates,
 )
 from protos.config_file import key_path, parse_yaml, read_text, validate
-from protos.identity import IdentityRole
 from protos.model import NodeName, Role, ServiceName
 from protos.preferences import DEFAULT_CHARGE, InterfaceLabel
+from protos.trust.identity import IdentityRole
 from sidecar.config_fields import (
     ControlPlaneAddresses,
     DomainLabel,
@@ -43,8 +43,8 @@ from sidecar.service_config import NetworkConfig, ServiceConfig
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from protos.identity import Identity
     from protos.model import InterfaceName
+    from protos.trust.identity import Identity
     from sidecar.core.rules.budget import Budget
 
 DEFAULT_CLOUD_UDP_PORT = 24700

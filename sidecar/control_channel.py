@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import grpc
 
-from protos.identity import CONTROL_PLANE_DNS
+from protos.trust.identity import CONTROL_PLANE_DNS
 
 if TYPE_CHECKING:
     from protos.tls_files import TlsFiles

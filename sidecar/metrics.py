@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from prometheus_client import Metric
 
-    from protos.identity import Identity
     from protos.model import InterfaceName, ServiceName
+    from protos.trust.identity import Identity
     from sidecar.core.control.session import ControlStats
     from sidecar.core.seam.stats import EngineStats, LinkStats
     from sidecar.revocations import RevocationState

@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.identity import CertificateError
 from protos.revocation_views import revocation_set
+from protos.trust.identity import CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from protos.identity import RevocationList
     from protos.model import NodeName, RevocationSet
     from protos.tls_files import TlsWatch
+    from protos.trust.identity import RevocationList
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from protos import interpreter
 from protos.base.errors import StartError
 from protos.base.host_port import split_host_port
-from protos.clock_floor import ClockFloor
 from protos.model import (
     MAX_UNMET,
     OLDEST_PROTOCOL_VERSION,
@@ -28,6 +27,7 @@ from protos.model import (
 )
 from protos.notifier import Notifier
 from protos.tls_files import TlsWatch, load_tls_files
+from protos.trust.clock_floor import ClockFloor
 from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient
 from sidecar.core.control.session import Apply, ControlSession

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protos.base.errors import ConfigError
-from protos.credential import Aead, SessionCredential, session_number, verify
+from protos.trust.credential import Aead, SessionCredential, session_number, verify
 from sidecar.core.crypto.session import OwnSession, public_key
 from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.clock_floor import ClockFloor
-    from protos.identity import Identity
     from protos.model import NodeName, Role
     from protos.tls_files import TlsFiles
+    from protos.trust.clock_floor import ClockFloor
+    from protos.trust.identity import Identity
 
 PRIVATE_KEY_BYTES = 32
 CPUINFO = Path("/proc/cpuinfo")

@@ -8,8 +8,8 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from protos.credential import Aead, SessionCredential
 from protos.model import NodeName, Peer, Role, SessionId
+from protos.trust.credential import Aead, SessionCredential
 from sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
 from sidecar.core.crypto.session import OwnSession, public_key
 from sidecar.core.wire.frame import HEADER_BYTES, PHASE_FLAG, Header, encode_header

@@ -21,8 +21,8 @@ from bench.control.crowd import Crowd
 from bench.control.member import SERVICE, Member
 from bench.control.plane import Plane
 from controlplane.ca import Authority
-from protos.identity import IdentityRole
 from protos.model import InterfaceName, NodeName, Role
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     import argparse

@@ -23,8 +23,8 @@ from bench.pressure import CpuPressure
 from bench.reporting.machine import machine
 from bench.reporting.terminal import show_verdicts
 from controlplane.ca import Authority
-from protos.identity import IdentityRole
 from protos.model import NodeName, Role
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     import argparse

@@ -7,8 +7,6 @@ import time
 from typing import TYPE_CHECKING
 
 from protos.base.histogram import Histogram
-from protos.candidate_signature import sign_candidates
-from protos.credential import Aead, SessionCredential, session_number
 from protos.model import (
     PROTOCOL_VERSION,
     Candidate,
@@ -28,6 +26,8 @@ from protos.model import (
     ServiceSet,
     ServiceUse,
 )
+from protos.trust.candidate_signature import sign_candidates
+from protos.trust.credential import Aead, SessionCredential, session_number
 from sidecar.core.control.session import ControlSession
 
 if TYPE_CHECKING:

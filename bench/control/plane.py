@@ -18,7 +18,7 @@ from urllib.request import urlopen
 import yaml
 
 from bench.churn.machine import processor_s
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from controlplane.ca import Authority

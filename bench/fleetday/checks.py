@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.model import NO_CALLS, ResourceKind, Role, Version
-from protos.pair_token import pair_token
 from protos.status import SyncState
+from protos.trust.pair_token import pair_token
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

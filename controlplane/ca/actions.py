@@ -20,7 +20,6 @@ from controlplane.ca.folder import AuthorityFolder, Protection
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE, PassphraseSource
 from protos.base.errors import ConfigError
 from protos.base.printable import escaped
-from protos.identity import IdentityRole
 from protos.regular_file import read_regular
 from protos.tls_files import (
     CA_FILE,
@@ -32,6 +31,7 @@ from protos.tls_files import (
     load_private_key,
     read_guarded,
 )
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     import argparse

@@ -22,7 +22,7 @@ from controlplane.ca.files import write_tls_files
 from controlplane.ca.index import Entry, Record
 from controlplane.ca.request import fingerprint
 from protos.base.names import node_name
-from protos.identity import MAX_CA_CERTIFICATES
+from protos.trust.identity import MAX_CA_CERTIFICATES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec
 
     from controlplane.ca.request import Request
-    from protos.identity import IdentityRole
+    from protos.trust.identity import IdentityRole
 
 DAY_S = 86_400.0
 

@@ -17,7 +17,7 @@ from protos.arguments import checked
 from protos.base.errors import ConfigError, DecodeError
 from protos.base.names import node_name, text
 from protos.base.printable import escaped
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -20,7 +20,7 @@ from pydantic import (
 from protos.base.errors import ConfigError
 from protos.base.names import node_name
 from protos.config_file import key_path
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

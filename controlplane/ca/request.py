@@ -3,7 +3,7 @@
     subject          CN=robot-7
     public key       ECDSA on P-256
     attributes       one extension request, of one extension:
-    subjectAltName   as the certificate's (protos/identity.py)
+    subjectAltName   as the certificate's (protos/trust/identity.py)
 
 A request proves that who made it has the key, and nothing else: whoever made it wrote down the name and role. So the CA
 takes its key only, and name and role from the operator. Who asks for more than a certificate of ours holds is refused.
@@ -24,11 +24,11 @@ from cryptography.x509.oid import NameOID
 
 from controlplane.ca.certificates import alternative_names
 from protos.base.errors import DecodeError
-from protos.identity import SIGNATURES, name_and_role
+from protos.trust.identity import SIGNATURES, name_and_role
 
 if TYPE_CHECKING:
-    from protos.identity import IdentityRole
     from protos.model import NodeName
+    from protos.trust.identity import IdentityRole
 
 REQUEST_FILE = "request.pem"
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-from protos.credential import decode_credential, session_number
 from protos.model import InterfaceId, Role
-from protos.pair_token import pair_token
+from protos.trust.credential import decode_credential, session_number
+from protos.trust.pair_token import pair_token
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import pair_keys
 from sidecar.core.crypto.session import public_key
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from protos.credential import SessionCredential
+    from protos.trust.credential import SessionCredential
     from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.link.datagrams import LinkIdentity
     from sidecar.core.path.keys import SealingKeys

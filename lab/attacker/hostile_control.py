@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from lab.attacker.hostile_link import ESCAPES
 from lab.attacker.orders import Stage
 from protos.base.histogram import MAX_COUNT, Histogram
-from protos.candidate_signature import sign_candidates
 from protos.model import (
     MAX_CANDIDATES_OF_INTERFACE,
     Candidate,
@@ -36,6 +35,7 @@ from protos.model import (
     ServiceUse,
     Version,
 )
+from protos.trust.candidate_signature import sign_candidates
 from sidecar.core.control.session import ControlSession, ControlState
 
 if TYPE_CHECKING:

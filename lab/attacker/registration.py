@@ -7,8 +7,8 @@ import time
 from typing import TYPE_CHECKING
 
 from protos.convert import sidecar_message_to_proto
-from protos.credential import Aead, SessionCredential, session_number
 from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, SessionId, Version
+from protos.trust.credential import Aead, SessionCredential, session_number
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec

@@ -42,7 +42,6 @@ from protos.convert.types import (
     use_from_proto,
     use_to_proto,
 )
-from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import (
     MAX_PEERS,
     MAX_UNMET,
@@ -67,6 +66,7 @@ from protos.model import (
     Welcome,
 )
 from protos.plr.v1 import control_pb2
+from protos.trust.identity import MAX_CA_CERTIFICATES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from protos.base.errors import DecodeError
 from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_OUTCOMES, MAX_USES
-from protos.identity import MAX_CA_CERTIFICATES
 from protos.model import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES, MAX_UNMET
 from protos.plr.v1 import control_pb2
+from protos.trust.identity import MAX_CA_CERTIFICATES
 
 CHEAP_BYTES = 4096
 """What is no longer is cheap whatever it holds."""

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from protos.base.errors import ConfigError, DecodeError
 from protos.config_file import parse_yaml, read_text
-from protos.identity import Identity, IdentityRole
 from protos.model import NodeName, ServiceName
 from protos.regular_file import read_regular
 from protos.tls_files import load_tls_files
+from protos.trust.identity import Identity, IdentityRole
 from sidecar.config import load_config
 from sidecar.core.rules.service_rule import Rules
 from sidecar.doctor import host, node_checks, running_checks

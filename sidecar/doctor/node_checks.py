@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from protos.certificate_term import term_problem
-from protos.clock_floor import SLACK_S
+from protos.trust.certificate_term import term_problem
+from protos.trust.clock_floor import SLACK_S
 from sidecar.doctor.finding import duration, fail, ok, warn
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from protos.identity import Identity
     from protos.tls_files import TlsFiles
+    from protos.trust.identity import Identity
     from sidecar.doctor.finding import Finding
     from sidecar.doctor.host import ClockState
     from sidecar.net.interfaces import InterfaceChoice

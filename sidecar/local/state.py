@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from protos.certificate_term import term_problem
+from protos.trust.certificate_term import term_problem
 from sidecar.core.base.values import PathState
 from sidecar.local.protocol import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from protos.clock_floor import ClockFloor
     from protos.model import InterfaceName
     from protos.tls_files import TlsWatch
+    from protos.trust.clock_floor import ClockFloor
     from sidecar.config import SidecarConfig
     from sidecar.control_client import ControlView
     from sidecar.core.base.values import PathId

@@ -28,7 +28,6 @@ from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from protos.credential import SessionCredential
     from protos.model import (
         InterfaceName,
         MappingSet,
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
         ServiceUse,
         SessionId,
     )
+    from protos.trust.credential import SessionCredential
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
     from sidecar.core.crypto.session import OwnSession

@@ -19,8 +19,8 @@ from controlplane.ca import Authority, Validity
 from controlplane.ca.files import write_tls_files
 from lab.attacker.control_client import CONNECT, CONTROL_PLANE_DNS
 from lab.system import CONTROL_PORT
-from protos.identity import IdentityRole
 from protos.model import Role
+from protos.trust.identity import IdentityRole
 from tests.attacks.registrations import registration
 from tests.attacks.world import ATTACKER, World
 

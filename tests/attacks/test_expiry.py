@@ -9,7 +9,7 @@ import pytest
 
 from controlplane.ca.certificates import Validity
 from lab.system import read_json
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 from tests.attacks.world import SERVICES
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import pytest
 
 from controlplane.ca import Authority
 from lab.system import CONTROL_PORT, System, read_json
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 from tests.attacks.world import ATTACKER, World, attack_lab, is_ours
 
 if TYPE_CHECKING:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.credential import session_number
-from protos.identity import MALFORMED, CertificateError
 from protos.model import PeerSet, Role, Version
+from protos.trust.credential import session_number
+from protos.trust.identity import MALFORMED, CertificateError
 from tests.sessions import session_of
 from tests.sim.mesh import Mesh, rule
 
 if TYPE_CHECKING:
-    from protos.credential import SessionCredential
+    from protos.trust.credential import SessionCredential
 
 CALLS = 20
 

@@ -18,8 +18,8 @@ import pytest
 from lab.attacker.control_client import CONNECT
 from lab.attacker.junk import mangled, noise
 from protos.convert import sidecar_message_to_proto
-from protos.identity import CONTROL_PLANE_DNS, IdentityRole
 from protos.model import CandidateSet, Drain, Heartbeat, NodeName, Report, Role, ServiceSet
+from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 from tests.attacks.registrations import registration
 from tests.integration.control_plane_process import Secured, cloud, open_channel, robot
 from tests.integration.secured_control_plane import SecuredControlPlane

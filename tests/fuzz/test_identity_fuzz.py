@@ -9,9 +9,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from controlplane.ca import Authority
-from protos.credential import Aead, SessionCredential, verify
-from protos.identity import CertificateError, IdentityRole, Trust
 from protos.model import NodeName, Role, SessionId
+from protos.trust.credential import Aead, SessionCredential, verify
+from protos.trust.identity import CertificateError, IdentityRole, Trust
 from tests.unit.protos.forged import NOW, Recipe, uri
 
 CA = Authority.create(clock=lambda: NOW)

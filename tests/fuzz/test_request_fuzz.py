@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from controlplane.ca.certificates import generate_key
 from controlplane.ca.request import build_request, parse_request
 from protos.base.errors import DecodeError
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 
 pytestmark = pytest.mark.audit("sec-11")
 

@@ -16,8 +16,6 @@ import grpc
 import yaml
 
 from protos.convert import control_message_from_proto, sidecar_message_to_proto, status_from_proto
-from protos.credential import Aead, SessionCredential, session_number
-from protos.identity import CONTROL_PLANE_DNS
 from protos.model import (
     Ack,
     CandidateSet,
@@ -35,6 +33,8 @@ from protos.model import (
     Version,
 )
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2, control_pb2_grpc
+from protos.trust.credential import Aead, SessionCredential, session_number
+from protos.trust.identity import CONTROL_PLANE_DNS
 from tests.unit.controlplane.samples import interfaces, offer, registration, use
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import urllib.request
 from typing import TYPE_CHECKING, Any
 
 from controlplane.ca import Authority
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Secured
 
 if TYPE_CHECKING:

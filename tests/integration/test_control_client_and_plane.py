@@ -40,7 +40,7 @@ from protos.model import (
     SessionId,
     Welcome,
 )
-from protos.pair_token import pair_token
+from protos.trust.pair_token import pair_token
 from sidecar.control_client import ControlClient
 from sidecar.core.control import session
 from sidecar.core.control.session import ControlSession

@@ -22,8 +22,8 @@ from controlplane.core.control.control import ControlCore
 from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics
 from protos.base.host_port import split_host_port
-from protos.identity import Identity, IdentityRole, RevocationList
 from protos.model import NodeName, Role
+from protos.trust.identity import Identity, IdentityRole, RevocationList
 from sidecar.config import SidecarConfig, load_config
 from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats

@@ -18,7 +18,7 @@ import pytest
 
 from controlplane.ca import Authority
 from protos import commit
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 from sidecar.doctor import command, ping_command
 from sidecar.local.client import LocalClient
 from sidecar.state_file import decode_identity

@@ -13,7 +13,7 @@ import grpc
 import pytest
 
 from controlplane.cli import main
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 from tests.integration.control_plane_process import HEARTBEAT_S, PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, robot
 from tests.integration.secured_control_plane import SecuredControlPlane
 

@@ -13,12 +13,12 @@ import pytest
 
 from controlplane.ca import Authority, Validity
 from controlplane.ca.files import write_atomically
-from protos.candidate_signature import verify_candidates
-from protos.credential import decode_credential
-from protos.identity import CertificateError, IdentityRole
 from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, ServiceSet, Welcome
 from protos.revocation_views import revocation_set
 from protos.tls_files import TlsWatch, load_tls_files
+from protos.trust.candidate_signature import verify_candidates
+from protos.trust.credential import decode_credential
+from protos.trust.identity import CertificateError, IdentityRole
 from sidecar import control_client
 from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient

@@ -17,10 +17,10 @@ import pytest
 from controlplane import tls_gate
 from controlplane.ca import Authority
 from controlplane.tls_gate import TlsGate
-from protos.clock_floor import ClockFloor
-from protos.identity import CONTROL_PLANE_DNS, IdentityRole
 from protos.model import NodeName
 from protos.tls_files import load_tls_files
+from protos.trust.clock_floor import ClockFloor
+from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable

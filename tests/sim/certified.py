@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
-from protos.clock_floor import ClockFloor
-from protos.identity import IdentityRole
 from protos.tls_files import load_tls_files
+from protos.trust.clock_floor import ClockFloor
+from protos.trust.identity import IdentityRole
 from sidecar.announcement import Announcer
 from sidecar.start_session import signed, start_session
 from tests.sim.mesh import Mesh
@@ -17,8 +17,8 @@ from tests.sim.mesh import Mesh
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.credential import SessionCredential
     from protos.tls_files import TlsFiles
+    from protos.trust.credential import SessionCredential
     from sidecar.core.crypto.session import OwnSession
     from tests.sim.mesh import Node
 

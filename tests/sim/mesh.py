@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TYPE_CHECKING
 
-from protos.credential import Aead
 from protos.model import (
     ALL_CALLS,
     Candidate,
@@ -25,7 +24,8 @@ from protos.model import (
     SessionId,
     Version,
 )
-from protos.pair_token import pair_token
+from protos.trust.credential import Aead
+from protos.trust.pair_token import pair_token
 from sidecar.announcement import Announcer
 from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import RequestId

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
-from protos.credential import Aead
 from protos.model import PeerSet, Version
+from protos.trust.credential import Aead
 from sidecar.core.crypto import aead
 from sidecar.core.link.link import Link
 from sidecar.core.path.key_exchange import KeyLimits

@@ -10,9 +10,9 @@ import pytest
 
 from controlplane.ca.authority import Authority
 from controlplane.ca.files import write_atomically, write_tls_files
-from protos.identity import IdentityRole
 from protos.model import Role
 from protos.tls_files import CRL_FILE, TlsWatch, load_tls_files
+from protos.trust.identity import IdentityRole
 from sidecar.announcement import Announcer
 from sidecar.core.base.values import Priority
 from sidecar.core.engine.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from protos.credential import SessionCredential
     from protos.model import NodeName
+    from protos.trust.credential import SessionCredential
     from sidecar.core.wire.messages import RevocationMessage
     from tests.sim.mesh import Node
 

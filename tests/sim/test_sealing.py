@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.credential import Aead
 from protos.model import InterfaceId, PeerSet, Version
+from protos.trust.credential import Aead
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.wire import frame
 from sidecar.core.wire.introduction import encode_introduction
@@ -19,7 +19,7 @@ from tests.sim.mesh import Mesh, Node
 from tests.sim.test_mesh import assert_each_answered_once
 
 if TYPE_CHECKING:
-    from protos.credential import SessionCredential
+    from protos.trust.credential import SessionCredential
 
 
 def pair(seed: int = 1, limits: KeyLimits | None = None) -> tuple[Mesh, Node, Node]:

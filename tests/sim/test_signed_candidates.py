@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.candidate_signature import sign_candidates
 from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, PeerSet, Version
+from protos.trust.candidate_signature import sign_candidates
 from tests.sim.certified import CertifiedMesh
 
 if TYPE_CHECKING:

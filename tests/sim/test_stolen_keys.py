@@ -26,8 +26,8 @@ from tests.sim.test_sealing import dropped, phases
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.credential import Aead
     from protos.model import Address, Peer
+    from protos.trust.credential import Aead
     from sidecar.core.crypto.key_schedule import PairKeys
 
 pytestmark = pytest.mark.audit("sec-9")

@@ -24,9 +24,6 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from protos.base.errors import DecodeError
-from protos.candidate_signature import signed_bytes, verify_candidates
-from protos.credential import Aead, SessionCredential, decode_credential, session_number, verify
-from protos.identity import Trust
 from protos.model import (
     PROTOCOL_VERSION,
     Candidate,
@@ -37,7 +34,10 @@ from protos.model import (
     Role,
     ServiceName,
 )
-from protos.pair_token import pair_token
+from protos.trust.candidate_signature import signed_bytes, verify_candidates
+from protos.trust.credential import Aead, SessionCredential, decode_credential, session_number, verify
+from protos.trust.identity import Trust
+from protos.trust.pair_token import pair_token
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.crypto import session

@@ -19,7 +19,6 @@ from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
 from bench.null_cipher import install
 from protos import interpreter
-from protos.clock_floor import ClockFloor
 from protos.model import (
     ALL_CALLS,
     Assignment,
@@ -37,7 +36,8 @@ from protos.model import (
     SessionId,
     Version,
 )
-from protos.pair_token import pair_token
+from protos.trust.clock_floor import ClockFloor
+from protos.trust.pair_token import pair_token
 from sidecar.config import SidecarConfig
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine.engine import EngineConfig
@@ -49,7 +49,7 @@ from sidecar.start_session import start_session
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.credential import SessionCredential
+    from protos.trust.credential import SessionCredential
     from sidecar.core.seam.application import ApplicationEvent
 
 SERVICE = ServiceName("/bench")

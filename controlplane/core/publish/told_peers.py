@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, overload
 
-from protos.pair_token import pair_token
+from protos.trust.pair_token import pair_token
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.registry.registry import Refusal
 from protos.base.errors import DecodeError
-from protos.credential import decode_credential, verify
+from protos.trust.credential import decode_credential, verify
 
 if TYPE_CHECKING:
-    from protos.identity import Identity
     from protos.model import Registration
+    from protos.trust.identity import Identity
 
 
 def check_claims(registration: Registration, identity: Identity, certificate: bytes) -> Refusal | None:

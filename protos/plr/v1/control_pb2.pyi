@@ -159,14 +159,14 @@ class Register(_message.Message):
     role: _types_pb2.Role.ValueType
     session: _builtins.int
     token: _builtins.bytes
-    """Its own secret, for the control plane alone; peers are told what follows from it for each (protos/pair_token.py)."""
+    """Its own secret, for the control plane alone; peers are told what follows from it for each (protos/trust/pair_token.py)."""
     incarnation: _builtins.int
     software_version: _builtins.str
     peers_version: _builtins.int
     """What it holds already (from disk or an earlier stream); 0 means nothing."""
     mapping_version: _builtins.int
     credential: _builtins.bytes
-    """What this run says of itself to its peers, signed by itself (protos/credential.py)."""
+    """What this run says of itself to its peers, signed by itself (protos/trust/credential.py)."""
     region: _builtins.str
     """Of a cloud: where it stands; clouds with the same one fail together. Empty: not known."""
     incremental: _builtins.bool
@@ -213,7 +213,7 @@ class Candidates(_message.Message):
     """Grows with each message of a session."""
     signature: _builtins.bytes
     """Of the session's certificate, over candidates, serial and session, for the peers to check
-    (protos/candidate_signature.py). None in insecure mode.
+    (protos/trust/candidate_signature.py). None in insecure mode.
     """
     @_builtins.property
     def candidates(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.Candidate]: ...

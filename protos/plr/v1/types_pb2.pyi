@@ -289,12 +289,12 @@ class Peer(_message.Message):
     session: _builtins.int
     """Identifies this run of the sidecar in the header of every datagram it sends."""
     token: _builtins.bytes
-    """What it introduces itself with to the sidecar that this is sent to, and to no other (protos/pair_token.py)."""
+    """What it introduces itself with to the sidecar that this is sent to, and to no other (protos/trust/pair_token.py)."""
     incarnation: _builtins.int
     """Grows with every start of the sidecar."""
     draining: _builtins.bool
     credential: _builtins.bytes
-    """What this run says of itself, signed by itself (protos/credential.py); opaque to the control plane, which relays it."""
+    """What this run says of itself, signed by itself (protos/trust/credential.py); opaque to the control plane, which relays it."""
     may_call_everything: _builtins.bool
     """No policy is in force: it may call everything."""
     candidates_serial: _builtins.int

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
 from protos.base.errors import DecodeError
-from protos.candidate_signature import verify_candidates
-from protos.credential import SessionCredential, decode_credential
-from protos.identity import CertificateError
 from protos.model import Candidate, SessionId
+from protos.trust.candidate_signature import verify_candidates
+from protos.trust.credential import SessionCredential, decode_credential
+from protos.trust.identity import CertificateError
 from sidecar.core.crypto.key_schedule import pair_keys
 
 if TYPE_CHECKING:

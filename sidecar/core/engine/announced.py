@@ -12,8 +12,8 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.base.errors import DecodeError
-from protos.identity import REVOKED, CertificateError
 from protos.model import MAX_CANDIDATES_OF_INTERFACE
+from protos.trust.identity import REVOKED, CertificateError
 
 if TYPE_CHECKING:
     from protos.model import Candidate, InterfaceId, NodeName, Peer

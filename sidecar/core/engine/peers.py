@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.base.errors import DecodeError
-from protos.identity import CertificateError
 from protos.model import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
+from protos.trust.identity import CertificateError
 from sidecar.core.engine.announced import Announced
 from sidecar.core.engine.verification_budget import VerificationBudget
 from sidecar.core.seam.links import LinkPeer

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.model import Role
-from protos.pair_token import pair_token
+from protos.trust.pair_token import pair_token
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
@@ -28,8 +28,8 @@ from sidecar.core.wire.frame import (
 from sidecar.core.wire.introduction import INTRODUCTION_BYTES, encode_introduction
 
 if TYPE_CHECKING:
-    from protos.credential import SessionCredential
     from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
+    from protos.trust.credential import SessionCredential
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.path.path import Path
     from sidecar.core.path.send_queue import Run
@@ -60,7 +60,7 @@ class LinkIdentity:
     role: Role
     session: SessionId
     token: bytes = field(repr=False)
-    """Our own; each peer knows what follows from it for that peer (`protos/pair_token.py`)."""
+    """Our own; each peer knows what follows from it for that peer (`protos/trust/pair_token.py`)."""
     credential: bytes = field(repr=False)
     """Encoded."""
 

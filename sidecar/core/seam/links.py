@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from protos.credential import SessionCredential
     from protos.model import Address, InterfaceId, NodeName, SessionId
+    from protos.trust.credential import SessionCredential
     from sidecar.core.base.values import PathId, PathState
     from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.message.outbound import OutboundMessage

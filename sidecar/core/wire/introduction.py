@@ -4,10 +4,10 @@ Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
 
     hello id (8 bytes)        = Expand(token, "plr 2 hello id")
     sealed:  probe id (64), offer of keys (phase (32), public key (32 bytes), proof (16 bytes); all 0: none),
-             credential (protos/credential.py)
+             credential (protos/trust/credential.py)
     tag (16 bytes)
 
-The token is the sender's for this receiver (`protos/pair_token.py`): stable, and known to these two and the control
+The token is the sender's for this receiver (`protos/trust/pair_token.py`): stable, and known to these two and the control
 plane alone. It is a gate that costs a stranger's datagram a look into a table. Behind it stands ChaCha20-Poly1305 with
 a key from Expand(token, "plr 2 introduction" | session | sender's interface | receiver's interface | receiver's name),
 the clear bytes and the hello id as associated data, and the nonce of every datagram (frame.py): one key for each path
@@ -31,7 +31,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from protos.base.errors import DecodeError
-from protos.credential import decode_credential
+from protos.trust.credential import decode_credential
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import expand
 from sidecar.core.wire.frame import (
@@ -46,8 +46,8 @@ from sidecar.core.wire.frame import (
 )
 
 if TYPE_CHECKING:
-    from protos.credential import SessionCredential
     from protos.model import NodeName
+    from protos.trust.credential import SessionCredential
 
 HELLO_BYTES = 8
 INTRODUCTION_FLAGS = SEALED_FLAG | INTRODUCTION_FLAG

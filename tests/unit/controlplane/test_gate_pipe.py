@@ -12,8 +12,8 @@ import pytest
 
 from controlplane.ca import Authority
 from controlplane.gate_pipe import PipeEnd
-from protos.identity import IdentityRole
 from protos.model import NodeName
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from controlplane.ca import Authority
-from protos.clock_floor import SLACK_S, ClockFloor
-from protos.identity import EXPIRED, CertificateError, IdentityRole, Trust
+from protos.trust.clock_floor import SLACK_S, ClockFloor
+from protos.trust.identity import EXPIRED, CertificateError, IdentityRole, Trust
 
 pytestmark = pytest.mark.audit("sec-9")
 

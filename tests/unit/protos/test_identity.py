@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from controlplane.ca import Authority, Validity
-from protos.identity import (
+from protos.trust.identity import (
     CONTROL_PLANE_DNS,
     MAX_CA_CERTIFICATES,
     MAX_CERTIFICATE_BYTES,

@@ -7,7 +7,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
 from protos.model import TOKEN_BYTES, NodeName, Role
-from protos.pair_token import pair_token
+from protos.trust.pair_token import pair_token
 
 TOKEN, ROBOT = bytes(range(16)), NodeName("robot-1")
 

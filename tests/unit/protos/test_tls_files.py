@@ -13,9 +13,9 @@ from cryptography.hazmat.primitives.serialization import BestAvailableEncryption
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.base.errors import ConfigError
-from protos.identity import CertificateError, IdentityRole
 from protos.model import NodeName
 from protos.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
+from protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.ca import Authority
-from protos.candidate_signature import verify_candidates
 from protos.convert import parse_sidecar_message, sidecar_message_to_proto
-from protos.identity import IdentityRole
 from protos.model import Candidate, CandidateKind, CandidateSet, InterfaceId, InterfaceName, SessionId
 from protos.preferences import InterfaceLabel
 from protos.tls_files import load_tls_files
+from protos.trust.candidate_signature import verify_candidates
+from protos.trust.identity import IdentityRole
 from sidecar.announcement import Announcer
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import yaml
 from pydantic import ValidationError
 
 from protos.base.errors import ConfigError
-from protos.identity import Identity, IdentityRole
 from protos.model import InterfaceName, NodeName, Role
+from protos.trust.identity import Identity, IdentityRole
 from sidecar.config import (
     DEFAULT_CLOUD_UDP_PORT,
     LogLevel,

@@ -12,11 +12,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.base.errors import ConfigError, DecodeError
-from protos.clock_floor import ClockFloor
-from protos.credential import SessionCredential, verify
-from protos.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, CertificateError, IdentityRole, Trust
 from protos.model import Peer, Role, SessionId
 from protos.tls_files import TlsFiles, load_tls_files
+from protos.trust.clock_floor import ClockFloor
+from protos.trust.credential import SessionCredential, verify
+from protos.trust.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, CertificateError, IdentityRole, Trust
 from sidecar import start_session as module
 from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
 from sidecar.start_session import preferred_aead, signed, start_session

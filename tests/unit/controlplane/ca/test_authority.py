@@ -9,7 +9,7 @@ from controlplane.ca import Authority, AuthorityError
 from controlplane.ca.authority import BACKDATE_S
 from controlplane.ca.request import build_request, parse_request
 from protos.base.errors import DecodeError
-from protos.identity import CertificateError, IdentityRole, Trust
+from protos.trust.identity import CertificateError, IdentityRole, Trust
 
 DAY_S = 86_400.0
 

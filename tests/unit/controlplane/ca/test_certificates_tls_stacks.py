@@ -10,7 +10,7 @@ import pytest
 
 from controlplane.ca import Authority, Issued, Validity
 from controlplane.ca.files import write_tls_files
-from protos.identity import CONTROL_PLANE_DNS, IdentityRole
+from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,8 +11,8 @@ import pytest
 
 from controlplane import cli
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
-from protos.identity import CertificateError, IdentityRole
 from protos.tls_files import load_tls_files
+from protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
     from tests.unit.controlplane.ca.shell import Shell

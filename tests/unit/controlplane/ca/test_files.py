@@ -10,7 +10,7 @@ import pytest
 
 from controlplane.ca import Authority
 from controlplane.ca.files import write_atomically, write_tls_files
-from protos.identity import IdentityRole
+from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

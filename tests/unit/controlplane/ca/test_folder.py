@@ -15,7 +15,7 @@ from controlplane.ca.actions import refuse_taken
 from controlplane.ca.files import write_atomically
 from controlplane.ca.folder import AuthorityFolder, Protection
 from protos.base.errors import ConfigError
-from protos.identity import CertificateError, IdentityRole, Trust
+from protos.trust.identity import CertificateError, IdentityRole, Trust
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,7 +17,7 @@ from controlplane.ca.files import write_atomically
 from controlplane.ca.folder import AuthorityFolder
 from controlplane.ca.index import Entry
 from protos.base.errors import ConfigError
-from protos.identity import MAX_CA_CERTIFICATES, CertificateError, IdentityRole, Trust
+from protos.trust.identity import MAX_CA_CERTIFICATES, CertificateError, IdentityRole, Trust
 from tests.unit.controlplane.ca.test_authority import DAY_S, Clock
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from controlplane.ca.certificates import alternative_names, generate_key
 from controlplane.ca.key_file import clear_pem
 from controlplane.ca.request import MAX_REQUEST_BYTES, build_request, fingerprint, parse_request
 from protos.base.errors import DecodeError
-from protos.identity import CONTROL_PLANE_DNS, IdentityRole
+from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -20,7 +20,7 @@ from protos.model import (
     ServiceOffer,
     SessionId,
 )
-from protos.pair_token import pair_token
+from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import PathId, Priority, RequestId
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.link.datagrams import LinkIdentity

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.ca import Authority
-from protos.identity import IdentityRole
 from protos.model import InterfaceName
 from protos.tls_files import load_tls_files
+from protos.trust.identity import IdentityRole
 from sidecar.doctor import node_checks
 from sidecar.doctor.finding import Finding, Level
 from sidecar.doctor.host import ClockState, reverse_path_filter, unit_environment

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
     ALL_CALLS,
     MAX_PEERS,
@@ -34,7 +33,8 @@ from protos.model import (
     SessionId,
     Version,
 )
-from protos.pair_token import pair_token
+from protos.trust.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
+from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import PathState, RequestId
 from sidecar.core.engine.engine import EngineConfig
 from sidecar.core.link.datagrams import Batch, LinkIdentity
@@ -49,7 +49,7 @@ from tests.sessions import session_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.credential import SessionCredential
+    from protos.trust.credential import SessionCredential
     from sidecar.core.link.pinging import Pong
 
 SERVICE, TYPE = ServiceName("/echo"), "t/srv/Echo"

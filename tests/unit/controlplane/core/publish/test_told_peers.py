@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 from controlplane.core.publish.told_peers import ToldPeers
 from protos.model import ALL_CALLS, NodeName, Peer, Role, SessionId
-from protos.pair_token import pair_token
+from protos.trust.pair_token import pair_token
 from tests.unit.controlplane.samples import interfaces, offer
 
 ROBOT = NodeName("robot")

@@ -9,9 +9,9 @@ import pytest
 from controlplane.ca import Authority, Issued
 from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from controlplane.core.registry.registry import Refusal
-from protos.credential import Aead, SessionCredential, session_number
-from protos.identity import Identity, IdentityRole, Trust
 from protos.model import NodeName, Registration, Role
+from protos.trust.credential import Aead, SessionCredential, session_number
+from protos.trust.identity import Identity, IdentityRole, Trust
 from tests.unit.controlplane.samples import registration as sample
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from cryptography.exceptions import InvalidTag
 
-from protos.credential import Aead
+from protos.trust.credential import Aead
 from sidecar.core.crypto.aead import KEY_BYTES, NONCE_BYTES, TAG_BYTES, choose, make_cipher
 
 KEY, NONCE, CLEAR = bytes(range(KEY_BYTES)), bytes(range(NONCE_BYTES)), b"clear"

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.credential import SessionCredential, decode_credential
 from protos.model import NodeName, Peer, Role, SessionId
+from protos.trust.credential import SessionCredential, decode_credential
 from sidecar.core.crypto import session as session_module
 from sidecar.core.crypto.session import OwnSession
 from tests.sessions import credential_of, private_key, session_of

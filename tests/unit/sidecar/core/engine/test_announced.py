@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.candidate_signature import sign_candidates, verify_candidates
-from protos.clock_floor import ClockFloor
-from protos.identity import IdentityRole
 from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, NodeName, Peer, PeerSet, Role, Version
+from protos.trust.candidate_signature import sign_candidates, verify_candidates
+from protos.trust.clock_floor import ClockFloor
+from protos.trust.identity import IdentityRole
 from sidecar.core.crypto import session
 from sidecar.core.engine import announced as module
 from sidecar.core.engine.announced import Announced

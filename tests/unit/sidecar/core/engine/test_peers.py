@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.model import (
     MAX_PEERS,
     NO_POLICY,
@@ -29,6 +28,7 @@ from protos.model import (
     SessionId,
     Version,
 )
+from protos.trust.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
 from sidecar.core.crypto.session import OwnSession
 from sidecar.core.engine.peers import RESTART_GAP_S, Peers
 from sidecar.core.seam.links import PeerRestarted
@@ -36,7 +36,7 @@ from tests.sessions import credential_of, private_key, session_of, with_credenti
 from tests.unit.sidecar.core.builders import ECHO, A, B, peer
 
 if TYPE_CHECKING:
-    from protos.credential import SessionCredential
+    from protos.trust.credential import SessionCredential
 
 OWN = session_of("robot-1", Role.ROBOT, 99)
 HELD = peer(A, session=1), peer(B, session=2)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.credential import decode_credential
 from protos.model import POLICY_PENDING, NodeName, PeerSet, Role, SessionId, Version
+from protos.trust.credential import decode_credential
 from sidecar.core.crypto.session import OwnSession
 from sidecar.core.engine.peers import Peers
 from sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_AT_ONCE, LOOKS_PER_S
@@ -24,8 +24,8 @@ from tests.unit.sidecar.core.builders import A, B, peer
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.credential import SessionCredential
     from protos.model import Peer
+    from protos.trust.credential import SessionCredential
 
 HELD = peer(A, session=1), peer(B, session=2)
 FORGED, GENUINE = 9, 2

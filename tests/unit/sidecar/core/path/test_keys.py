@@ -7,8 +7,8 @@ import pytest
 from cryptography.exceptions import InvalidTag
 
 from protos.base.errors import DecodeError
-from protos.credential import Aead
 from protos.model import InterfaceId, Role
+from protos.trust.credential import Aead
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import proof_of_offer
 from sidecar.core.path.key_exchange import OTHER_OFFER_AFTER_S, KeyLimits

@@ -27,8 +27,8 @@ from cryptography.x509 import load_der_x509_certificate
 
 from protos.base.errors import DecodeError
 from protos.base.names import node_name
-from protos.identity import MALFORMED, UNTRUSTED, WRONG_ROLE, CertificateError, Identity, IdentityRole
 from protos.model import MAX_CREDENTIAL_BYTES, NodeName, Role, SessionId
+from protos.trust.identity import MALFORMED, UNTRUSTED, WRONG_ROLE, CertificateError, Identity, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable

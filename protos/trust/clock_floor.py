@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.identity import Trust
+    from protos.trust.identity import Trust
 
 SLACK_S = 300.0
 """A clock that is behind by no more is set a little; `plr ca` lets certificates begin as much in the past."""

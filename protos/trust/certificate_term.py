@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.base.durations import in_words
-from protos.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
+from protos.trust.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
 
 if TYPE_CHECKING:
     from protos.tls_files import TlsFiles

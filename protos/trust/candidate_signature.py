@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 from cryptography.exceptions import InvalidSignature
 
-from protos.credential import SIGNATURE_ALGORITHM, signer_key
-from protos.identity import UNTRUSTED, CertificateError
 from protos.model import CandidateKind
+from protos.trust.credential import SIGNATURE_ALGORITHM, signer_key
+from protos.trust.identity import UNTRUSTED, CertificateError
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec

@@ -1,0 +1,1 @@
+"""Who a node is and what it signed: certificates, credentials, tokens. Imports `base` and `model`."""
