@@ -25,7 +25,7 @@ from ipaddress import IPv6Address
 from typing import TYPE_CHECKING, Any
 
 from controlplane.core.stun.responder import StunOutcome, StunResponder
-from protos.stun import MAX_MESSAGE_BYTES
+from protos.stun.codec import MAX_MESSAGE_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

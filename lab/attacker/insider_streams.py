@@ -23,7 +23,7 @@ from lab.attacker.orders import ORDERS, TALLY, Commander, Stage
 from lab.attacker.registration import registration
 from lab.attacker.tally import Tally
 from protos.model import Role
-from protos.stun import MessageClass, StunMessage, encode
+from protos.stun.codec import MessageClass, StunMessage, encode
 from protos.tls_files import load_tls_files
 
 if TYPE_CHECKING:

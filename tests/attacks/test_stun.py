@@ -14,7 +14,7 @@ import pytest
 from controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
 from lab.attacker.wire import Captured
 from lab.system import STUN_PORT
-from protos.stun import MessageClass, StunMessage, decode, encode, is_stun
+from protos.stun.codec import MessageClass, StunMessage, decode, encode, is_stun
 from tests.attacks.world import ATTACKER, ATTACKERS_PORT, World, is_ours, send_all
 
 if TYPE_CHECKING:

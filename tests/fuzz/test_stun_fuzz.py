@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from controlplane.core.stun.responder import StunOutcome, StunResponder
 from protos.base.errors import DecodeError
-from protos.stun import (
+from protos.stun.codec import (
     HEADER_BYTES,
     MAX_TEXT_CHARACTERS,
     Attribute,

@@ -24,7 +24,7 @@ from protos.model import (
     Report,
 )
 from protos.status import SyncState
-from protos.stun import MessageClass, StunMessage, decode, encode
+from protos.stun.codec import MessageClass, StunMessage, decode, encode
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
 from tests.unit.controlplane.samples import PLAN, histogram, path
 

@@ -18,7 +18,7 @@ import pytest
 
 from controlplane.core.stun.responder import StunOutcome
 from controlplane.stun_server import SHARE, StunServer, start_stun_server
-from protos.stun import MessageClass, StunMessage, decode, encode
+from protos.stun.codec import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun.client import StunClient
 from sidecar.core.stun.events import Mapped, StunEvent
 from tests.free_ports import free_port

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.stun.source_limits import SourceLimits
 from protos.base.errors import DecodeError
-from protos.stun import MessageClass, StunMessage, decode, encode, is_stun
+from protos.stun.codec import MessageClass, StunMessage, decode, encode, is_stun
 
 if TYPE_CHECKING:
     from protos.model import Address

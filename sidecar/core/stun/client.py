@@ -13,7 +13,7 @@ from ipaddress import ip_address
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.base.errors import DecodeError
-from protos.stun import MessageClass, decode, is_stun
+from protos.stun.codec import MessageClass, decode, is_stun
 from sidecar.core.stun.events import StunDrop
 from sidecar.core.stun.family import StunClientConfig, StunFamilyClient, StunOutbox
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from typing import TYPE_CHECKING
 
-from protos.stun import TRANSACTION_ID_BYTES, MessageClass, StunMessage
+from protos.stun.codec import TRANSACTION_ID_BYTES, MessageClass, StunMessage
 from sidecar.core.stun.events import Failed, Mapped, MappingChanged, StunDrop, StunEvent
 from sidecar.core.stun.transaction import Retransmission, StunTransaction
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.stun import MessageClass, StunMessage, encode
+from protos.stun.codec import MessageClass, StunMessage, encode
 
 if TYPE_CHECKING:
     from protos.model import Address

@@ -9,7 +9,7 @@ import struct
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.stun import (
+from protos.stun.codec import (
     MAX_MESSAGE_BYTES,
     MAX_UNKNOWN_ATTRIBUTES,
     MessageClass,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from typing import TYPE_CHECKING
 
-from protos.stun import MessageClass, StunMessage, decode, encode
+from protos.stun.codec import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun.client import StunClient
 
 if TYPE_CHECKING:

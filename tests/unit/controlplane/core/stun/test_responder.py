@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from controlplane.core.stun.responder import StunOutcome, StunResponder
 from controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
-from protos.stun import MessageClass, StunMessage, decode, encode
+from protos.stun.codec import MessageClass, StunMessage, decode, encode
 
 TRANSACTION_ID = bytes(range(12))
 SOURCE = ("198.51.100.7", 40000)

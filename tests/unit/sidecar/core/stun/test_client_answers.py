@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.stun import MessageClass, StunMessage, decode, encode
+from protos.stun.codec import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun.events import Failed, Mapped, StunDrop
 from tests.unit.sidecar.stun_network import (
     MOVED,
