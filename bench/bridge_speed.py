@@ -34,8 +34,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_for_type_support
 from std_srvs.srv import Empty
 
-from protos import interpreter
 from protos.model import NodeName, Role, ServiceName, SessionId
+from protos.program import interpreter
 from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived

@@ -21,25 +21,25 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos import extras, interpreter, program
+from protos.program import endings, extras, interpreter
 
 with extras.required("plr-controlplane", "controlplane"):
     from controlplane.certificates import load_own_files
     from controlplane.config import load_config, refuse_exposed
-    from protos.arguments import OneLineParser
     from protos.base.errors import ConfigError
     from protos.base.printable import escaped
-    from protos.log_lines import line_formatter
-    from protos.logging_setup import Logging
+    from protos.program.arguments import OneLineParser
+    from protos.program.log_lines import line_formatter
+    from protos.program.logging_setup import Logging
+    from protos.program.version_option import ShowVersion, describe
     from protos.trust.certificate_term import term_problem
-    from protos.version_option import ShowVersion, describe
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from controlplane.config import ControlPlaneConfig
     from controlplane.server import Addresses
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -53,7 +53,7 @@ _NO_STUN_SERVERS = (
 log = logging.getLogger("controlplane")
 
 
-@program.ends_quietly("plr-controlplane")
+@endings.ends_quietly("plr-controlplane")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     arguments = _parser().parse_args(argv)
@@ -151,7 +151,7 @@ def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
 async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> None:
     from controlplane.policy_reload import PolicyReload
     from controlplane.server import serve
-    from protos.notifier import Notifier
+    from protos.program.notifier import Notifier
 
     interpreter.share()
     stop = asyncio.Event()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 from protos.base.errors import ConfigError
 from protos.convert.fields import MAX_CRL_BYTES
+from protos.program.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
 from protos.revocation_views import revocation_set
-from protos.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:

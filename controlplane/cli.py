@@ -26,14 +26,14 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from protos import extras
-from protos.arguments import OneLineParser
-from protos.version_option import ShowVersion
+from protos.program import extras
+from protos.program.arguments import OneLineParser
+from protos.program.version_option import ShowVersion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from protos.arguments import Commands
+    from protos.program.arguments import Commands
 
 # Each command imports what it needs when it is the one that is asked for: `plr status` is used where each second
 # counts, and what all commands import together takes longer than its answer.
@@ -138,7 +138,7 @@ _ON_A_NODE = {
     "ping": "on a robot or a server: how long each path to a peer takes",
     "bugreport": "on a robot or a server: a tar file for whoever helps",
 }
-"""The sidecar's, which never come here (protos/command_line.py): to be listed, and found by who mistypes one."""
+"""The sidecar's, which never come here (protos/program/command_line.py): to be listed, and found by who mistypes one."""
 
 
 if __name__ == "__main__":

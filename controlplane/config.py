@@ -13,8 +13,15 @@ from controlplane.pattern_fields import InterfacePatterns, NodePatterns, one_or_
 from controlplane.policy_config import PolicyConfig
 from protos.base.errors import ConfigError
 from protos.base.host_port import is_loopback
-from protos.config_fields import AbsolutePath, ListenAddress, RemoteAddress, TlsDir, check_security, refuse_duplicates
-from protos.config_file import parse_yaml, read_text, validate
+from protos.program.config_fields import (
+    AbsolutePath,
+    ListenAddress,
+    RemoteAddress,
+    TlsDir,
+    check_security,
+    refuse_duplicates,
+)
+from protos.program.config_file import parse_yaml, read_text, validate
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,7 +12,7 @@ from controlplane.config import ControlPlaneConfig
 if TYPE_CHECKING:
     import argparse
 
-    from protos.arguments import Commands
+    from protos.program.arguments import Commands
 
 EXIT_OK = 0
 

@@ -23,11 +23,11 @@ from typing import IO, TYPE_CHECKING
 
 from controlplane.core.explain.event_memory import EventMemory
 from controlplane.event_lines import decode, encode
-from protos import own_folder
 from protos.base.errors import DecodeError
 from protos.base.names import clean_text
 from protos.fleet_events import EventKind, EventLogState, FleetEvent
-from protos.own_folder import OwnFolder
+from protos.program import own_folder
+from protos.program.own_folder import OwnFolder
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 from controlplane import event_lines, event_text
 from controlplane.admin_client import AskError, add_options, ask
-from protos.arguments import checked, whole
 from protos.base.names import node_name
 from protos.convert import event_list_from_proto, event_query_to_proto
 from protos.fleet_events import EventQuery
+from protos.program.arguments import checked, whole
 
 if TYPE_CHECKING:
-    from protos.arguments import Commands
     from protos.fleet_events import EventList
+    from protos.program.arguments import Commands
 
 EXIT_OK = 0
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 from controlplane import explanation_text
 from controlplane.admin_client import AskError, add_options, ask
-from protos.arguments import checked
 from protos.base.names import node_name, service_name
 from protos.convert import explanation_from_proto
 from protos.plr.v1 import admin_pb2
+from protos.program.arguments import checked
 
 if TYPE_CHECKING:
-    from protos.arguments import Commands
     from protos.explanation import Explanation
     from protos.plr.v1 import admin_pb2_grpc
+    from protos.program.arguments import Commands
 
 EXIT_OK = 0
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import resource
 from pathlib import Path
 
-from protos import interpreter
+from protos.program import interpreter
 
 SET_ASIDE_EVERY_S = 0.1
 """A fleet of 1,000 makes some thousand objects in this time, which take a millisecond."""

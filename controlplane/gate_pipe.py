@@ -112,5 +112,5 @@ class PipeEnd(asyncio.Protocol):
             return
         other.close()
         if other.lost:
-            # The garbage collector does not look at what has been there for long (`protos.interpreter`).
+            # The garbage collector does not look at what has been there for long (`protos.program.interpreter`).
             self._other = other._other = None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from protos.trust.identity import UNTRUSTED
 
 if TYPE_CHECKING:
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 NO_CERTIFICATE = "no_certificate"
 OLD_TLS = "old_tls"

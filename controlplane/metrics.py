@@ -17,8 +17,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from controlplane import handshakes, limits, tls_gate
 from controlplane.fleet_metrics import FleetCollector
 from protos.fleet_events import EventLogState
-from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind, Role
+from protos.program.metrics_server import MetricsServer
 from protos.revocation_views import revocation_gauges
 from protos.status import SyncState
 from protos.trust import identity

@@ -15,16 +15,16 @@ from controlplane.planning.plot import PlotError, draw
 from controlplane.planning.prospects import least_set
 from controlplane.planning.traces import TraceError, read_trace
 from controlplane.planning.workload import DEFAULT, Compute, Workload
-from protos import extras
-from protos.arguments import whole
 from protos.base.printable import escaped
+from protos.program import extras
+from protos.program.arguments import whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from controlplane.planning.prospects import Source
     from controlplane.planning.traces import RecordedPaths
-    from protos.arguments import Commands
+    from protos.program.arguments import Commands
 
 EXIT_MET = 0
 EXIT_NOT_MET = 1

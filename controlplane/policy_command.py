@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from controlplane.config import load_config
 from controlplane.core.policy.explain import explain
-from protos.arguments import checked
 from protos.base.errors import ConfigError
 from protos.base.names import node_name, service_name
+from protos.program.arguments import checked
 
 if TYPE_CHECKING:
     import argparse
 
-    from protos.arguments import Commands
+    from protos.program.arguments import Commands
 
 EXIT_ALLOWED = 0
 EXIT_DENIED = 1

@@ -28,15 +28,15 @@ from controlplane.stun_server import start_stun_server
 from controlplane.tls_gate import TlsGate
 from protos.base.host_port import split_host_port
 from protos.fleet_events import EventKind
+from protos.program.version_option import describe
 from protos.trust.clock_floor import ClockFloor
-from protos.version_option import describe
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from controlplane.config import ControlPlaneConfig
     from controlplane.policy_reload import PolicyReload
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,6 @@ import grpc
 
 from controlplane import event_text, status_table
 from controlplane.admin_client import EXIT_FAILED, AskError, add_options, ask
-from protos.arguments import checked
 from protos.base.errors import DecodeError
 from protos.base.names import node_name
 from protos.convert import (
@@ -25,15 +24,16 @@ from protos.convert import (
 )
 from protos.convert.fields import MAX_SIDECARS
 from protos.plr.v1 import admin_pb2
+from protos.program.arguments import checked
 from protos.status import StatusQuery
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from protos.arguments import Commands
     from protos.fleet_events import DepartedSidecar
     from protos.model import NodeName
     from protos.plr.v1 import admin_pb2_grpc
+    from protos.program.arguments import Commands
     from protos.status import SidecarStatus
 
 EXIT_OK = 0

@@ -15,18 +15,18 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos import commit, extras, program
+from protos.program import commit, endings, extras
 
 with extras.required("plr-sidecar", "sidecar"):
-    from protos.arguments import OneLineParser
     from protos.base.errors import ConfigError, StartError
     from protos.base.printable import escaped
-    from protos.log_lines import line_formatter
-    from protos.logging_setup import Logging
     from protos.model import Role
-    from protos.tls_files import load_tls_files
+    from protos.program.arguments import OneLineParser
+    from protos.program.log_lines import line_formatter
+    from protos.program.logging_setup import Logging
+    from protos.program.tls_files import load_tls_files
+    from protos.program.version_option import ShowVersion
     from protos.trust.certificate_term import term_problem
-    from protos.version_option import ShowVersion
     from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
     from sidecar.ros import environment
     from sidecar.stop_request import StopRequest
@@ -64,7 +64,7 @@ exit codes:
 """
 
 
-@program.ends_quietly(PROGRAM)
+@endings.ends_quietly(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     options = _parser().parse_args(arguments)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from protos.model import Candidate, InterfaceName, SessionId
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from protos.base.errors import ConfigError
 from protos.base.host_port import is_loopback
-from protos.config_fields import (
+from protos.model import NodeName, Role, ServiceName
+from protos.preferences import DEFAULT_CHARGE, InterfaceLabel
+from protos.program.config_fields import (
     AbsolutePath,
     IpAddress,
     ListenAddress,
@@ -22,9 +24,7 @@ from protos.config_fields import (
     check_security,
     refuse_duplicates,
 )
-from protos.config_file import key_path, parse_yaml, read_text, validate
-from protos.model import NodeName, Role, ServiceName
-from protos.preferences import DEFAULT_CHARGE, InterfaceLabel
+from protos.program.config_file import key_path, parse_yaml, read_text, validate
 from protos.trust.identity import IdentityRole
 from sidecar.config_fields import (
     ControlPlaneAddresses,

@@ -9,7 +9,7 @@ import grpc
 from protos.trust.identity import CONTROL_PLANE_DNS
 
 if TYPE_CHECKING:
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 KEEPALIVE_TIME_MS = 10_000
 """Ping this often: finds out about a control plane that hangs while its kernel acknowledges, and keeps NAT bindings for

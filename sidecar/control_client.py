@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import grpc
 
-from protos import tls_advice
 from protos.base.errors import DecodeError, UnknownKindError
 from protos.base.names import clean_text
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
 from protos.model import PeerSet, Report, ResourceKind, ServiceSet, Welcome
 from protos.plr.v1 import control_pb2_grpc
+from protos.program import tls_advice
 from sidecar.control_channel import REFUSALS, open_channel
 from sidecar.core.control.session import Apply
 from sidecar.core.control.watch import CHEAPER
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from protos.model import CandidateSet, RevocationSet
     from protos.plr.v1 import control_pb2
-    from protos.tls_files import TlsWatch
+    from protos.program.tls_files import TlsWatch
     from sidecar.control_hooks import ControlHooks
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.control.session import ControlSession, ControlStats

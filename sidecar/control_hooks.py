@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from protos.model import MappingSet, PeerSet, Report, Welcome
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from sidecar.core.base.report_scope import ReportScope
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protos.entry import end_by_ctrl_c
+from protos.program.entry import end_by_ctrl_c
 
 
 def main() -> int:

@@ -15,8 +15,8 @@ from prometheus_client.core import HistogramMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
 from protos.base.host_port import split_host_port
-from protos.metrics_server import MetricsServer
 from protos.model import ResourceKind
+from protos.program.metrics_server import MetricsServer
 from protos.revocation_views import revocation_gauges
 from sidecar.core.control.watch import LEAVE_CAUSES
 from sidecar.core.control.ways import DIAL_DROPS

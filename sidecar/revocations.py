@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from protos.model import NodeName, RevocationSet
-    from protos.tls_files import TlsWatch
+    from protos.program.tls_files import TlsWatch
     from protos.trust.identity import RevocationList
 
 log = logging.getLogger(__name__)

@@ -10,7 +10,6 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from protos import interpreter
 from protos.base.errors import StartError
 from protos.base.host_port import split_host_port
 from protos.model import (
@@ -25,8 +24,9 @@ from protos.model import (
     ServiceSet,
     Version,
 )
-from protos.notifier import Notifier
-from protos.tls_files import TlsWatch, load_tls_files
+from protos.program import interpreter
+from protos.program.notifier import Notifier
+from protos.program.tls_files import TlsWatch, load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from sidecar.announcement import Announcer
 from sidecar.control_client import ControlClient
@@ -48,7 +48,6 @@ from sidecar.unmet_services import UnmetServices, told, told_mismatched, told_un
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from protos.metrics_server import MetricsServer
     from protos.model import (
         Assignment,
         Candidate,
@@ -59,7 +58,8 @@ if TYPE_CHECKING:
         Report,
         Welcome,
     )
-    from protos.tls_files import TlsFiles
+    from protos.program.metrics_server import MetricsServer
+    from protos.program.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.base.values import PathState

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import NodeName, Role
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from protos.trust.clock_floor import ClockFloor
     from protos.trust.identity import Identity
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from protos.base.errors import DecodeError
 from protos.model import TOKEN_BYTES
-from protos.own_folder import OwnFolder
-from protos.regular_file import open_regular
+from protos.program.own_folder import OwnFolder
+from protos.program.regular_file import open_regular
 from sidecar.state_file import (
     MAX_FILE_BYTES,
     ControlAddresses,

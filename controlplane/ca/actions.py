@@ -20,8 +20,8 @@ from controlplane.ca.folder import AuthorityFolder, Protection
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE, PassphraseSource
 from protos.base.errors import ConfigError
 from protos.base.printable import escaped
-from protos.regular_file import read_regular
-from protos.tls_files import (
+from protos.program.regular_file import read_regular
+from protos.program.tls_files import (
     CA_FILE,
     CERTIFICATE_FILE,
     CRL_FILE,

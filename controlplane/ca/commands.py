@@ -12,17 +12,17 @@ from cryptography.x509 import ReasonFlags
 from controlplane.ca import actions, request_actions
 from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityError
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
-from protos import program
-from protos.arguments import checked
 from protos.base.errors import ConfigError, DecodeError
 from protos.base.names import node_name, text
 from protos.base.printable import escaped
+from protos.program import endings
+from protos.program.arguments import checked
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.arguments import Commands
+    from protos.program.arguments import Commands
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -260,7 +260,7 @@ def _tell_of_what_is_done(shown: str) -> None:
         sys.stdout.write(f"{shown}\n")
         sys.stdout.flush()
     except OSError as error:
-        program.print_no_more()
+        endings.print_no_more()
         sys.stderr.write(f"plr: done, but it cannot be printed ({error.strerror}): {shown.partition(chr(10))[0]}\n")
 
 

@@ -9,7 +9,7 @@ import stat
 import tempfile
 from typing import TYPE_CHECKING
 
-from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE
+from protos.program.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -27,8 +27,8 @@ from controlplane.ca.files import PRIVATE_FILE, PRIVATE_FOLDER, PUBLIC_FILE, wri
 from controlplane.ca.index import decode_index, encode_index
 from controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
 from protos.base.errors import ConfigError
-from protos.regular_file import read_regular
-from protos.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
+from protos.program.regular_file import read_regular
+from protos.program.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

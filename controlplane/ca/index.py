@@ -19,7 +19,7 @@ from pydantic import (
 
 from protos.base.errors import ConfigError
 from protos.base.names import node_name
-from protos.config_file import key_path
+from protos.program.config_file import key_path
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.base.errors import ConfigError
-from protos.tls_files import read_guarded
+from protos.program.tls_files import read_guarded
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,8 +18,8 @@ from controlplane.ca.key_file import clear_pem
 from controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_request, fingerprint, parse_request
 from protos.base.errors import ConfigError, DecodeError
 from protos.base.printable import escaped
-from protos.regular_file import read_regular
-from protos.tls_files import KEY_FILE
+from protos.program.regular_file import read_regular
+from protos.program.tls_files import KEY_FILE
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:

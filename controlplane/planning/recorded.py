@@ -18,7 +18,7 @@ from protos.base.errors import DecodeError
 from protos.convert import explanation_from_proto
 from protos.explanation import SAMPLE
 from protos.plr.v1 import admin_pb2
-from protos.regular_file import read_regular
+from protos.program.regular_file import read_regular
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -27,7 +27,7 @@ from lab.attacker.hostile_means import Means
 from lab.attacker.orders import ORDERS, TALLY, Commander, Stage
 from lab.attacker.tally import Tally
 from protos.model import ServiceName
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from sidecar import __main__ as sidecar
 from sidecar import runtime
 from sidecar.core.base.values import RejectReason, RequestId

@@ -23,13 +23,13 @@ from lab.attacker.orders import ORDERS, TALLY, Commander, Stage
 from lab.attacker.registration import registration
 from lab.attacker.tally import Tally
 from protos.model import Role
+from protos.program.tls_files import load_tls_files
 from protos.stun.codec import MessageClass, StunMessage, encode
-from protos.tls_files import load_tls_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 SILENT = 200
 """Connections held open at once without a word; half as many with the beginning of a handshake."""

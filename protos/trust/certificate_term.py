@@ -9,7 +9,7 @@ from protos.base.durations import in_words
 from protos.trust.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
 
 if TYPE_CHECKING:
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 SOON_S = 7 * 86_400.0
 """Before its end, a certificate is warned of for so long; the alert in deploy/prometheus fires as early."""

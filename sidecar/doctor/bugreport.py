@@ -30,11 +30,11 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from protos import commit
 from protos.base.errors import ConfigError
 from protos.base.host_port import split_host_port
 from protos.base.printable import escaped
-from protos.config_file import parse_yaml, read_text
+from protos.program import commit
+from protos.program.config_file import parse_yaml, read_text
 from sidecar.config import SidecarConfig
 from sidecar.doctor.command import as_json, as_text
 from sidecar.doctor.examination import examine

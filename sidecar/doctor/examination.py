@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from protos.base.errors import ConfigError, DecodeError
-from protos.config_file import parse_yaml, read_text
 from protos.model import NodeName, ServiceName
-from protos.regular_file import read_regular
-from protos.tls_files import load_tls_files
+from protos.program.config_file import parse_yaml, read_text
+from protos.program.regular_file import read_regular
+from protos.program.tls_files import load_tls_files
 from protos.trust.identity import Identity, IdentityRole
 from sidecar.config import load_config
 from sidecar.core.rules.service_rule import Rules
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from typing import TypeVar
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from sidecar.config import SidecarConfig
     from sidecar.doctor.finding import Finding
     from sidecar.doctor.running_checks import PathKey

@@ -11,7 +11,7 @@ from sidecar.doctor.finding import duration, fail, ok, warn
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from protos.trust.identity import Identity
     from sidecar.doctor.finding import Finding
     from sidecar.doctor.host import ClockState

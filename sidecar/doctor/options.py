@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from protos.arguments import OneLineParser
+from protos.program.arguments import OneLineParser
 from sidecar.doctor.examination import DEFAULT_CONFIG, Where
 
 

@@ -21,10 +21,10 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from protos.arguments import checked, number, whole
 from protos.base.errors import ConfigError, DecodeError
 from protos.base.names import interface_name, node_name
 from protos.base.printable import escaped
+from protos.program.arguments import checked, number, whole
 from sidecar.core.link.pinging import LEAST_BYTES
 from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 from sidecar.doctor.examination import connect, read_config

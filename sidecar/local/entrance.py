@@ -15,7 +15,7 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos.own_folder import refuse_strange
+from protos.program.own_folder import refuse_strange
 from sidecar.local.shares import Rate
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from protos.model import InterfaceName
-    from protos.tls_files import TlsWatch
+    from protos.program.tls_files import TlsWatch
     from protos.trust.clock_floor import ClockFloor
     from sidecar.config import SidecarConfig
     from sidecar.control_client import ControlView

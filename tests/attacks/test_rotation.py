@@ -12,7 +12,7 @@ import pytest
 from controlplane.ca import Authority
 from controlplane.ca.files import write_atomically, write_tls_files
 from lab.system import CONTROL_METRICS_PORT, METRICS_PORT, System
-from protos.tls_files import CA_FILE, CRL_FILE
+from protos.program.tls_files import CA_FILE, CRL_FILE
 from tests.attacks.world import World, attack_lab, is_ours
 from tests.netns.calling import Call, assert_flawless
 

@@ -19,7 +19,7 @@ from controlplane.ca.files import write_atomically
 from lab import Lab, LabConfig, LinkProfile, robot, server
 from lab.attacker.wire import Tap
 from lab.system import CONTROL_METRICS_PORT, METRICS_PORT
-from protos.tls_files import CRL_FILE
+from protos.program.tls_files import CRL_FILE
 from tests.netns.calling import Call
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from controlplane.ca import Authority
 from controlplane.ca.index import decode_index, encode_index
 from protos.base.errors import ConfigError
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from tests.unit.controlplane.samples import interfaces, path, registration, use
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from sidecar.core.base.report_scope import ReportScope
 
 

@@ -16,7 +16,7 @@ from controlplane.config import ControlPlaneConfig
 from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from tests.integration.test_tls_gate import PATIENCE_S, opened, until
 

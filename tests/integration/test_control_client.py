@@ -57,7 +57,7 @@ from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedContro
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from sidecar.core.base.report_scope import ReportScope
 
 WELCOME = Welcome(lease_s=0.6, report_interval_s=0.1, stun_servers=("192.0.2.9:3478",))

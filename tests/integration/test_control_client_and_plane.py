@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from sidecar.core.base.report_scope import ReportScope
 
 ROOT = Path(__file__).parents[2]

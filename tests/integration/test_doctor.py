@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from controlplane.ca import Authority
-from protos import commit
+from protos.program import commit
 from protos.trust.identity import IdentityRole
 from sidecar.doctor import command, ping_command
 from sidecar.local.client import LocalClient
@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.audit("ops-14"), pytest.mark.ros]
 
 
 def plr(*arguments: str) -> subprocess.CompletedProcess[str]:
-    argv = [sys.executable, "-m", "protos.command_line", *arguments]
+    argv = [sys.executable, "-m", "protos.program.command_line", *arguments]
     return subprocess.run(argv, capture_output=True, text=True, timeout=100, env=environment())
 
 

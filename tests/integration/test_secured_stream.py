@@ -14,8 +14,8 @@ import pytest
 from controlplane.ca import Authority, Validity
 from controlplane.ca.files import write_atomically
 from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, ServiceSet, Welcome
+from protos.program.tls_files import TlsWatch, load_tls_files
 from protos.revocation_views import revocation_set
-from protos.tls_files import TlsWatch, load_tls_files
 from protos.trust.candidate_signature import verify_candidates
 from protos.trust.credential import decode_credential
 from protos.trust.identity import CertificateError, IdentityRole
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from sidecar.core.base.report_scope import ReportScope
 
 

@@ -18,7 +18,7 @@ from controlplane import tls_gate
 from controlplane.ca import Authority
 from controlplane.tls_gate import TlsGate
 from protos.model import NodeName
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 

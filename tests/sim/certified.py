@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.identity import IdentityRole
 from sidecar.announcement import Announcer
@@ -17,7 +17,7 @@ from tests.sim.mesh import Mesh
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
     from protos.trust.credential import SessionCredential
     from sidecar.core.crypto.session import OwnSession
     from tests.sim.mesh import Node

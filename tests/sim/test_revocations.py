@@ -11,7 +11,7 @@ import pytest
 from controlplane.ca.authority import Authority
 from controlplane.ca.files import write_atomically, write_tls_files
 from protos.model import Role
-from protos.tls_files import CRL_FILE, TlsWatch, load_tls_files
+from protos.program.tls_files import CRL_FILE, TlsWatch, load_tls_files
 from protos.trust.identity import IdentityRole
 from sidecar.announcement import Announcer
 from sidecar.core.base.values import Priority

@@ -12,7 +12,7 @@ import pytest
 
 from controlplane import cli
 from controlplane.__main__ import main as controlplane
-from protos.command_line import main as plr
+from protos.program.command_line import main as plr
 from sidecar.__main__ import main as sidecar
 from tests.free_ports import free_port
 

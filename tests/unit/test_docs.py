@@ -24,7 +24,7 @@ from controlplane.metrics import Metrics
 from protos.base.histogram import Histogram
 from protos.convert.fields import MAX_CRL_BYTES
 from protos.model import InterfaceName, NodeName, ServiceName
-from protos.tls_files import MAX_FILE_BYTES
+from protos.program.tls_files import MAX_FILE_BYTES
 from protos.trust.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
 from sidecar.config import SidecarConfig
 from sidecar.control_client import JUDGE_AGAIN_S

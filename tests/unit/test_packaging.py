@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos import commit, extras
+from protos.program import commit, extras
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 
 SOLVER = ("ortools", "pandas", "grpc_health", "grpc_reflection")
-_COMMAND = {"protos.command_line": ("doctor",), "controlplane.cli": ("status",)}
+_COMMAND = {"protos.program.command_line": ("doctor",), "controlplane.cli": ("status",)}
 SIDECAR = ("pyroute2", "sdnotify", "zfec", "prometheus_client")
 
 
@@ -91,7 +91,7 @@ def test_a_program_without_its_extra_says_which(module: str, name: str, absent: 
     [
         ("controlplane", "plr-controlplane", "controlplane", "cryptography"),
         ("sidecar", "plr-sidecar", "sidecar", "yaml"),
-        ("protos.command_line", "plr", "sidecar", "pydantic"),
+        ("protos.program.command_line", "plr", "sidecar", "pydantic"),
         ("controlplane.cli", "plr", "controlplane", "grpc"),
     ],
 )
@@ -136,7 +136,14 @@ def git(folder: Path, *arguments: str) -> str:
 def checkout(tmp_path: Path) -> Path:
     """A small one: what builds the wheel, and a package of two modules."""
     folder = tmp_path / "checkout"
-    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE", "protos/commit.py", "protos/__init__.py"):
+    for name in (
+        "setup.py",
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+        "protos/program/commit.py",
+        "protos/__init__.py",
+    ):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / name)
     (folder / "sidecar").mkdir()

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
 from bench.null_cipher import install
-from protos import interpreter
 from protos.model import (
     ALL_CALLS,
     Assignment,
@@ -36,6 +35,7 @@ from protos.model import (
     SessionId,
     Version,
 )
+from protos.program import interpreter
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.pair_token import pair_token
 from sidecar.config import SidecarConfig

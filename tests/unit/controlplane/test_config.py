@@ -15,7 +15,7 @@ from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from protos.base.errors import ConfigError
 from protos.base.host_port import check_remote, split_host_port
-from protos.config_file import MAX_CONFIG_BYTES
+from protos.program.config_file import MAX_CONFIG_BYTES
 
 if TYPE_CHECKING:
     from pathlib import Path

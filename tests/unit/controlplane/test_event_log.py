@@ -15,10 +15,10 @@ from controlplane import event_log
 from controlplane.event_lines import decode, encode
 from controlplane.event_log import FILE, EventLog
 from controlplane.remembered import departures
-from protos import own_folder
 from protos.base.errors import DecodeError
 from protos.fleet_events import EventKind, EventQuery, FleetEvent, Why
 from protos.model import NodeName, Role
+from protos.program import own_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable

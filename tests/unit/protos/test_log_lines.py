@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.base.printable import escaped
-from protos.log_lines import JournalFormatter, LineFormatter, is_journal, line_formatter
+from protos.program.log_lines import JournalFormatter, LineFormatter, is_journal, line_formatter
 from sidecar.core.base.values import RejectReason
 from sidecar.core.wire.messages import RejectionMessage, decode_message, encode_message
 from tests.unit.sidecar.core.builders import request_id

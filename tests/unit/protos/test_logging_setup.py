@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos import logging_setup
-from protos.log_lines import line_formatter
-from protos.logging_setup import Logging
+from protos.program import logging_setup
+from protos.program.log_lines import line_formatter
+from protos.program.logging_setup import Logging
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

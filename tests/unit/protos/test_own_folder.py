@@ -10,7 +10,7 @@ import pytest
 from controlplane.event_log import EventLog
 from protos.fleet_events import EventKind
 from protos.model import NodeName
-from protos.own_folder import OwnFolder
+from protos.program.own_folder import OwnFolder
 from sidecar.state_store import StateDirError, StateStore
 
 if TYPE_CHECKING:

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from protos.program import ends_quietly
+from protos.program.endings import ends_quietly
 
 pytestmark = pytest.mark.audit("ops-14")
 
 ROOT = Path(__file__).parents[3]
 PROGRAMS = [
-    ["protos.command_line", "config", "schema", "controlplane"],
+    ["protos.program.command_line", "config", "schema", "controlplane"],
     ["sidecar", "--print-schema"],
 ]
 FULL = Path("/dev/full")

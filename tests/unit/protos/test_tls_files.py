@@ -14,7 +14,7 @@ from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.base.errors import ConfigError
 from protos.model import NodeName
-from protos.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
+from protos.program.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
 from protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from controlplane.ca import Authority
 from protos.convert import parse_sidecar_message, sidecar_message_to_proto
 from protos.model import Candidate, CandidateKind, CandidateSet, InterfaceId, InterfaceName, SessionId
 from protos.preferences import InterfaceLabel
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.candidate_signature import verify_candidates
 from protos.trust.identity import IdentityRole
 from sidecar.announcement import Announcer

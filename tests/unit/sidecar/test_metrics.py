@@ -19,7 +19,7 @@ from sidecar.metrics import MetricSources, SidecarCollector, serve_metrics
 from sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:
-    from protos.metrics_server import MetricsServer
+    from protos.program.metrics_server import MetricsServer
 
 PLAN = ServiceName("/plan")
 WLAN = InterfaceName("wlan0")

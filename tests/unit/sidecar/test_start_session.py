@@ -13,7 +13,7 @@ from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.base.errors import ConfigError, DecodeError
 from protos.model import Peer, Role, SessionId
-from protos.tls_files import TlsFiles, load_tls_files
+from protos.program.tls_files import TlsFiles, load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.credential import SessionCredential, verify
 from protos.trust.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, CertificateError, IdentityRole, Trust

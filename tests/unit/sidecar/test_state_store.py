@@ -12,7 +12,6 @@ from typing import IO, TYPE_CHECKING
 
 import pytest
 
-from protos import own_folder
 from protos.base.errors import DecodeError
 from protos.model import (
     Assignment,
@@ -32,6 +31,7 @@ from protos.model import (
     Version,
     Welcome,
 )
+from protos.program import own_folder
 from sidecar import state_store
 from sidecar.state_file import (
     ControlAddresses,

@@ -11,7 +11,7 @@ import pytest
 
 from controlplane import cli
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from controlplane.ca.certificates import generate_key
 from controlplane.ca.folder import AuthorityFolder
 from controlplane.ca.key_file import clear_pem
 from controlplane.ca.request import MAX_REQUEST_BYTES, build_request
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.identity import IdentityRole
 from tests.unit.controlplane.ca.shell import at_a_terminal
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from prometheus_client import CollectorRegistry, Gauge
 
-from protos.metrics_server import MetricsServer
+from protos.program.metrics_server import MetricsServer
 from sidecar.config import load_config
 from sidecar.doctor import bugreport
 from sidecar.doctor.examination import Examination, Where

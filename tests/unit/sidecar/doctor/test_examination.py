@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from controlplane.ca import Authority
-from protos import tls_files
 from protos.base.errors import ConfigError
-from protos.tls_files import load_tls_files
+from protos.program import tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.identity import IdentityRole
 from sidecar.doctor import examination
 from sidecar.doctor.examination import RUNTIME_SOCKET, Where, _certificate_and_clock, _judged, _wrong, connect, sockets

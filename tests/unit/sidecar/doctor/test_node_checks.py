@@ -10,7 +10,7 @@ import pytest
 
 from controlplane.ca import Authority
 from protos.model import InterfaceName
-from protos.tls_files import load_tls_files
+from protos.program.tls_files import load_tls_files
 from protos.trust.identity import IdentityRole
 from sidecar.doctor import node_checks
 from sidecar.doctor.finding import Finding, Level

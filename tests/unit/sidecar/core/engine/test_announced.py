@@ -25,7 +25,7 @@ from tests.unit.sidecar.test_start_session import Fleet
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 pytestmark = pytest.mark.audit("sec-5")
 

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 
 from protos.base.errors import ConfigError
-from protos.regular_file import open_regular
+from protos.program.regular_file import open_regular
 from protos.trust.identity import CertificateError, Identity, IdentityRole, Trust
 
 if TYPE_CHECKING:

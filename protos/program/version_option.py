@@ -6,8 +6,8 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from protos import commit
 from protos.model import PROTOCOL_VERSION
+from protos.program import commit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,7 +11,7 @@ import sys
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
-from protos import extras, program
+from protos.program import endings, extras
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,7 +22,7 @@ OPERATOR = "operator"
 EXIT_FAILURE = 1
 
 
-@program.ends_quietly("plr")
+@endings.ends_quietly("plr")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)

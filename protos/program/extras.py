@@ -7,7 +7,7 @@ import importlib.util
 import sys
 from typing import TYPE_CHECKING
 
-from protos.program import ended_by_ctrl_c
+from protos.program.endings import ended_by_ctrl_c
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from protos.base.errors import ConfigError
-from protos.regular_file import read_regular
+from protos.program.regular_file import read_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -8,7 +8,7 @@ from protos.trust.certificate_term import remedy
 from protos.trust.identity import CONTROL_PLANE_DNS, CertificateError
 
 if TYPE_CHECKING:
-    from protos.tls_files import TlsFiles
+    from protos.program.tls_files import TlsFiles
 
 _SEE_LOG = "its log tells more"
 

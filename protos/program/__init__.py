@@ -1,0 +1,1 @@
+"""What every program starts with: command line, configuration, log, certificate files, metrics. The only IO here."""
