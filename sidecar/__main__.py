@@ -27,7 +27,7 @@ with extras.required("plr-sidecar", "sidecar"):
     from protos.program.tls_files import load_tls_files
     from protos.program.version_option import ShowVersion
     from protos.trust.certificate_term import term_problem
-    from sidecar.config import SidecarConfig, config_schema, load_config, refuse_exposed
+    from sidecar.config.sidecar import SidecarConfig, config_schema, load_config, refuse_exposed
     from sidecar.ros import environment
     from sidecar.stop_request import StopRequest
 

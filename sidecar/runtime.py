@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     )
     from protos.program.metrics_server import MetricsServer
     from protos.program.tls_files import TlsFiles
-    from sidecar.config import SidecarConfig
+    from sidecar.config.sidecar import SidecarConfig
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.base.values import PathState
     from sidecar.core.link.pinging import Pong

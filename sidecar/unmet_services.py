@@ -8,7 +8,7 @@ import difflib
 from typing import TYPE_CHECKING
 
 from protos.model import ServiceName
-from sidecar.config_fields import is_glob
+from sidecar.config.fields import is_glob
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping

@@ -20,9 +20,9 @@ from bench.matcher.crossed import pairs_of
 from bench.matcher.feed import REPORT_INTERVAL_S, Reporter
 from bench.matcher.plane import Plane
 from bench.matcher.races import ANSWER_BYTES, PATHS
+from sidecar.config.service import DEFAULT_EXPLORATION
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.robot.dispatch.exploration import ExplorationBudget
-from sidecar.service_config import DEFAULT_EXPLORATION
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -35,7 +35,7 @@ from protos.base.host_port import split_host_port
 from protos.base.printable import escaped
 from protos.program import commit
 from protos.program.config_file import parse_yaml, read_text
-from sidecar.config import SidecarConfig
+from sidecar.config.sidecar import SidecarConfig
 from sidecar.doctor.command import as_json, as_text
 from sidecar.doctor.examination import examine
 from sidecar.doctor.options import parser_of, where_of

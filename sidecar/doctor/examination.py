@@ -16,7 +16,7 @@ from protos.program.config_file import parse_yaml, read_text
 from protos.program.regular_file import read_regular
 from protos.program.tls_files import load_tls_files
 from protos.trust.identity import Identity, IdentityRole
-from sidecar.config import load_config
+from sidecar.config.sidecar import load_config
 from sidecar.core.rules.service_rule import Rules
 from sidecar.doctor import host, node_checks, running_checks
 from sidecar.doctor.finding import fail, ok, warn
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from typing import TypeVar
 
     from protos.program.tls_files import TlsFiles
-    from sidecar.config import SidecarConfig
+    from sidecar.config.sidecar import SidecarConfig
     from sidecar.doctor.finding import Finding
     from sidecar.doctor.running_checks import PathKey
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from protos.model import InterfaceName
-    from sidecar.config import SidecarConfig
+    from sidecar.config.sidecar import SidecarConfig
     from sidecar.doctor.examination import Where
     from sidecar.local.client import LocalClient
 

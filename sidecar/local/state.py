@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from protos.model import InterfaceName
     from protos.program.tls_files import TlsWatch
     from protos.trust.clock_floor import ClockFloor
-    from sidecar.config import SidecarConfig
+    from sidecar.config.sidecar import SidecarConfig
     from sidecar.control_client import ControlView
     from sidecar.core.base.values import PathId
     from sidecar.net.dataplane import ThreadedDataPlane

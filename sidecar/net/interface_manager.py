@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model import Address
-    from sidecar.config import SidecarConfig
+    from sidecar.config.sidecar import SidecarConfig
     from sidecar.core.crypto.session import OwnSession
     from sidecar.core.link.memory import LinkMemory
     from sidecar.core.stun.client import StunView

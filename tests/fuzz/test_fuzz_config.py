@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.base.errors import ConfigError
-from sidecar.config import SidecarConfig, parse_config
+from sidecar.config.sidecar import SidecarConfig, parse_config
 
 _KEYS = st.sampled_from([*SidecarConfig.model_fields, "deadline_ms", "name", "servers", "address", "enabled"])
 _SCALARS = (

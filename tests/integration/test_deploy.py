@@ -24,7 +24,7 @@ from controlplane.metrics import Metrics
 from protos.base.host_port import split_host_port
 from protos.model import NodeName, Role
 from protos.trust.identity import Identity, IdentityRole, RevocationList
-from sidecar.config import SidecarConfig, load_config
+from sidecar.config.sidecar import SidecarConfig, load_config
 from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats
 from sidecar.metrics import MetricSources, SidecarCollector

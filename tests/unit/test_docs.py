@@ -26,7 +26,7 @@ from protos.convert.fields import MAX_CRL_BYTES
 from protos.model import InterfaceName, NodeName, ServiceName
 from protos.program.tls_files import MAX_FILE_BYTES
 from protos.trust.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
-from sidecar.config import SidecarConfig
+from sidecar.config.sidecar import SidecarConfig
 from sidecar.control_client import JUDGE_AGAIN_S
 from sidecar.core.control.session import ControlStats
 from sidecar.core.engine.revocation_exchange import ASK_AGAIN_S, ASK_NEXT_AFTER_S

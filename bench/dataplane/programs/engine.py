@@ -38,7 +38,7 @@ from protos.model import (
 from protos.program import interpreter
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.pair_token import pair_token
-from sidecar.config import SidecarConfig
+from sidecar.config.sidecar import SidecarConfig
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine.engine import EngineConfig
 from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived

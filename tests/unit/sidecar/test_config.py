@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from protos.base.errors import ConfigError
 from protos.model import InterfaceName, NodeName, Role
 from protos.trust.identity import Identity, IdentityRole
-from sidecar.config import (
+from sidecar.config.sidecar import (
     DEFAULT_CLOUD_UDP_PORT,
     LogLevel,
     SidecarConfig,

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from protos.base.errors import ConfigError
-from sidecar.config import parse_config
+from sidecar.config.sidecar import parse_config
 from tests.unit.sidecar.configs import BACKED, CLOUD, ROBOT, SAFE, SOURCE, parse, with_service
 
 BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [

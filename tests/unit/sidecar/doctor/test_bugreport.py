@@ -12,7 +12,7 @@ import yaml
 from prometheus_client import CollectorRegistry, Gauge
 
 from protos.program.metrics_server import MetricsServer
-from sidecar.config import load_config
+from sidecar.config.sidecar import load_config
 from sidecar.doctor import bugreport
 from sidecar.doctor.examination import Examination, Where
 from sidecar.doctor.finding import fail

@@ -26,7 +26,7 @@ from tests.unit.sidecar.configs import ROBOT, parse
 if TYPE_CHECKING:
     from typing import Any, NoReturn
 
-    from sidecar.config import SidecarConfig
+    from sidecar.config.sidecar import SidecarConfig
 
 pytestmark = pytest.mark.audit("ops-14")
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from protos.model import InterfaceName, Role
-from sidecar.config import SidecarConfig, StunConfig
+from sidecar.config.service import ServiceConfig
+from sidecar.config.sidecar import SidecarConfig, StunConfig
 from sidecar.core.interfaces.scan_schedule import RETRY_S
 from sidecar.core.seam.links import SetCarrier
 from sidecar.net import interface_manager as module
 from sidecar.net.interface_manager import InterfaceManager
 from sidecar.net.interfaces import Interface
 from sidecar.net.netlink_watch import Changes
-from sidecar.service_config import ServiceConfig
 from tests.sessions import session_of
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from protos.program.config_fields import (
 )
 from protos.program.config_file import key_path, parse_yaml, read_text, validate
 from protos.trust.identity import IdentityRole
-from sidecar.config_fields import (
+from sidecar.config.fields import (
     ControlPlaneAddresses,
     DomainLabel,
     InterfacePattern,
@@ -36,9 +36,9 @@ from sidecar.config_fields import (
     converted,
     is_glob,
 )
+from sidecar.config.service import NetworkConfig, ServiceConfig
 from sidecar.core.control.ways import Price
 from sidecar.core.rules.service_rule import Rules, ServiceRule
-from sidecar.service_config import NetworkConfig, ServiceConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

@@ -11,7 +11,7 @@ from protos.convert.fields import MAX_CHARGE
 from protos.model import Role, ServiceName
 from protos.preferences import AT_MOST_EVERY_INTERFACE, DEFAULT_CHARGE, EVERY_INTERFACE
 from protos.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
-from sidecar.config_fields import (
+from sidecar.config.fields import (
     CopiesWanted,
     DomainLabel,
     FullServiceName,
