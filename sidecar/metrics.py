@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
     from protos.model import InterfaceName, ServiceName
     from protos.trust.identity import Identity
+    from sidecar.control.revocations import RevocationState
     from sidecar.core.control.session import ControlStats
     from sidecar.core.seam.stats import EngineStats, LinkStats
-    from sidecar.revocations import RevocationState
     from sidecar.ros.stats import BridgeStats
 
 _OUTCOMES = ("ok", "deadline_missed", "failed", "rejected")

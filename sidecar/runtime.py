@@ -28,8 +28,9 @@ from protos.program import interpreter
 from protos.program.notifier import Notifier
 from protos.program.tls_files import TlsWatch, load_tls_files
 from protos.trust.clock_floor import ClockFloor
-from sidecar.announcement import Announcer
-from sidecar.control_client import ControlClient
+from sidecar.control.announcement import Announcer
+from sidecar.control.client import ControlClient
+from sidecar.control.revocations import Revocations
 from sidecar.core.control.session import Apply, ControlSession
 from sidecar.core.control.ways import ControlInterface
 from sidecar.core.engine.engine import EngineConfig
@@ -39,7 +40,6 @@ from sidecar.metrics import MetricSources, serve_metrics
 from sidecar.net.control_dialer import ControlDialer
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
-from sidecar.revocations import Revocations
 from sidecar.ros.bridge import RosBridge
 from sidecar.start_session import signed, start_session
 from sidecar.state_store import StateDirError, StateStore

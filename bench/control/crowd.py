@@ -18,7 +18,7 @@ from protos.convert import control_message_from_proto, sidecar_message_to_proto
 from protos.model import MappingSet, PeerSet, Role
 from protos.plr.v1 import control_pb2_grpc
 from protos.trust.identity import CONTROL_PLANE_DNS
-from sidecar.control_channel import REFUSALS
+from sidecar.control.channel import REFUSALS
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.control.session import Apply, ControlState
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from protos.program.tls_files import TlsWatch
     from protos.trust.clock_floor import ClockFloor
     from sidecar.config.sidecar import SidecarConfig
-    from sidecar.control_client import ControlView
+    from sidecar.control.client import ControlView
     from sidecar.core.base.values import PathId
     from sidecar.net.dataplane import ThreadedDataPlane
     from sidecar.net.interface_manager import InterfaceView

@@ -18,7 +18,7 @@ from protos.model import (
     Welcome,
 )
 from protos.status import SyncState
-from sidecar.control_client import ControlClient
+from sidecar.control.client import ControlClient
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud

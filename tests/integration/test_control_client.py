@@ -46,8 +46,8 @@ from protos.model import (
     Welcome,
 )
 from protos.plr.v1 import control_pb2
-from sidecar import control_client
-from sidecar.control_client import ControlClient
+from sidecar.control import client
+from sidecar.control.client import ControlClient
 from sidecar.core.control import session as control_session
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
@@ -378,7 +378,7 @@ def test_leaves_an_address_that_takes_connections_and_says_nothing_to_the_others
 def test_judges_again_and_again_also_without_control_plane_and_whatever_comes_of_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(control_client, "JUDGE_AGAIN_S", 0.01)
+    monkeypatch.setattr(client, "JUDGE_AGAIN_S", 0.01)
     rig = Rig(f"127.0.0.1:{free_port()}")
     rig.hooks.crash = True
     rig.client.start()

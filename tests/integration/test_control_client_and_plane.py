@@ -41,7 +41,7 @@ from protos.model import (
     Welcome,
 )
 from protos.trust.pair_token import pair_token
-from sidecar.control_client import ControlClient
+from sidecar.control.client import ControlClient
 from sidecar.core.control import session
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer

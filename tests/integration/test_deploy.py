@@ -25,10 +25,10 @@ from protos.base.host_port import split_host_port
 from protos.model import NodeName, Role
 from protos.trust.identity import Identity, IdentityRole, RevocationList
 from sidecar.config.sidecar import SidecarConfig, load_config
+from sidecar.control.revocations import RevocationState
 from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats
 from sidecar.metrics import MetricSources, SidecarCollector
-from sidecar.revocations import RevocationState
 from tests.free_ports import free_port
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from protos.revocation_views import revocation_set
 from protos.trust.candidate_signature import verify_candidates
 from protos.trust.credential import decode_credential
 from protos.trust.identity import CertificateError, IdentityRole
-from sidecar import control_client
-from sidecar.announcement import Announcer
-from sidecar.control_client import ControlClient
+from sidecar.control import client
+from sidecar.control.announcement import Announcer
+from sidecar.control.client import ControlClient
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
 from tests.free_ports import free_port
@@ -112,7 +112,7 @@ class Robot:
 def test_a_renewed_certificate_is_shown_on_a_new_stream(
     plane: SecuredControlPlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control_client, "LOOK_INTERVAL_S", 0.05)
+    monkeypatch.setattr(client, "LOOK_INTERVAL_S", 0.05)
     folder = tmp_path / "tls"
     plane.authority.write_tls_dir(folder, "robot-1", IdentityRole.ROBOT)
     with cloud(plane.address, "cloud-a", plane.member("cloud-a", IdentityRole.CLOUD)) as server:
@@ -134,7 +134,7 @@ def test_a_renewal_is_never_relayed_as_what_a_forger_says(
     plane: SecuredControlPlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Addresses signed with the one certificate beside the credential of the other: each peer logged a warning."""
-    monkeypatch.setattr(control_client, "LOOK_INTERVAL_S", 0.05)
+    monkeypatch.setattr(client, "LOOK_INTERVAL_S", 0.05)
     folder = tmp_path / "tls"
     plane.authority.write_tls_dir(folder, "robot-11", IdentityRole.ROBOT)
     robot = Robot(plane.address, folder, "robot-11")
@@ -172,7 +172,7 @@ def test_new_files_count_while_no_control_plane_is_there(
     plane: SecuredControlPlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also between two attempts to reach it, which may be long."""
-    monkeypatch.setattr(control_client, "LOOK_INTERVAL_S", 0.05)
+    monkeypatch.setattr(client, "LOOK_INTERVAL_S", 0.05)
     folder = tmp_path / "tls"
     plane.authority.write_tls_dir(folder, "robot-6", IdentityRole.ROBOT)
     robot = Robot(f"127.0.0.1:{free_port()}", folder, "robot-6")

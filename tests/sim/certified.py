@@ -10,7 +10,7 @@ from controlplane.ca.files import write_tls_files
 from protos.program.tls_files import load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.identity import IdentityRole
-from sidecar.announcement import Announcer
+from sidecar.control.announcement import Announcer
 from sidecar.start_session import signed, start_session
 from tests.sim.mesh import Mesh
 

@@ -26,7 +26,7 @@ from protos.model import (
 )
 from protos.trust.credential import Aead
 from protos.trust.pair_token import pair_token
-from sidecar.announcement import Announcer
+from sidecar.control.announcement import Announcer
 from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine.engine import Engine, EngineConfig

@@ -13,12 +13,12 @@ from controlplane.ca.files import write_atomically, write_tls_files
 from protos.model import Role
 from protos.program.tls_files import CRL_FILE, TlsWatch, load_tls_files
 from protos.trust.identity import IdentityRole
-from sidecar.announcement import Announcer
+from sidecar.control.announcement import Announcer
+from sidecar.control.revocations import Revocations
 from sidecar.core.base.values import Priority
 from sidecar.core.engine.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
 from sidecar.core.seam.links import SetCredential
 from sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
-from sidecar.revocations import Revocations
 from tests.sim.mesh import Mesh, rule
 
 if TYPE_CHECKING:

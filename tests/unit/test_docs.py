@@ -27,13 +27,13 @@ from protos.model import InterfaceName, NodeName, ServiceName
 from protos.program.tls_files import MAX_FILE_BYTES
 from protos.trust.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
 from sidecar.config.sidecar import SidecarConfig
-from sidecar.control_client import JUDGE_AGAIN_S
+from sidecar.control.client import JUDGE_AGAIN_S
+from sidecar.control.revocations import RevocationState
 from sidecar.core.control.session import ControlStats
 from sidecar.core.engine.revocation_exchange import ASK_AGAIN_S, ASK_NEXT_AFTER_S
 from sidecar.core.seam.stats import EngineStats, LinkStats
 from sidecar.core.wire.messages import RevocationsHeld, encode_message
 from sidecar.metrics import MetricSources, SidecarCollector
-from sidecar.revocations import RevocationState
 from sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:

@@ -68,7 +68,7 @@ def statuses(
             services=() if shorter else services,
             paths=() if shorter else paths,
             refused_offers=permits.refused_offers(sidecar),
-            revocations=sidecar.revocations,
+            revocations=sidecar.control.revocations,
             unmet=sidecar.unmet,
             untyped=sidecar.untyped,
             unreached=sidecar.unreached,

@@ -13,7 +13,7 @@ from protos.preferences import InterfaceLabel
 from protos.program.tls_files import load_tls_files
 from protos.trust.candidate_signature import verify_candidates
 from protos.trust.identity import IdentityRole
-from sidecar.announcement import Announcer
+from sidecar.control.announcement import Announcer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from sidecar.outage_log import REPEATED_FAILURE_LOG_S, OutageLog
+from sidecar.control.outage_log import REPEATED_FAILURE_LOG_S, OutageLog
 
 LOG = logging.getLogger("outage")
 

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from protos.model import ResourceKind
-from sidecar.refusal_log import RefusalLog
+from sidecar.control.refusal_log import RefusalLog
 
 if TYPE_CHECKING:
     import pytest

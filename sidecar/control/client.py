@@ -24,11 +24,11 @@ from protos.convert import control_message_from_proto, sidecar_message_to_proto
 from protos.model import PeerSet, Report, ResourceKind, ServiceSet, Welcome
 from protos.plr.v1 import control_pb2_grpc
 from protos.program import tls_advice
-from sidecar.control_channel import REFUSALS, open_channel
+from sidecar.control.channel import REFUSALS, open_channel
+from sidecar.control.outage_log import OutageLog
+from sidecar.control.refusal_log import RefusalLog
 from sidecar.core.control.session import Apply
 from sidecar.core.control.watch import CHEAPER
-from sidecar.outage_log import OutageLog
-from sidecar.refusal_log import RefusalLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from protos.model import CandidateSet, RevocationSet
     from protos.plr.v1 import control_pb2
     from protos.program.tls_files import TlsWatch
-    from sidecar.control_hooks import ControlHooks
+    from sidecar.control.hooks import ControlHooks
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.control.session import ControlSession, ControlStats
     from sidecar.net.control_dialer import ControlDialer, ControlLine

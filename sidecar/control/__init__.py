@@ -1,0 +1,1 @@
+"""The control stream over gRPC: what drives `sidecar.core.control`."""
