@@ -36,14 +36,14 @@ from sidecar.core.control.ways import ControlInterface
 from sidecar.core.engine.engine import EngineConfig
 from sidecar.local.server import LocalServer, LocalSocketError
 from sidecar.local.state import LocalState, MappingOrigin
-from sidecar.metrics import MetricSources, serve_metrics
 from sidecar.net.control_dialer import ControlDialer
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
+from sidecar.observe.metrics import MetricSources, serve_metrics
+from sidecar.observe.unmet_services import UnmetServices, told, told_mismatched, told_unreached
 from sidecar.ros.bridge import RosBridge
 from sidecar.start_session import signed, start_session
 from sidecar.state_store import StateDirError, StateStore
-from sidecar.unmet_services import UnmetServices, told, told_mismatched, told_unreached
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

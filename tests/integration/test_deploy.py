@@ -28,7 +28,7 @@ from sidecar.config.sidecar import SidecarConfig, load_config
 from sidecar.control.revocations import RevocationState
 from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats
-from sidecar.metrics import MetricSources, SidecarCollector
+from sidecar.observe.metrics import MetricSources, SidecarCollector
 from tests.free_ports import free_port
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ from sidecar.core.control.session import ControlStats
 from sidecar.core.engine.revocation_exchange import ASK_AGAIN_S, ASK_NEXT_AFTER_S
 from sidecar.core.seam.stats import EngineStats, LinkStats
 from sidecar.core.wire.messages import RevocationsHeld, encode_message
-from sidecar.metrics import MetricSources, SidecarCollector
+from sidecar.observe.metrics import MetricSources, SidecarCollector
 from sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:

@@ -52,7 +52,9 @@ def test_a_sidecar_has_no_numpy_but_that_of_ros() -> None:
         for file in (ROOT / folder).glob("*.py")
     )
     counted = "from protos.histogram import Histogram\nh = Histogram(); h.record(1.0); h.merge(h.copy()); h.to_sparse()"
-    done = without(("numpy", *SOLVER), f"import {', '.join(modules)}, sidecar.metrics\n{counted}; h.quantile(0.5)")
+    done = without(
+        ("numpy", *SOLVER), f"import {', '.join(modules)}, sidecar.observe.metrics\n{counted}; h.quantile(0.5)"
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -1,4 +1,4 @@
-"""Plain counters that the cores keep and `sidecar/metrics.py` reads at scrape time.
+"""Plain counters that the cores keep and `sidecar/observe/metrics.py` reads at scrape time.
 
 Each object has one writer (a link's thread, or whoever holds the engine); a scrape reads it without a lock, which in
 CPython is safe for ints and dicts as long as the reader copies (`dict(...)`) before it iterates.

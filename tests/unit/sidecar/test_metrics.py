@@ -14,8 +14,8 @@ from protos.base.histogram import Histogram
 from protos.model import InterfaceName, NodeName, ResourceKind, ServiceName
 from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats, LinkStats, PathStats
-from sidecar.metric_families import DURATION_BOUNDS_S, cumulative
-from sidecar.metrics import MetricSources, SidecarCollector, serve_metrics
+from sidecar.observe.metric_families import DURATION_BOUNDS_S, cumulative
+from sidecar.observe.metrics import MetricSources, SidecarCollector, serve_metrics
 from sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import pytest
 
 from protos.model import ServiceName
-from sidecar.unmet_services import GRACE_S, MAX_NAMES_SHOWN, UnmetServices, told, told_mismatched, told_unreached
+from sidecar.observe.unmet_services import (
+    GRACE_S,
+    MAX_NAMES_SHOWN,
+    UnmetServices,
+    told,
+    told_mismatched,
+    told_unreached,
+)
 
 pytestmark = pytest.mark.audit("ops-5")
 

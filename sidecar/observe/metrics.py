@@ -22,7 +22,7 @@ from sidecar.core.control.watch import LEAVE_CAUSES
 from sidecar.core.control.ways import DIAL_DROPS
 from sidecar.core.engine.revocation_exchange import EXCHANGES
 from sidecar.local.server import REFUSALS
-from sidecar.metric_families import by_one, counter, cumulative, gauge
+from sidecar.observe.metric_families import by_one, counter, cumulative, gauge
 from sidecar.state_store import FAILURES
 
 if TYPE_CHECKING:

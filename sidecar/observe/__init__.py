@@ -1,0 +1,1 @@
+"""What the sidecar shows: metrics and unmet services."""
