@@ -40,7 +40,7 @@ from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ExecuteRequest, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import SetReady
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, symbol_count
-from sidecar.start_session import start_session
+from sidecar.state.start_session import start_session
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -42,8 +42,8 @@ from sidecar.net.interface_manager import InterfaceManager
 from sidecar.observe.metrics import MetricSources, serve_metrics
 from sidecar.observe.unmet_services import UnmetServices, told, told_mismatched, told_unreached
 from sidecar.ros.bridge import RosBridge
-from sidecar.start_session import signed, start_session
-from sidecar.state_store import StateDirError, StateStore
+from sidecar.state.start_session import signed, start_session
+from sidecar.state.store import StateDirError, StateStore
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

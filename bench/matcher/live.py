@@ -19,8 +19,8 @@ from lab import Lab, LabConfig, LinkProfile
 from lab.system import System, read_json
 from protos.base.errors import DecodeError
 from protos.model import NodeName
-from sidecar.state_file import decode_last_good
-from sidecar.state_store import LAST_GOOD_FILE
+from sidecar.state.file import decode_last_good
+from sidecar.state.store import LAST_GOOD_FILE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -26,8 +26,8 @@ from sidecar.local.protocol import MAX_REQUESTS
 from sidecar.net.interfaces import choose, list_interfaces
 from sidecar.ros import environment
 from sidecar.ros.errors import RosBridgeError
-from sidecar.state_file import MAX_FILE_BYTES, decode_clock_floor, decode_last_good
-from sidecar.state_store import CLOCK_FILE, LAST_GOOD_FILE
+from sidecar.state.file import MAX_FILE_BYTES, decode_clock_floor, decode_last_good
+from sidecar.state.store import CLOCK_FILE, LAST_GOOD_FILE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

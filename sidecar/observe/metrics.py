@@ -23,7 +23,7 @@ from sidecar.core.control.ways import DIAL_DROPS
 from sidecar.core.engine.revocation_exchange import EXCHANGES
 from sidecar.local.server import REFUSALS
 from sidecar.observe.metric_families import by_one, counter, cumulative, gauge
-from sidecar.state_store import FAILURES
+from sidecar.state.store import FAILURES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -30,8 +30,8 @@ from protos.convert import (
 )
 from protos.model import NodeName
 from protos.plr.v1 import admin_pb2
-from sidecar import state_file
-from sidecar.state_file import LastGood
+from sidecar.state import file
+from sidecar.state.file import LastGood
 from tests.fuzz.test_fuzz_state_file import sealed
 from tests.unit.protos import message_strategies as some
 
@@ -123,11 +123,11 @@ def test_damaged_messages(kind: str, fuzz_datagrams: int) -> None:
 
 
 FILES: dict[str, tuple[bytes, Callable[[bytes], object]]] = {
-    "identity": (b"plr-id\0\0", state_file.decode_identity),
-    "last good": (b"plr-last", lambda data: state_file.decode_last_good(data, OWNER)),
-    "addresses": (b"plr-ctrl", state_file.decode_addresses),
-    "revocations": (b"plr-crls", state_file.decode_revocations),
-    "clock": (b"plr-clck", state_file.decode_clock_floor),
+    "identity": (b"plr-id\0\0", file.decode_identity),
+    "last good": (b"plr-last", lambda data: file.decode_last_good(data, OWNER)),
+    "addresses": (b"plr-ctrl", file.decode_addresses),
+    "revocations": (b"plr-crls", file.decode_revocations),
+    "clock": (b"plr-clck", file.decode_clock_floor),
 }
 SEAL_BYTES = 46
 NEEDS_A_FIXED_LENGTH = (b"plr-id\0\0", b"plr-clck")
@@ -139,7 +139,7 @@ def test_damaged_state_files(kind: str, fuzz_datagrams: int) -> None:
     magic, decode = FILES[kind]
     last_good = st.builds(LastGood, st.just(OWNER), some.welcomes, some.peer_sets(), some.mapping_sets)
     bodies = [
-        *corpus(last_good.map(lambda last: state_file.encode_last_good(last)[SEAL_BYTES:])),
+        *corpus(last_good.map(lambda last: file.encode_last_good(last)[SEAL_BYTES:])),
         bytes(40),
         b"\x00\x04a:50051",
     ]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from protos.base.errors import DecodeError
 from protos.model import MappingSet, NodeName, PeerSet, Version, Welcome
-from sidecar.state_file import (
+from sidecar.state.file import (
     FORMAT_VERSION,
     LAST_GOOD_VERSION,
     LastGood,

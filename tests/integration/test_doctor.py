@@ -21,7 +21,7 @@ from protos.program import commit
 from protos.trust.identity import IdentityRole
 from sidecar.doctor import command, ping_command
 from sidecar.local.client import LocalClient
-from sidecar.state_file import decode_identity
+from sidecar.state.file import decode_identity
 from tests.free_ports import free_port
 from tests.integration.control_plane_process import ControlPlaneProcess
 from tests.integration.test_sidecar_program import Program, environment

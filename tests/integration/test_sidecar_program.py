@@ -34,7 +34,7 @@ from protos.model import (
     Welcome,
 )
 from protos.preferences import InterfaceLabel
-from sidecar.state_store import StateStore
+from sidecar.state.store import StateStore
 from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane
 from tests.sessions import with_credential

@@ -10,8 +10,8 @@ from protos.model import NodeName, Peer, PeerSet, Role, ServiceName, ServiceOffe
 from sidecar.__main__ import main
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.ros.known_types import MAX_LINES, missing_types
-from sidecar.state_file import LastGood, encode_last_good
-from sidecar.state_store import LAST_GOOD_FILE
+from sidecar.state.file import LastGood, encode_last_good
+from sidecar.state.store import LAST_GOOD_FILE
 
 if TYPE_CHECKING:
     from pathlib import Path

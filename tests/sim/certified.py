@@ -11,7 +11,7 @@ from protos.program.tls_files import load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.identity import IdentityRole
 from sidecar.control.announcement import Announcer
-from sidecar.start_session import signed, start_session
+from sidecar.state.start_session import signed, start_session
 from tests.sim.mesh import Mesh
 
 if TYPE_CHECKING:

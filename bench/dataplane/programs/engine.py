@@ -44,7 +44,7 @@ from sidecar.core.engine.engine import EngineConfig
 from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_manager import InterfaceManager
-from sidecar.start_session import start_session
+from sidecar.state.start_session import start_session
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

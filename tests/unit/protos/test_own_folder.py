@@ -11,7 +11,7 @@ from controlplane.event_log import EventLog
 from protos.fleet_events import EventKind
 from protos.model import NodeName
 from protos.program.own_folder import OwnFolder
-from sidecar.state_store import StateDirError, StateStore
+from sidecar.state.store import StateDirError, StateStore
 
 if TYPE_CHECKING:
     from pathlib import Path

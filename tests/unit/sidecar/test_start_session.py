@@ -17,9 +17,9 @@ from protos.program.tls_files import TlsFiles, load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.credential import SessionCredential, verify
 from protos.trust.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, CertificateError, IdentityRole, Trust
-from sidecar import start_session as module
 from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
-from sidecar.start_session import preferred_aead, signed, start_session
+from sidecar.state import start_session as module
+from sidecar.state.start_session import preferred_aead, signed, start_session
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -32,8 +32,8 @@ from protos.model import (
     Welcome,
 )
 from protos.program import own_folder
-from sidecar import state_store
-from sidecar.state_file import (
+from sidecar.state import store as state_store
+from sidecar.state.file import (
     ControlAddresses,
     Identity,
     LastGood,
@@ -44,7 +44,7 @@ from sidecar.state_file import (
     encode_identity,
     encode_last_good,
 )
-from sidecar.state_store import (
+from sidecar.state.store import (
     ADDRESSES_FILE,
     CLOCK_FILE,
     IDENTITY_FILE,
@@ -325,7 +325,7 @@ def test_what_did_not_fit_on_a_full_disk_is_written_when_there_is_room(
 WRITE_FOR_EVER = """
 import itertools, sys
 from pathlib import Path
-import sidecar.state_store as state_store
+import sidecar.state.store as state_store
 from protos.model import MappingSet, NodeName, Version
 state_store.MIN_WRITE_INTERVAL_S = 0.0
 store = state_store.StateStore(Path(sys.argv[1]), NodeName("robot-1"))

@@ -17,7 +17,7 @@ from sidecar.core.crypto import session
 from sidecar.core.engine import announced as module
 from sidecar.core.engine.announced import Announced
 from sidecar.core.engine.peers import Peers
-from sidecar.start_session import start_session
+from sidecar.state.start_session import start_session
 from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import peer
 from tests.unit.sidecar.test_start_session import Fleet

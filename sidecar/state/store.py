@@ -20,7 +20,7 @@ from protos.base.errors import DecodeError
 from protos.model import TOKEN_BYTES
 from protos.program.own_folder import OwnFolder
 from protos.program.regular_file import open_regular
-from sidecar.state_file import (
+from sidecar.state.file import (
     MAX_FILE_BYTES,
     ControlAddresses,
     Identity,
