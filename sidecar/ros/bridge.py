@@ -19,7 +19,7 @@ from sidecar.ros.event_queue import EventQueue
 from sidecar.ros.graph import sidecar_node_name
 from sidecar.ros.log_limit import LimitedLog
 from sidecar.ros.looks import Looks
-from sidecar.ros.robot_side import RobotSide
+from sidecar.ros.robot.robot_side import RobotSide
 from sidecar.ros.ros_loop import RosLoop
 from sidecar.ros.stats import BridgeStats
 

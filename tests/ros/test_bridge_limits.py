@@ -11,7 +11,7 @@ from sidecar.core.base.values import RejectReason
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import OfferService
 from sidecar.ros.rcl import RmwRequestId
-from sidecar.ros.request_numbering import RequestNumbering
+from sidecar.ros.robot.request_numbering import RequestNumbering
 from tests.ros.mesh import wait_until
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ PLAN = ServiceName("/plan")
 
 
 def test_more_requests_than_a_robot_may_have_pending(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.ros.robot_side.MAX_PENDING_REQUESTS", 10)
+    monkeypatch.setattr("sidecar.ros.robot.robot_side.MAX_PENDING_REQUESTS", 10)
     mesh.faults.delay_s = lambda: 0.5
     mesh.start()
     mesh.serve("--plan", "/plan")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.rules.service_rule import Rules
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.service_proxy import ServiceProxy
+from sidecar.ros.robot.service_proxy import ServiceProxy
 from sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:

@@ -17,14 +17,14 @@ from sidecar.core.seam.application import (
 )
 from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.fallback_caller import FallbackCaller
-from sidecar.ros.new_clients import GIVE_UP_S, NewClients
 from sidecar.ros.node_names import NodeNames
-from sidecar.ros.notices import NoticePublisher
-from sidecar.ros.proxies import Proxies
 from sidecar.ros.rcl import NewClientError
-from sidecar.ros.reply_pacer import ReplyPacer
-from sidecar.ros.request_numbering import RequestNumbering
+from sidecar.ros.robot.fallback_caller import FallbackCaller
+from sidecar.ros.robot.new_clients import GIVE_UP_S, NewClients
+from sidecar.ros.robot.notices import NoticePublisher
+from sidecar.ros.robot.proxies import Proxies
+from sidecar.ros.robot.reply_pacer import ReplyPacer
+from sidecar.ros.robot.request_numbering import RequestNumbering
 from sidecar.ros.server_processes import ServerProcesses
 
 if TYPE_CHECKING:
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import ApplicationEvent
     from sidecar.ports import DataPlane
-    from sidecar.ros.fallback_caller import FallbackAnswer
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.rcl import Message, RmwRequestId
+    from sidecar.ros.robot.fallback_caller import FallbackAnswer
+    from sidecar.ros.robot.service_proxy import ServiceProxy
     from sidecar.ros.ros_loop import RosLoop
-    from sidecar.ros.service_proxy import ServiceProxy
     from sidecar.ros.stats import BridgeStats
 
 MAX_PENDING_REQUESTS = 4096
