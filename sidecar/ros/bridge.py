@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 from protos.model import Role
 from sidecar.core.base.values import RejectReason
 from sidecar.core.seam.application import ExecuteRequest
-from sidecar.ros.cloud_side import CloudSide
+from sidecar.ros.cloud.cloud_side import CloudSide
 from sidecar.ros.event_queue import EventQueue
 from sidecar.ros.graph import sidecar_node_name
 from sidecar.ros.log_limit import LimitedLog

@@ -16,7 +16,7 @@ import re
 import struct
 from typing import TYPE_CHECKING
 
-from sidecar.ros.dds_id import ENDPOINT_BYTES, PARTICIPANT_BYTES
+from sidecar.ros.cloud.dds_id import ENDPOINT_BYTES, PARTICIPANT_BYTES
 from sidecar.ros.errors import RosBridgeError
 
 if TYPE_CHECKING:

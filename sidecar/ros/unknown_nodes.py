@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from sidecar.ros.dds_id import participant_of
+from sidecar.ros.cloud.dds_id import participant_of
 from sidecar.ros.participant_info import nodes_of, speaker
 
 UNKNOWN_FOR_S = 1.0

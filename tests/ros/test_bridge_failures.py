@@ -127,7 +127,7 @@ def test_a_service_comes_goes_and_comes_back(mesh: Mesh) -> None:
 
 def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """The name never leaves the graph: only the server's endpoint tells that the old requests are lost."""
-    monkeypatch.setattr("sidecar.ros.server_processes.ServerProcesses.watch", lambda _processes, _endpoint: None)
+    monkeypatch.setattr("sidecar.ros.cloud.server_processes.ServerProcesses.watch", lambda _processes, _endpoint: None)
     mesh.start()
     old = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")

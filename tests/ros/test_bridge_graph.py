@@ -201,7 +201,7 @@ def test_a_type_that_is_not_installed_on_the_robot(mesh: Mesh, caplog: pytest.Lo
 def test_a_type_that_is_installed_later(
     mesh: Mesh, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("sidecar.ros.cloud_side.TYPE_RETRY_S", 0.3)
+    monkeypatch.setattr("sidecar.ros.cloud.cloud_side.TYPE_RETRY_S", 0.3)
     with monkeypatch.context() as without:
         without.delitem(sys.modules, "std_srvs.srv", raising=False)
         without.setitem(sys.modules, "std_srvs", None)  # importing it fails, as when it is not installed

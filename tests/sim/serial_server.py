@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
 from sidecar.core.seam.application import AbandonExecution, ApplicationEvent, CancelExecution, ExecuteRequest
-from sidecar.ros.request_window import RequestWindow
+from sidecar.ros.cloud.request_window import RequestWindow
 
 if TYPE_CHECKING:
     from tests.sim.mesh import Mesh, Node

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sidecar.core.robot.fallback.fallbacks import Fallbacks
+from sidecar.ros.cloud.local_server import LocalServer
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.local_server import LocalServer
 from sidecar.ros.types import load_service_type
 
 if TYPE_CHECKING:
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from sidecar.core.robot.fallback.fallbacks import FallbackCall
     from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import RequestFailed
+    from sidecar.ros.cloud.server_processes import ServerProcesses
     from sidecar.ros.graph import NameOf, Served
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.ros_loop import RosLoop
-    from sidecar.ros.server_processes import ServerProcesses
     from sidecar.ros.stats import BridgeStats
 
 MAX_ASKED = 64

@@ -16,6 +16,7 @@ from sidecar.core.seam.application import (
     WithdrawService,
 )
 from sidecar.ros import graph
+from sidecar.ros.cloud.server_processes import ServerProcesses
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.node_names import NodeNames
 from sidecar.ros.rcl import NewClientError
@@ -25,7 +26,6 @@ from sidecar.ros.robot.notices import NoticePublisher
 from sidecar.ros.robot.proxies import Proxies
 from sidecar.ros.robot.reply_pacer import ReplyPacer
 from sidecar.ros.robot.request_numbering import RequestNumbering
-from sidecar.ros.server_processes import ServerProcesses
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,7 +10,7 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import Priority
-from sidecar.ros.request_window import RequestWindow
+from sidecar.ros.cloud.request_window import RequestWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,9 +12,9 @@ from protos.model import NodeName
 from sidecar.core.base.fair_share import Shares
 from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.seam.application import AbandonExecution
-from sidecar.ros.cloud_side import MAX_EXECUTIONS, SILENCE_S, TRUSTED_S, CloudSide
-from sidecar.ros.request_window import RequestWindow
-from sidecar.ros.service_runner import ServiceRunner
+from sidecar.ros.cloud.cloud_side import MAX_EXECUTIONS, SILENCE_S, TRUSTED_S, CloudSide
+from sidecar.ros.cloud.request_window import RequestWindow
+from sidecar.ros.cloud.service_runner import ServiceRunner
 from sidecar.ros.stats import BridgeStats
 
 

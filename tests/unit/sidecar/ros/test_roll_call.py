@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.ros import roll_call
-from sidecar.ros.roll_call import CALL_S, CALLS_MISSED, RollCall
+from sidecar.ros.cloud import roll_call
+from sidecar.ros.cloud.roll_call import CALL_S, CALLS_MISSED, RollCall
 from tests.unit.sidecar.ros.participant_messages import endpoint, participant_info
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from sidecar.ros.server_capacity import FIRST_LIMIT, SAFE_SIZE, ServerCapacity
-from sidecar.ros.shared_queue import SharedQueue
+from sidecar.ros.cloud.server_capacity import FIRST_LIMIT, SAFE_SIZE, ServerCapacity
+from sidecar.ros.cloud.shared_queue import SharedQueue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from sidecar.ros.request_queue import RequestQueue
+from sidecar.ros.cloud.request_queue import RequestQueue
 
 if TYPE_CHECKING:
     from collections.abc import Hashable

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-from sidecar.ros.service_times import ServiceTimes
+from sidecar.ros.cloud.service_times import ServiceTimes
 
 FEWER = 4
 """A trial is with one such part of what is in work at once."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from sidecar.ros import graph
+from sidecar.ros.cloud.server_capacity import MOST_AT_ONCE
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.rcl import Message, send_request, take_response
 from sidecar.ros.ros_loop import service_qos
-from sidecar.ros.server_capacity import MOST_AT_ONCE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from sidecar.ros.cloud.local_server import LocalServer
+from sidecar.ros.cloud.request_window import RequestWindow
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.local_server import LocalServer
-from sidecar.ros.request_window import RequestWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros.dds_id import participant_of
+from sidecar.ros.cloud.dds_id import participant_of
 from sidecar.ros.discovery_topic import DiscoveryTopic
 from sidecar.ros.participant_info import speaker
 
