@@ -141,7 +141,7 @@ def _check_ros(*, thorough: bool) -> None:
 def _warn_of_missing_types(config: SidecarConfig) -> None:
     if config.role is not Role.ROBOT:
         return  # which type a local server has shows when it runs
-    from sidecar.ros.known_types import missing_types
+    from sidecar.ros.graph.known_types import missing_types
     from sidecar.state.store import peek_last_good
 
     peers = peek_last_good(config.state_dir, config.node_name).peers

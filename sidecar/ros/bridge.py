@@ -16,9 +16,9 @@ from sidecar.core.base.values import RejectReason
 from sidecar.core.seam.application import ExecuteRequest
 from sidecar.ros.cloud.cloud_side import CloudSide
 from sidecar.ros.event_queue import EventQueue
-from sidecar.ros.graph import sidecar_node_name
+from sidecar.ros.graph.graph import sidecar_node_name
+from sidecar.ros.graph.looks import Looks
 from sidecar.ros.log_limit import LimitedLog
-from sidecar.ros.looks import Looks
 from sidecar.ros.robot.robot_side import RobotSide
 from sidecar.ros.ros_loop import RosLoop
 from sidecar.ros.stats import BridgeStats

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.participant_info import nodes_of
-from sidecar.ros.unknown_nodes import UnknownNodes
+from sidecar.ros.graph.participant_info import nodes_of
+from sidecar.ros.graph.unknown_nodes import UnknownNodes
 from tests.unit.sidecar.ros.participant_messages import endpoint, participant_info
 
 WRITERS = [endpoint(7, number) for number in range(6)]

@@ -14,7 +14,7 @@ import pytest
 from protos.model import ServiceName
 from sidecar.core.base.values import RejectReason
 from sidecar.core.seam.application import AbandonExecution, CancelExecution
-from sidecar.ros import graph
+from sidecar.ros.graph import graph
 from tests.ros.loopback import ROBOT
 from tests.ros.mesh import no_name, wait_until
 from tests.ros.notice_listener import NoticeListener
@@ -134,8 +134,8 @@ def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.Mo
     mesh.call("/plan", "--count", "4", "--tolerance", "-1", "--timeout-s", "1")
     wait_until(lambda: mesh.cloud.stats.pending == 4, "4 requests at the server")
     with monkeypatch.context() as blind:
-        blind.setattr("sidecar.ros.looks.Looks.turn", lambda _looks, _now: None)
-        blind.setattr("sidecar.ros.looks.Looks.next_due", lambda _looks: time.monotonic() + 0.1)
+        blind.setattr("sidecar.ros.graph.looks.Looks.turn", lambda _looks, _now: None)
+        blind.setattr("sidecar.ros.graph.looks.Looks.next_due", lambda _looks: time.monotonic() + 0.1)
         old.stop(signal.SIGTERM)
         mesh.serve("--plan", "/plan")
         node = mesh.cloud._loop.node  # type: ignore[union-attr]  # a started bridge has one

@@ -12,8 +12,8 @@ import pytest
 from protos.model import Role, ServiceName
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import OfferService
-from sidecar.ros import graph
 from sidecar.ros.bridge import RosBridge
+from sidecar.ros.graph import graph
 from tests.ros.loopback import Loopback
 from tests.ros.mesh import RULES, no_name, wait_until
 
@@ -29,7 +29,7 @@ PLAN_TYPE = "nav_msgs/srv/GetPlan"
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look at the graph often also while it does not change."""
-    monkeypatch.setattr("sidecar.ros.looks.IDLE_PERIOD_S", 0.1)
+    monkeypatch.setattr("sidecar.ros.graph.looks.IDLE_PERIOD_S", 0.1)
 
 
 def scanned(node: Any) -> dict[ServiceName, graph.Served]:

@@ -9,7 +9,7 @@ import pytest
 from protos.model import NodeName, Peer, PeerSet, Role, ServiceName, ServiceOffer, SessionId, Version
 from sidecar.__main__ import main
 from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.ros.known_types import MAX_LINES, missing_types
+from sidecar.ros.graph.known_types import MAX_LINES, missing_types
 from sidecar.state.file import LastGood, encode_last_good
 from sidecar.state.store import LAST_GOOD_FILE
 

@@ -13,11 +13,11 @@ import pytest
 
 from protos.model import ServiceName
 from sidecar.core.base.values import RejectReason
-from sidecar.ros import graph
 from sidecar.ros.cloud import dds_id, process_finder, server_processes
 from sidecar.ros.cloud.cloud_side import SILENCE_S
 from sidecar.ros.cloud.process_finder import has_ended, open_process, wants_processor
 from sidecar.ros.cloud.roll_call import CALL_S
+from sidecar.ros.graph import graph
 from tests.ros.mesh import no_name, wait_until
 
 if TYPE_CHECKING:

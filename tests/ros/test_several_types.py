@@ -11,7 +11,7 @@ import pytest
 
 from protos.model import ServiceName
 from sidecar.core.base.values import RejectReason
-from sidecar.ros import graph
+from sidecar.ros.graph import graph
 from tests.ros.mesh import no_name, wait_until
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from sidecar.core.base.fair_share import Shares
 from sidecar.core.base.values import RejectReason
 from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
-from sidecar.ros import graph
 from sidecar.ros.cloud.roll_call import POLL_S, RollCall
 from sidecar.ros.cloud.server_processes import ServerProcesses
 from sidecar.ros.cloud.service_runner import Execution, ServiceRunner
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.node_names import NodeNames
+from sidecar.ros.graph import graph
+from sidecar.ros.graph.node_names import NodeNames
 from sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros import graph
 from sidecar.ros.cloud.server_capacity import MOST_AT_ONCE
 from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.graph import graph
 from sidecar.ros.rcl import Message, send_request, take_response
 from sidecar.ros.ros_loop import service_qos
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from protos.model import ServiceName
-    from sidecar.ros.graph import NameOf
+    from sidecar.ros.graph.graph import NameOf
     from sidecar.ros.types import ServiceType
 
 TAKEN_AT_ONCE = 32

@@ -9,8 +9,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from sidecar.ros.cloud.dds_id import participant_of
-from sidecar.ros.discovery_topic import DiscoveryTopic
-from sidecar.ros.participant_info import speaker
+from sidecar.ros.graph.discovery_topic import DiscoveryTopic
+from sidecar.ros.graph.participant_info import speaker
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

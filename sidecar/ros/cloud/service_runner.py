@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from protos.model import NodeName, ServiceName
     from sidecar.core.base.values import ExecutionId, Priority
-    from sidecar.ros.graph import NameOf
+    from sidecar.ros.graph.graph import NameOf
     from sidecar.ros.rcl import Message
     from sidecar.ros.types import ServiceType
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import RequestFailed
     from sidecar.ros.cloud.server_processes import ServerProcesses
-    from sidecar.ros.graph import NameOf, Served
+    from sidecar.ros.graph.graph import NameOf, Served
     from sidecar.ros.log_limit import LimitedLog
     from sidecar.ros.ros_loop import RosLoop
     from sidecar.ros.stats import BridgeStats

@@ -6,8 +6,8 @@ import logging
 from typing import TYPE_CHECKING
 
 from sidecar.core.rules.service_rule import Rules
-from sidecar.ros import graph
 from sidecar.ros.errors import RosBridgeError
+from sidecar.ros.graph import graph
 from sidecar.ros.robot.service_proxy import ServiceProxy
 from sidecar.ros.types import TypeNotInstalledError, load_service_type
 

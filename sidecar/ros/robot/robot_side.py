@@ -15,10 +15,10 @@ from sidecar.core.seam.application import (
     Unreachable,
     WithdrawService,
 )
-from sidecar.ros import graph
 from sidecar.ros.cloud.server_processes import ServerProcesses
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.node_names import NodeNames
+from sidecar.ros.graph import graph
+from sidecar.ros.graph.node_names import NodeNames
 from sidecar.ros.rcl import NewClientError
 from sidecar.ros.robot.fallback_caller import FallbackCaller
 from sidecar.ros.robot.new_clients import GIVE_UP_S, NewClients

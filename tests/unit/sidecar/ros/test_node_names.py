@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.ros import node_names
+from sidecar.ros.graph import node_names
+from sidecar.ros.graph.node_names import CALL_S, POLL_S, NodeNames
+from sidecar.ros.graph.unknown_nodes import MAX_ENDPOINTS, UNKNOWN_FOR_S
 from sidecar.ros.log_limit import LimitedLog
-from sidecar.ros.node_names import CALL_S, POLL_S, NodeNames
 from sidecar.ros.stats import BridgeStats
-from sidecar.ros.unknown_nodes import MAX_ENDPOINTS, UNKNOWN_FOR_S
 from tests.unit.sidecar.ros.participant_messages import endpoint, participant_info
 
 if TYPE_CHECKING:

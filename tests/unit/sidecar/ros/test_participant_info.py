@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.participant_info import MAX_INFO_BYTES, MAX_NODES, nodes_of, speaker
+from sidecar.ros.graph.participant_info import MAX_INFO_BYTES, MAX_NODES, nodes_of, speaker
 from tests.unit.sidecar.ros.participant_messages import Node, endpoint, participant_info
 
 READERS = [endpoint(7, 1), endpoint(7, 2)]

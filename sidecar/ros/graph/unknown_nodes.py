@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from sidecar.ros.cloud.dds_id import participant_of
-from sidecar.ros.participant_info import nodes_of, speaker
+from sidecar.ros.graph.participant_info import nodes_of, speaker
 
 UNKNOWN_FOR_S = 1.0
 """A process is asked when rmw has not known the node of one of its endpoints for so long; it is also the least time

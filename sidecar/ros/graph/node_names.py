@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros.discovery_topic import DiscoveryTopic
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.participant_info import speaker
-from sidecar.ros.unknown_nodes import UnknownNodes
+from sidecar.ros.graph.discovery_topic import DiscoveryTopic
+from sidecar.ros.graph.participant_info import speaker
+from sidecar.ros.graph.unknown_nodes import UnknownNodes
 
 if TYPE_CHECKING:
     from sidecar.ros.log_limit import LimitedLog

@@ -12,7 +12,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph import PARTICIPANTS_TOPIC
+from sidecar.ros.graph.graph import PARTICIPANTS_TOPIC
 from sidecar.ros.rcl import LatchedTopic, MessageType
 
 if TYPE_CHECKING:

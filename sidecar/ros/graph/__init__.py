@@ -1,0 +1,1 @@
+"""Who is in the local ROS graph, and what its types are."""
