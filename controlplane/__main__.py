@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING
 from protos.program import endings, extras, interpreter
 
 with extras.required("plr-controlplane", "controlplane"):
-    from controlplane.certificates import load_own_files
     from controlplane.config import load_config, refuse_exposed
+    from controlplane.serve.certificate_watch import load_own_files
     from protos.base.errors import ConfigError
     from protos.base.printable import escaped
     from protos.program.arguments import OneLineParser
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from controlplane.config import ControlPlaneConfig
-    from controlplane.server import Addresses
+    from controlplane.serve.server import Addresses
     from protos.program.tls_files import TlsFiles
 
 EXIT_OK = 0
@@ -104,7 +104,7 @@ def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
 def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> int:
     _take_descriptors()
     # gRPC takes half a second to import, which checking a configuration need not wait for.
-    from controlplane.server import StartError
+    from controlplane.serve.server import StartError
 
     try:
         asyncio.run(_run(source, config, files))
@@ -150,7 +150,7 @@ def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
 
 async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> None:
     from controlplane.policy_reload import PolicyReload
-    from controlplane.server import serve
+    from controlplane.serve.server import serve
     from protos.program.notifier import Notifier
 
     interpreter.share()

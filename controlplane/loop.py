@@ -27,11 +27,11 @@ from controlplane.core.problem.problem import Problem
 from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from controlplane.core.registry.registry import Refusal
-from controlplane.earliest_end import EarliestEnd
 from controlplane.fleet_metrics import MAX_GONE, Fleet
 from controlplane.garbage import Collector
-from controlplane.mailbox import Mailbox
 from controlplane.remembered import departures
+from controlplane.serve.earliest_end import EarliestEnd
+from controlplane.serve.mailbox import Mailbox
 from controlplane.turns import Turns
 from protos.base.token_bucket import TokenBucket
 from protos.convert import status_to_proto
@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from controlplane.event_log import EventLog
     from controlplane.matcher import Matcher
     from controlplane.metrics import Metrics
-    from controlplane.stun_server import StunServer
-    from controlplane.tls_gate import Caller
+    from controlplane.serve.stun_server import StunServer
+    from controlplane.serve.tls_gate import Caller
     from protos.explanation import Explanation
     from protos.model import NodeName, Registration, RevocationSet, ServiceName, SidecarMessage
     from protos.trust.identity import Trust

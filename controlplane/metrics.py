@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import prometheus_client
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-from controlplane import handshakes, limits, tls_gate
 from controlplane.fleet_metrics import FleetCollector
+from controlplane.serve import handshakes, stream_limits, tls_gate
 from protos.fleet_events import EventLogState
 from protos.model import ResourceKind, Role
 from protos.program.metrics_server import MetricsServer
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.control.control import ControlCore
     from controlplane.fleet_metrics import Fleet
-    from controlplane.stun_server import StunServer
+    from controlplane.serve.stun_server import StunServer
     from protos.trust.identity import Identity, RevocationList
 
 SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
@@ -62,8 +62,8 @@ REFUSAL_REASONS = (
     tls_gate.TOO_MANY_HANDSHAKES,
     tls_gate.TOO_MANY_CONNECTIONS,
     tls_gate.GAVE_UP,
-    limits.TOO_MANY_STREAMS,
-    limits.TOO_FAST,
+    stream_limits.TOO_MANY_STREAMS,
+    stream_limits.TOO_FAST,
 )
 """Labels of plr_refused_connections_total, there from the start."""
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
-from controlplane.mailbox import Mailbox
+from controlplane.serve.mailbox import Mailbox
 from protos.convert import (
     control_message_to_proto,
     parse_control_message,

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 import grpc
 import pytest
 
-from controlplane import admin, turns
-from controlplane.admin import AdminService
+from controlplane import turns
 from controlplane.cli import main
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.registry.registry import Refusal
 from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
+from controlplane.serve import admin
+from controlplane.serve.admin import AdminService
 from protos.convert import status_from_proto
 from protos.fleet_events import EventKind
 from protos.model import CandidateSet, InterfaceName, NodeName, PathReport, Report, Role, ServiceSet

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import certificates, turns
 from controlplane import metrics as metrics_module
-from controlplane.certificates import CertificateKeeper
+from controlplane import turns
 from controlplane.config import ControlPlaneConfig
 from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
+from controlplane.serve import certificate_watch
+from controlplane.serve.certificate_watch import CertificateKeeper
 from protos.program.tls_files import load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from tests.integration.test_tls_gate import PATIENCE_S, opened, until
@@ -67,7 +68,7 @@ def revoke(gate: Gate, name: str) -> None:
 @pytest.fixture(autouse=True)
 def short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(turns, "TURN_S", 0.0)
-    monkeypatch.setattr(certificates, "POLL_INTERVAL_S", 0.02)
+    monkeypatch.setattr(certificate_watch, "POLL_INTERVAL_S", 0.02)
 
 
 @contextlib.asynccontextmanager

@@ -17,7 +17,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from controlplane.ca import Authority, Validity
-from controlplane.tls_gate import MAX_SILENT_PER_SOURCE
+from controlplane.serve.tls_gate import MAX_SILENT_PER_SOURCE
 from protos.model import MappingSet, RemovalReason, Report, Role, Welcome
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
 from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole

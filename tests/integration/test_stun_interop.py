@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.core.stun.responder import StunOutcome
-from controlplane.stun_server import SHARE, StunServer, start_stun_server
+from controlplane.serve.stun_server import SHARE, StunServer, start_stun_server
 from protos.stun.codec import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun.client import StunClient
 from sidecar.core.stun.events import Mapped, StunEvent

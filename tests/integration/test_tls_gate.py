@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import tls_gate
 from controlplane.ca import Authority
-from controlplane.tls_gate import TlsGate
+from controlplane.serve import tls_gate
+from controlplane.serve.tls_gate import TlsGate
 from protos.model import NodeName
 from protos.program.tls_files import load_tls_files
 from protos.trust.clock_floor import ClockFloor

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import tls_gate
 from controlplane.core.overload.admission import Admission
 from controlplane.core.overload.pacing import Pacing
+from controlplane.serve import tls_gate
 from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, SessionId, Welcome
 from sidecar.core.control.session import ControlSession, ControlState
 

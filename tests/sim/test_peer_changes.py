@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import stream_encoder
 from controlplane.core.control.control import ControlCore
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publish.messages import Close, Send
 from controlplane.core.publish.publisher import RESEND_S
 from controlplane.core.registry.registry import Refusal, StreamId
-from controlplane.stream_encoder import StreamEncoder
+from controlplane.serve import stream_encoder
+from controlplane.serve.stream_encoder import StreamEncoder
 from protos.convert import parse_control_message
 from protos.model import (
     CandidateSet,

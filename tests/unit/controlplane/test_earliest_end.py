@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.earliest_end import EarliestEnd
+from controlplane.serve.earliest_end import EarliestEnd
 from protos.model import NodeName
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.ca import Authority
-from controlplane.gate_pipe import PipeEnd
+from controlplane.serve.gate_pipe import PipeEnd
 from protos.model import NodeName
 from protos.trust.identity import IdentityRole
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.limits import (
+from controlplane.serve.stream_limits import (
     MAX_MESSAGE_BYTES,
     MAX_STREAMS_PER_NAME,
     MESSAGES_BURST,

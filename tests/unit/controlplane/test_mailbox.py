@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from controlplane.core.publish.messages import CloseReason
-from controlplane.mailbox import Mailbox
+from controlplane.serve.mailbox import Mailbox
 from protos.model import (
     MappingSet,
     NodeName,

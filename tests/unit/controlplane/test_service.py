@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, cast
 import grpc
 import pytest
 
-from controlplane import service as module
 from controlplane.core.overload.report_share import ReportShares
-from controlplane.limits import MAX_FIRST_BYTES
-from controlplane.mailbox import Mailbox
-from controlplane.service import ControlPlaneService
+from controlplane.serve import service as module
+from controlplane.serve.mailbox import Mailbox
+from controlplane.serve.service import ControlPlaneService
+from controlplane.serve.stream_limits import MAX_FIRST_BYTES
 from protos.convert import sidecar_message_to_proto
 from protos.model import Heartbeat, PeerSet, Report, Version
 from protos.plr.v1 import control_pb2
@@ -20,7 +20,7 @@ from tests.unit.controlplane.samples import registration
 
 if TYPE_CHECKING:
     from controlplane.loop import ControlLoop
-    from controlplane.service import Context
+    from controlplane.serve.service import Context
 
 
 class Loop:

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane import stream_encoder
 from controlplane.core.publish.told_peers import ToldPeers
-from controlplane.stream_encoder import StreamEncoder
+from controlplane.serve import stream_encoder
+from controlplane.serve.stream_encoder import StreamEncoder
 from protos.convert import parse_control_message
 from protos.model import (
     NodeName,

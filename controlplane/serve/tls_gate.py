@@ -26,10 +26,10 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from controlplane.core.overload.admission import Admission
-from controlplane.earliest_end import EarliestEnd
-from controlplane.gate_pipe import PipeEnd
-from controlplane.half_open import HalfOpen
-from controlplane.handshakes import server_context, why_failed
+from controlplane.serve.earliest_end import EarliestEnd
+from controlplane.serve.gate_pipe import PipeEnd
+from controlplane.serve.half_open import HalfOpen
+from controlplane.serve.handshakes import server_context, why_failed
 from protos.base.token_bucket import TokenBucket
 from protos.trust.identity import CertificateError, IdentityRole
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from controlplane.loop import ControlLoop
     from controlplane.metrics import Metrics
-    from controlplane.tls_gate import TlsGate
+    from controlplane.serve.tls_gate import TlsGate
     from protos.model import NodeName
     from protos.trust.clock_floor import ClockFloor
 

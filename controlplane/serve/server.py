@@ -16,16 +16,16 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from controlplane import admin, service
-from controlplane.access import AccessGuard
-from controlplane.certificates import CertificateKeeper
 from controlplane.core.registry.registry import MAX_SIDECARS
 from controlplane.event_log import EventLog
-from controlplane.limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
-from controlplane.stun_server import start_stun_server
-from controlplane.tls_gate import TlsGate
+from controlplane.serve import admin, service
+from controlplane.serve.access import AccessGuard
+from controlplane.serve.certificate_watch import CertificateKeeper
+from controlplane.serve.stream_limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
+from controlplane.serve.stun_server import start_stun_server
+from controlplane.serve.tls_gate import TlsGate
 from protos.base.host_port import split_host_port
 from protos.fleet_events import EventKind
 from protos.program.version_option import describe

@@ -10,7 +10,8 @@ import grpc
 
 from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
-from controlplane.limits import (
+from controlplane.serve.stream_encoder import StreamEncoder
+from controlplane.serve.stream_limits import (
     MAX_FIRST_BYTES,
     MAX_STREAMS_PER_NAME,
     TOO_FAST,
@@ -18,7 +19,6 @@ from controlplane.limits import (
     StreamCount,
     StreamRate,
 )
-from controlplane.stream_encoder import StreamEncoder
 from protos.base.errors import DecodeError, UnknownKindError
 from protos.base.protocol_versions import Spoken, refusal
 from protos.convert import (
@@ -34,8 +34,8 @@ from protos.plr.v1 import control_pb2
 if TYPE_CHECKING:
     from controlplane.core.registry.registry import StreamId
     from controlplane.loop import ControlLoop
-    from controlplane.mailbox import Mailbox
-    from controlplane.tls_gate import Caller, TlsGate
+    from controlplane.serve.mailbox import Mailbox
+    from controlplane.serve.tls_gate import Caller, TlsGate
     from protos.model import NodeName, SidecarMessage
 
     Context = grpc.aio.ServicerContext[bytes, bytes]

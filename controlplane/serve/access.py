@@ -13,7 +13,7 @@ from protos.trust.identity import WRONG_ROLE, IdentityRole
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
-    from controlplane.tls_gate import Caller
+    from controlplane.serve.tls_gate import Caller
 
     _Handler = grpc.RpcMethodHandler[Any, Any]
 
