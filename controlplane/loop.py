@@ -49,10 +49,10 @@ if TYPE_CHECKING:
     from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import StreamId
     from controlplane.event_log import EventLog
-    from controlplane.matcher import Matcher
     from controlplane.metrics import Metrics
     from controlplane.serve.stun_server import StunServer
     from controlplane.serve.tls_gate import Caller
+    from controlplane.solver.matcher import Matcher
     from protos.explanation import Explanation
     from protos.model import NodeName, Registration, RevocationSet, ServiceName, SidecarMessage
     from protos.trust.identity import Trust
@@ -127,12 +127,12 @@ class _LateMatcher:
     @staticmethod
     def prepare() -> None:
         """Import what few problems need."""
-        from controlplane import solver
+        from controlplane.solver import cp_sat
 
-        solver.prepare()
+        cp_sat.prepare()
 
     def solve(self, problem: Problem, time_limit_s: float, hint: Plan) -> Plan:
-        from controlplane.matcher import Matcher
+        from controlplane.solver.matcher import Matcher
 
         if self._matcher is None:
             self._matcher = Matcher()

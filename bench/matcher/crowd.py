@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.control.control import ControlCore
 from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import Send
-from controlplane.matcher import Matcher
+from controlplane.solver.matcher import Matcher
 from protos.base.histogram import Histogram
 from protos.model import (
     PROTOCOL_VERSION,

@@ -10,7 +10,7 @@ from controlplane.core.control.control import ControlCore
 from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import Send
 from controlplane.core.registry.registry import Refusal
-from controlplane.matcher import Matcher
+from controlplane.solver.matcher import Matcher
 from protos.model import (
     PROTOCOL_VERSION,
     Candidate,

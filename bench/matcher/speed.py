@@ -18,7 +18,7 @@ from controlplane.config import ControlPlaneConfig
 from controlplane.core.control.schedule import URGENT_DELAY_S
 from controlplane.core.problem.plan import relative_gap
 from controlplane.core.problem.problem import Objective
-from controlplane.matcher import Matcher
+from controlplane.solver.matcher import Matcher
 from protos.base.histogram import Histogram
 
 if TYPE_CHECKING:

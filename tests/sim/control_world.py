@@ -9,7 +9,7 @@ from controlplane.core.control.control import ControlCore
 from controlplane.core.control.events import DepartureNotice, NackNotice, Settings
 from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.registry import Refusal, StreamId
-from controlplane.matcher import solve
+from controlplane.solver.matcher import solve
 from protos.model import (
     Ack,
     CandidateSet,

@@ -9,7 +9,7 @@ from controlplane.core.control.control import ControlCore
 from controlplane.core.control.events import OffersRefusedNotice, Settings
 from controlplane.core.publish.messages import Send
 from controlplane.core.registry.registry import Refusal
-from controlplane.matcher import solve
+from controlplane.solver.matcher import solve
 from protos.convert import control_message_to_proto, parse_control_message
 from protos.model import (
     PROTOCOL_VERSION,

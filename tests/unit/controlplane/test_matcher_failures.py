@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import group_solver
 from controlplane.core.estimate.forgetting import FORGET_S
 from controlplane.core.estimate.processing import ComputeTimes
 from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
 from controlplane.core.publish.snapshots import VersionSource
-from controlplane.matcher import Matcher
+from controlplane.solver import group
+from controlplane.solver.matcher import Matcher
 from protos.convert import use_from_proto, use_to_proto
 from protos.model import MAX_VERSION, InterfaceName, NodeName, ServiceName, Version
 from protos.preferences import Copies
@@ -43,15 +43,15 @@ def block(robot: str, interfaces: int = 2, servers: int = 2) -> Block:
 def test_a_block_that_cannot_be_solved_costs_no_other_its_mapping(
     limited: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    solve = group_solver.GroupSolver.solve
+    solve = group.GroupSolver.solve
 
-    def fails(self: group_solver.GroupSolver, hint: Plan | None, prices: Mapping[Key, float]) -> group_solver.Found:
+    def fails(self: group.GroupSolver, hint: Plan | None, prices: Mapping[Key, float]) -> group.Found:
         if any(one.key.robot == "bad" for one in self._group.blocks):
             raise IndexError("of nothing")
         return solve(self, hint, prices)
 
-    monkeypatch.setattr(group_solver.GroupSolver, "solve", fails)
-    monkeypatch.setattr(group_solver, "_failures", group_solver.FailureLog())
+    monkeypatch.setattr(group.GroupSolver, "solve", fails)
+    monkeypatch.setattr(group, "_failures", group.FailureLog())
     capacity = {FleetKey(NodeName(f"cloud-{number}"), SERVICE): 3 for number in range(2)} if limited else {}
     problem = Problem((block("good-1"), block("bad"), block("good-2")), capacity)
     matcher = Matcher()

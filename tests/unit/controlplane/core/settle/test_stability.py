@@ -10,7 +10,7 @@ import pytest
 from controlplane.core.problem.plan import Plan, make_plan, price
 from controlplane.core.problem.problem import FleetKey, Objective, Problem, Target
 from controlplane.core.settle.stability import CHANGE_WINDOW_S, MAX_CHANGES, Stability
-from controlplane.matcher import solve
+from controlplane.solver.matcher import solve
 from protos.model import NodeName
 from protos.preferences import AT_MOST_EVERY_INTERFACE
 from tests.unit.controlplane.problems import PLAN, block, choices_of, random_problem

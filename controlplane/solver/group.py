@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.problem.plan import choice_of, relative_gap
 from controlplane.core.solve.decomposition import Decomposition, Relaxed
 from controlplane.core.solve.limits import Limits
-from controlplane.solver import RESOLUTION, Column, pick_columns
+from controlplane.solver.cp_sat import RESOLUTION, Column, pick_columns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

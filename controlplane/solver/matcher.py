@@ -17,7 +17,7 @@ from controlplane.core.problem.problem import FleetKey, reachable
 from controlplane.core.solve.decomposition import Decomposition
 from controlplane.core.solve.grouping import independent_groups
 from controlplane.core.solve.limits import Limits
-from controlplane.group_solver import SMALL_BLOCKS, solve_group
+from controlplane.solver.group import SMALL_BLOCKS, solve_group
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
